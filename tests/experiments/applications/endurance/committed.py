@@ -77,6 +77,12 @@ def by_place(name: str) -> dict[tuple, dict]:
     return places
 
 
+def of_three_starts(name: str) -> dict[tuple, dict]:
+    """(robot, start, minute) -> row of the served model over ten minutes: "grown", or with tokens "drawn"."""
+    more = [row for row in read_rows(RESULTS / "more_starts.csv") if row["variant"] == name]
+    return by_place(f"{name}_ten.csv") | {(row["robot"], row["start"], row["part"]): row for row in more}
+
+
 def gain(measure: str, pairs: list[tuple[dict, dict]]) -> tuple[float, float]:
     """(mean, half its interval) over robots, of how much more the first of each pair of rows has than the second."""
     mean, half, robots = over_robots([{**row, measure: row[measure] - other[measure]} for row, other in pairs], measure)

@@ -18,6 +18,7 @@ from tests.experiments.applications.endurance.committed import (
     check_tables,
     gain,
     gains,
+    of_three_starts,
     rows_of_trained,
     words_of,
 )
@@ -25,7 +26,7 @@ from tests.experiments.applications.endurance.committed import (
 
 def test_the_page_shows_what_was_measured():
     ten = read_rows(RESULTS / "grown_ten.csv")
-    drawn = read_rows(RESULTS / "drawn_ten.csv")
+    drawn = list(of_three_starts("drawn").values())
     minutes = {
         "| minute |": lambda label: [row for row in ten if row["part"] == float(label)],
         "| minute, drawn |": lambda label: [row for row in drawn if row["part"] == float(label)],
@@ -49,10 +50,8 @@ def test_ten_minutes_are_as_the_page_says():
     first, second, last = objects(mine)
     said = f"found in {first} % of frames of the first minute, in {second} % of those of the second, in {last} % of the last"
     assert said in page
-    assert "two cores train in {}, {} and {}.".format(*objects(small)) in page
+    assert "two cores train in {}, {} and {} (".format(*objects(small)) in page
     tools = f"{100 * mean('tool_found', 10):.0f}"
-    assert f"| likeliest tokens: {last} % |" in words_of(ROOT / "README.md")
-    assert f"not in all, and in {last} % with the likeliest tokens" in page
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
     assert f"commands by {mean('follows', 10):.2f} after {mean('follows', 1):.2f} in the first minute" in page
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
@@ -130,7 +129,7 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
     kept, before = ([found(minute, of) for minute in (1, 2, 10)] for of in (ten, grown))
     said = "in {} % of the frames of the first minute, in {} % of those of the second and in {} % of the last, where"
     assert said.format(*kept) in page and '"grown" has {}, {} and {}.'.format(*before) in page
-    assert f"in {kept[2]} % by a model that was trained on a displaced past" in page
+    assert f"trained on a displaced past has {kept[2]} % from the first starts" in page
     last, later = ([(row, grown[k]) for k, row in ten.items() if k[2] >= first] for first in (10, 2))
     more, half = gain("object_found", last)
     assert more > half
@@ -159,44 +158,46 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
 
 
 def test_what_drawing_tokens_does_is_as_the_page_says():
-    page, drawn, grown = words_of(PAGE), by_place("drawn_ten.csv"), by_place("grown_ten.csv")
-    assert len(drawn) == 8 * 10 and drawn.keys() == grown.keys()
+    page, drawn, grown = words_of(PAGE), of_three_starts("drawn"), of_three_starts("grown")
+    assert len(drawn) == 8 * 3 * 10 and drawn.keys() == grown.keys()
 
     def percent(rows: list[dict], measure: str = "object_found") -> str:
         mean, _, robots = over_robots(rows, measure)
         assert robots == 8
         return f"{100 * mean:.0f}"
 
-    last = [percent([row for k, row in of.items() if k[2] == 10]) for of in (drawn, grown)]
-    tools = percent([row for k, row in drawn.items() if k[2] == 10], "tool_found")
-    assert f"| {last[0]} % of objects, {tools} % of tools |" in words_of(ROOT / "README.md")
+    def share(of: dict, minutes: range, starts: tuple = (0, 1, 2), measure: str = "object_found") -> str:
+        return percent([row for (_, start, at), row in of.items() if at in minutes and start in starts], measure)
+
+    def more(measure: str, first: int, starts: tuple = (0, 1, 2)) -> tuple[float, float]:
+        return gain(measure, [(row, grown[k]) for k, row in drawn.items() if k[2] >= first and k[1] in starts])
+
+    later, end = range(2, 11), range(10, 11)
+    last, tools = [share(of, end) for of in (drawn, grown)], share(drawn, end, measure="tool_found")
+    readme = words_of(ROOT / "README.md")
+    assert f"| {last[0]} % of objects, {tools} % of tools | likeliest tokens: {last[1]} % |" in readme
     said = "objects are found in {} % of the frames of the last minute, in {} with the likeliest tokens"
     assert said.format(*last) in words_of(ROOT / "docs" / "results.md")
-    assert "{} % in the last minute, where the likeliest tokens keep {}:".format(*last) in page
-    assert f"Objects are found in {last[0]} % of the frames of the last minute, not in all" in page
-    apart = [x for m in (10, 2) for x in gain("object_found", [(r, grown[k]) for k, r in drawn.items() if k[2] >= m])]
-    assert "robot {:+.2f} ± {:.2f}, from the second minute on {:+.2f} ± {:.2f}.".format(*apart) in page
-    lost = [robot for (robot, _, minute), row in drawn.items() if minute == 10 and row["object_found"] < 0.1]
-    assert lost == ["arm_chalk", "picker_slate"]
-
-    second = read_rows(RESULTS / "second_start.csv")
-    later = [
-        {(r["robot"], r["start"], r["part"]): r for r in second if r["variant"] == name} for name in ("drawn", "grown")
-    ]
-    shares = [percent([row for k, row in of.items() if k[2] >= 2]) for of in later]
-    assert "{} % against {} from the second minute to the fifth".format(*shares) in page
-    both = [mine | {k: of[k] for k in of if k[2] <= 5} for mine, of in zip(later, (drawn, grown), strict=True)]
-    assert both[0].keys() == both[1].keys() and len(both[0]) == 2 * 8 * 5
-
-    def over_both(measure: str, first: int) -> tuple[float, float]:
-        return gain(measure, [(row, both[1][k]) for k, row in both[0].items() if k[2] >= first])
-
-    objects = [x for first in (2, 5) for x in over_both("object_found", first)]
-    assert "both starts that is {:+.2f} ± {:.2f}, in the fifth minute {:+.2f} ± {:.2f},".format(*objects) in page
-    every = [mine | dict(of) for mine, of in zip(later, (drawn, grown), strict=True)]
-    filmed = gain("object_found", [(row, every[1][k]) for k, row in every[0].items() if k[2] >= 2])
-    assert "over all that was filmed from the second minute on {:+.2f} ± {:.2f}.".format(*filmed) in page
-    cost = [x for measure in ("psnr", "tool_close", "follows") for x in over_both(measure, 2)]
+    said = (
+        "Objects are found in {} % of the frames of the last minute, not in all, and in {} % with the likeliest tokens"
+    )
+    assert said.format(*last) in page
+    said = "in {} % of the frames, by the likeliest tokens in {}, paired by robot {:+.2f} ± {:.2f}. In the last minute it is"
+    assert said.format(share(drawn, later), share(grown, later), *more("object_found", 2)) in page
+    gained, half = more("object_found", 10)
+    assert (
+        "minute it is {} % and {}, {:+.2f} ± {:.2f}, which eight".format(*last, gained, half) in page and gained < half
+    )
+    by_start = [share(of, end, (start,)) for of in (drawn, grown) for start in (0, 1, 2)]
+    said = "in {}, {} and {} % of the frames from the first, second and third starts, by the likeliest tokens in {}, {} and {}."
+    assert said.format(*by_start) in page
+    kept = {robot: [round(100 * drawn[robot, start, 10]["object_found"]) for start in (0, 1, 2)] for robot, *_ in drawn}
+    assert "(arm_chalk: {}, {} and {} %)".format(*kept["arm_chalk"]) in page
+    assert [robot for robot, shares in kept.items() if max(shares) < 10] == ["picker_slate"]
+    assert "in the last minute, {:+.2f} ± {:.2f}.".format(*more("object_found", 10, (0,))) in page
+    said = "where drawing alone has {}, and is further"
+    assert said.format(by_start[0]) in page
+    cost = [x for measure in ("psnr", "tool_close", "follows") for x in more(measure, 2)]
     said = "PSNR {:+.1f} ± {:.1f} dB, tools in place {:+.2f} ± {:.2f}, follows {:+.2f} ± {:.2f};"
     assert said.format(*cost) in page
 
@@ -207,7 +208,7 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     ]
     assert "({:+.2f} ± {:.2f} and {:+.2f} ± {:.2f}), where temperature 0.7 has".format(*beside) in page
     shares = [percent(rows) for rows in each]
-    shares += [percent([row for k, row in of.items() if 2 <= k[2] <= 5]) for of in (grown, drawn)]
+    shares += [share(of, range(2, 6), (0,)) for of in (grown, drawn)]
     said = (
         "in {} % of the frames from the second minute to the fifth at temperature 0.4 and in {} % where one of the two "
         "likeliest entries of each factor is drawn, as in {} % by the likeliest tokens ("
