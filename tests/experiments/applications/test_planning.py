@@ -120,6 +120,7 @@ def test_the_learned_model_imagines_again_from_the_same_present():
     assert (to_picture(imagined[0, -1])(imagined) < to_picture(255 - imagined[0, -1])(imagined)).all()
 
 
+@pytest.mark.slow
 def test_the_program_of_the_page_plans(tmp_path, monkeypatch):
     (text,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     make_run(tmp_path / "runs/mine")

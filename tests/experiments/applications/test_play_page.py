@@ -319,6 +319,7 @@ def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_rob
     browsing(test)
 
 
+@pytest.mark.slow
 def test_the_page_says_that_a_model_without_actions_follows_none(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
