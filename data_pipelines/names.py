@@ -37,7 +37,8 @@ def inside(root: Path, text: object) -> Path:
 def brief(text: object) -> str:
     """A message that may quote a file of others, of bounded length."""
     text = str(text)
-    return text if len(text) <= 500 else f"{text[:500]} ..."
+    longest = 500
+    return text if len(text) <= longest else f"{text[:longest]} ..."
 
 
 def shown(value: object, longest: int = 80) -> str:

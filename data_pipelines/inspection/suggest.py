@@ -13,6 +13,7 @@ from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, Facts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.sources.rlds.schema import field_slice
+from data_pipelines.sources.units import told_left_out
 from data_pipelines.windows.cut import Cut
 from data_pipelines.windows.windows import TO_TRAIN
 
@@ -110,7 +111,7 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
     keys, dims, about = _choose_actions(facts)
     reasons = [f"camera: {why}", f"action: {about}"]
     if others := [field.key for field in facts.fields if field.kind == NOT_READ]:
-        reasons.append(f"left out: {', '.join(others)}; docs/own_data.md says what is a camera")
+        reasons.append(told_left_out(others))
     angles, unit = _choose_angles(facts, keys, dims)
     if angles:
         reasons.append(

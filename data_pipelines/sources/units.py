@@ -7,7 +7,7 @@ that are read so have in common.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol
@@ -22,6 +22,11 @@ from hma_jax.config import ConfigError
 
 class UnitError(EpisodeError):
     """One unit of a source is unusable; `--skip-damaged`, or corrupt='skip', leaves it out."""
+
+
+def told_left_out(pictures: Iterable[str]) -> str:
+    """What is said of pictures that no camera is made of."""
+    return f"left out: {', '.join(pictures)}; docs/own_data.md says what is a camera"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from experiments.progress import Pace, console, say, step
 from experiments.setting import UNSET, command, require_local, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require
+from hma_jax.config.base import require_seed
 
 
 def generate(
@@ -67,7 +68,7 @@ def generate(
     require(given >= 1, f"--given must be at least 1, got {given}")
     require(batch >= 1, f"--batch must be at least 1, got {batch}")
     require(episodes is None or episodes >= 1, f"--episodes must be at least 1, got {episodes}")
-    require(0 <= seed < 2**32, f"--seed must lie in [0, 2^32), got {seed}")
+    require_seed(seed, "--seed")
     require(clips >= 0, f"--clips must not be negative, got {clips}")
     if clips:
         require_module("av", f"--clips {clips}")
@@ -79,7 +80,7 @@ def generate(
         decode=decode, history=1,
     )  # fmt: skip
     if simulator.deaf:
-        console.print(f"note: {DEAF}", soft_wrap=True)
+        say(f"note: {DEAF}")
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)

@@ -113,6 +113,11 @@ class MaskingConfig:
     def predicts_actions(self) -> bool:
         return self.setting in PREDICT_ACTIONS
 
+    @property
+    def deaf(self) -> bool:
+        """Whether frames are predicted without actions, so that none has an effect."""
+        return self.setting == "passive"
+
 
 # --- Training --------------------------------------------------------------------------------
 

@@ -216,7 +216,7 @@ def to_official(params: Params, parts: Mapping[str, list[Part]]) -> dict[str, np
 
 
 def check_names(want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Raises ConfigError naming (the first ten) tensors that are missing, too many or of another shape."""
+    """Raises ConfigError naming (the first few) tensors that are missing, too many or of another shape."""
     wrong = {
         "missing": [f"{n} {want[n]}" for n in want if n not in found],
         "not expected": [f"{n} {found[n]}" for n in found if n not in want],
@@ -224,8 +224,9 @@ def check_names(want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[i
             f"{n}: expected {want[n]}, found {found[n]}" for n in want if n in found and found[n] != want[n]
         ],
     }
+    most = 10
     lines = [
-        f"\n  {len(names)} {problem}: " + "; ".join(names[:10]) + ("; ..." if len(names) > 10 else "")
+        f"\n  {len(names)} {problem}: " + "; ".join(names[:most]) + ("; ..." if len(names) > most else "")
         for problem, names in wrong.items()
         if names
     ]

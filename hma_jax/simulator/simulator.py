@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, require
-from hma_jax.config.base import require_choice
+from hma_jax.config.base import require_choice, require_seed
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
@@ -126,7 +126,7 @@ class Simulator:
     @property
     def deaf(self) -> bool:
         """Whether the model was trained without actions, so that none has an effect."""
-        return self.model.run.train.masking.setting == "passive"
+        return self.model.run.train.masking.deaf
 
     def describe(self, robots: Sequence[Robot]) -> None:
         """Takes better descriptions of robots, for episodes that begin from now on. ConfigError if one does not fit."""
@@ -159,7 +159,8 @@ class Simulator:
         numbers = [seeds + i for i in range(len(which))] if counted else whole_numbers("seeds", seeds)
         asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"
         require(len(each) == len(numbers) == len(which), asked)
-        require(all(0 <= s < 2**32 for s in numbers), "seeds must lie in [0, 2^32)")
+        for number in numbers:
+            require_seed(number, "seeds")
         new = {b: self._episode(start, int(seed)) for b, start, seed in zip(which, each, numbers, strict=True)}
         if not which:
             return self.images

@@ -93,8 +93,8 @@ def require_frames(run: Run, deed: str) -> None:
     masking = run.train.masking
     require(
         masking.predicts_frames,
-        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are none to "
-        f"{deed}. `hma evaluate` judges its actions; for this take a model that was trained with one of "
+        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are none "
+        f"to {deed}. `hma evaluate` judges its actions; for this take a model that was trained with one of "
         f"{', '.join(PREDICT_FRAMES)}",
     )
 

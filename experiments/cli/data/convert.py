@@ -130,7 +130,7 @@ def egoexo4d(
 def _convert(source: Source, destination: Destination, default_name: str, no_cameras: Collection[str] = ()) -> None:
     from data_pipelines.convert.write import convert
     from data_pipelines.errors import DataError, without_advice
-    from data_pipelines.sources.units import UnitError
+    from data_pipelines.sources.units import UnitError, told_left_out
 
     name = destination.name or re.sub(r"[^a-z0-9_]+", "_", default_name.lower()).strip("_")
     with step(f"convert {len(source.units)} to {name}") as update:
@@ -150,7 +150,7 @@ def _convert(source: Source, destination: Destination, default_name: str, no_cam
     for reason, count in done.left_out.items():
         say(f"left out {count:,} x: {reason}")
     if no_cameras:
-        say(f"left out: {', '.join(no_cameras)}; docs/own_data.md says what is a camera")
+        say(told_left_out(no_cameras))
     inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
     say(
         "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "

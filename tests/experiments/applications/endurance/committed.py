@@ -69,9 +69,9 @@ def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, floa
     return mean, half
 
 
-def by_place(name: str) -> dict[tuple, dict]:
-    """(robot, start, part) -> row of a committed table of one variant."""
-    rows = read_rows(RESULTS / name)
+def by_place(name: str, variant: str | None = None) -> dict[tuple, dict]:
+    """(robot, start, part) -> row of a committed table, of one variant where it has several."""
+    rows = [row for row in read_rows(RESULTS / name) if variant in (None, row["variant"])]
     places = {(row["robot"], row["start"], row["part"]): row for row in rows}
     assert len(places) == len(rows)
     return places
@@ -79,8 +79,7 @@ def by_place(name: str) -> dict[tuple, dict]:
 
 def of_three_starts(name: str) -> dict[tuple, dict]:
     """(robot, start, minute) -> row of the served model over ten minutes: "grown", or with tokens "drawn"."""
-    more = [row for row in read_rows(RESULTS / "more_starts.csv") if row["variant"] == name]
-    return by_place(f"{name}_ten.csv") | {(row["robot"], row["start"], row["part"]): row for row in more}
+    return by_place(f"{name}_ten.csv") | by_place("more_starts.csv", name)
 
 
 def gain(measure: str, pairs: list[tuple[dict, dict]]) -> tuple[float, float]:

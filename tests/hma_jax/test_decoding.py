@@ -1,0 +1,78 @@
+"""How one frame is filled: how many tokens stay masked, which are drawn, and what tokens do not allow."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
+from hma_jax.generation import decoding
+from hma_jax.generation.decoding import Frame, masked_counts, unmask
+from tests.tiny import DIFFUSION, model_config
+
+
+def test_masked_counts_are_the_cosine_schedule_of_the_release():
+    discrete = model_config(tokens=256)
+    assert masked_counts(discrete, 1) == [0]
+    assert masked_counts(discrete, 2) == [182, 0]
+    assert masked_counts(discrete, 4) == [237, 182, 98, 0]
+    assert masked_counts(discrete, 8) == [252, 237, 213, 182, 143, 98, 50, 0]
+    continuous = model_config(tokens=256, diffusion=DIFFUSION)
+    assert masked_counts(continuous, 4) == [236, 181, 97, 0]
+
+
+def test_where_half_of_a_frame_stays_masked_the_last_bit_is_the_release_s():
+    """cos(pi/2 2/3) comes out a little above or below 1/2, by the order of its products: one token more or less."""
+    discrete = model_config(tokens=256)
+    assert [masked_counts(discrete, steps)[2 * steps // 3 - 1] for steps in (3, 39, 51)] == [129, 129, 129]
+    continuous = model_config(tokens=256, diffusion=DIFFUSION)
+    assert [masked_counts(continuous, steps)[2 * steps // 3 - 1] for steps in (3, 39, 51)] == [128, 127, 127]
+
+
+def test_known_positions_are_never_drawn_again():
+    frame = Frame(jnp.array([[7, 0, 0, 0]]), jnp.array([[False, True, True, True]]))
+    out = unmask(frame, jnp.array([[1, 2, 3, 4]]), jnp.array([[0.0, 0.1, 0.9, 0.5]]), 1)
+    np.testing.assert_array_equal(out.values, [[7, 0, 3, 4]])
+    np.testing.assert_array_equal(out.masked, [[False, True, False, False]])
+    out = unmask(out, jnp.array([[5, 6, 7, 8]]), jnp.zeros((1, 4)), 0)
+    np.testing.assert_array_equal(out.values, [[7, 6, 3, 4]])
+
+
+@pytest.mark.parametrize("tokens", [1, 4])
+def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monkeypatch, tokens: int):
+    """Of nine looks at so few tokens some unmask none, and the denoiser has nothing to draw."""
+    drawn, config = [], model_config(tokens=tokens, diffusion=DIFFUSION)
+
+    def numbered(model, z, keys, decode):
+        drawn.append(z.shape[1])
+        return jnp.full((*z.shape[:2], DIFFUSION.token_channels), float(len(drawn)))
+
+    monkeypatch.setattr(decoding, "denoise", numbered)
+    said, keys = jnp.zeros((2, tokens, 3)), jax.random.split(jax.random.key(0), 2)
+    decode = DecodeConfig(9, sampler=SamplerConfig(steps=3))
+    frame = decoding.decode_frame(SimpleNamespace(config=config), said, lambda _: said, keys, decode)
+    assert min(drawn) == 1 and sum(drawn) == tokens
+    np.testing.assert_array_equal(np.sort(frame[..., 0]), [np.repeat(np.arange(1.0, len(drawn) + 1), drawn)] * 2)
+
+
+@pytest.mark.parametrize(
+    ("diffusion", "decode", "message"),
+    [
+        (None, DecodeConfig(top_k=9), "decode.top_k 9 exceeds the 8 entries"),
+        (DIFFUSION, DecodeConfig(order="confidence"), "'confidence' needs probabilities"),
+        (DIFFUSION, DecodeConfig(top_k=3), "top_k draws among the entries of a factor"),
+        (
+            DIFFUSION,
+            DecodeConfig(sampler=SamplerConfig(steps=21)),
+            "sampler.steps 21 exceeds the model.diffusion.steps 20",
+        ),
+    ],
+)
+def test_frames_are_not_filled_in_ways_that_their_tokens_do_not_have(diffusion, decode: DecodeConfig, message: str):
+    model = SimpleNamespace(config=model_config(diffusion=diffusion))
+    with pytest.raises(ConfigError, match=message):
+        decoding.decode_frame(
+            model, jnp.zeros((1, 9, 3)), lambda _: None, jax.random.split(jax.random.key(0), 1), decode
+        )
