@@ -27,16 +27,12 @@ FAST_COMPILATION = [
     "--xla_backend_optimization_level=0",
     "--xla_cpu_parallel_codegen_split_count=1",  # the other core has tests of its own
 ]
-if tuple(map(int, version("jaxlib").split(".")[:3])) < (
-    0,
-    11,
-    1,
-):  # later ones end the process at a flag they do not know
+# Later ones end the process at a flag that they do not know.
+if tuple(map(int, version("jaxlib").split(".")[:3])) < (0, 11, 1):
     FAST_COMPILATION.append("--xla_cpu_use_fusion_emitters=false")  # half the time of the compiler
 os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
-os.environ.setdefault(
-    "JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "1"
-)  # of each operation's origin one line: a tenth of the time
+# Of each operation's origin one line: a tenth of the time.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "1")
 # Tracing makes millions of objects that live on: looking through them again and again took an eighth of all time.
 gc.set_threshold(100_000, 20, 20)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would not hear Ctrl-C
