@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import types
 import typing
 from typing import Any, Literal
@@ -30,13 +31,17 @@ def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
     require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
 
 
-def check_choices(config: Any) -> None:
-    """Raises ConfigError for a field of a dataclass that is not among the choices of its type: a Literal, one or
-    None, or a tuple of such."""
+def check_fields(config: Any, limits: tuple[str, ...] = ()) -> None:
+    """Raises ConfigError for a field of a dataclass that is not among the choices of its type (a Literal, one or
+    None, or a tuple of such), and for a number that is not finite. Of `limits` infinity is none at all."""
+    where = type(config).__name__
     for name, choices, several in _choices(type(config)):
         value = getattr(config, name)
         for one in value if several else (value,):
-            require_choice(one, choices, f"{type(config).__name__}.{name}")
+            require_choice(one, choices, f"{where}.{name}")
+    for name, value in vars(config).items():
+        finite = not isinstance(value, float) or math.isfinite(value) or (name in limits and value == math.inf)
+        require(finite, f"{where}.{name} must be finite, got {value}")
 
 
 @functools.cache

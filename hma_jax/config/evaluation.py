@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require, require_seed
+from hma_jax.config.base import check_fields, require, require_seed
 from hma_jax.config.model import ModelConfig
 
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
@@ -35,7 +35,7 @@ class SamplerConfig:
     scale_initial_noise: bool = True
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.steps >= 2, f"sampler.steps must be at least 2, got {self.steps}")
         require(self.temperature >= 0, f"sampler.temperature must not be negative, got {self.temperature}")
         require(0.0 <= self.eta <= 1.0, f"sampler.eta must lie in [0, 1], got {self.eta}")
@@ -75,7 +75,7 @@ class DecodeConfig:
     slide: Literal["exact", "streaming"] = "exact"
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")
         require(self.temperature >= 0, f"decode.temperature must not be negative, got {self.temperature}")
         require(self.top_k >= 0, f"decode.top_k must not be negative, got {self.top_k}")
@@ -100,7 +100,7 @@ class EvalConfig:
     seed: int = 0  # of the choice of windows and of all draws
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
         require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
         require(self.random_actions >= 1, "eval.random_actions must be at least 1")

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require
+from hma_jax.config.base import check_fields, require
 
 Dtype = Literal["float32", "bfloat16"]
 
@@ -42,7 +42,7 @@ class MeshConfig:
     min_shard_size: int = 2**14  # smaller parameters stay whole on every device
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         sizes = (self.data, self.fsdp, self.tensor)
         require(sizes.count(-1) <= 1, f"mesh: only one axis may be -1, got {sizes}")
         require(all(s == -1 or s >= 1 for s in sizes), f"mesh axes must be -1 or at least 1, got {sizes}")
@@ -70,6 +70,6 @@ class ExecutionConfig:
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.accumulate >= 1, f"execution.accumulate must be at least 1, got {self.accumulate}")
         require(self.windows_at_once >= 1, f"execution.windows_at_once must be at least 1, got {self.windows_at_once}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require
+from hma_jax.config.base import check_fields, require
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class MupConfig:
     without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()  # ingredients taken away
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.base_width >= 1, f"mup.base_width must be at least 1, got {self.base_width}")
         require(self.attention_scale > 0, f"mup.attention_scale must be positive, got {self.attention_scale}")
 
@@ -52,7 +52,7 @@ class DiffusionConfig:
     time_shift: float = 1.0
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self, limits=("clip", "weight_cap"))
         for name in ("channels", "patch", "width", "depth", "repeats"):
             value = getattr(self, name)
             require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")
@@ -116,7 +116,7 @@ class ModelConfig:
     mup: MupConfig = field(default_factory=MupConfig)
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         for name in ("width", "layers", "heads", "frames", "tokens", "factors", "action_tokens"):
             require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
         require(
@@ -127,7 +127,14 @@ class ModelConfig:
             self.width * self.mlp_ratio >= 1,
             f"model.mlp_ratio {self.mlp_ratio} of model.width {self.width} leaves the MLP no width",
         )
+        for name in ("trunk_gain", "stem_gain"):  # of matrices that are all zero no gradient leads away
+            require(getattr(self, name) > 0, f"model.{name} must be positive, got {getattr(self, name)}")
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
+        require(
+            self.diffusion is not None or self.vocab_size <= 2**31,
+            f"model.factors {self.factors} of model.factor_vocab {self.factor_vocab} entries make {self.vocab_size} ids, "
+            f"more than the {2**31} that an int32 tells apart",
+        )
         require(
             not self.chain_factors or (self.factors > 1 and self.diffusion is None),
             "model.chain_factors needs ids of several factors: model.factors of at least 2 and no model.diffusion",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require
+from hma_jax.config.base import check_fields, require
 from hma_jax.config.execution import Dtype
 from hma_jax.config.tokenizer import TokenizerConfig
 
@@ -122,7 +122,7 @@ class Magvit2Config(Ids):
     compute_dtype: Dtype = "float32"
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(len(self.multipliers) >= 1, "magvit2.multipliers is empty; give one per level")
         _check_levels("magvit2", [self.channels * m for m in self.multipliers], self.groups)
         require(self.channels % self.groups == 0, f"magvit2.channels {self.channels} do not fit its groups")
@@ -159,7 +159,7 @@ class SvdVaeConfig(Latents):
     compute_dtype: Dtype = "float32"
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(len(self.channels) >= 1, "svd-vae.channels is empty; give one number per level")
         _check_levels("svd-vae", self.channels, self.groups)
         for name in ("layers", "latent_channels", "patch"):
@@ -186,7 +186,7 @@ class PixelsConfig(Latents):
     std: float = 0.5  # of pixels in -1..1, about that of natural images
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.patch >= 1, f"pixels.patch must be at least 1, got {self.patch}")
         require(self.std > 0, f"pixels.std must be positive, got {self.std}")
         self._check_size("pixels")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hma_jax.config.base import check_choices, require, require_seed
+from hma_jax.config.base import check_fields, require, require_seed
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class TokenizerConfig:
     latent_noise: float = 0.1
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         d = self.downsample
         require(d >= 2 and d & (d - 1) == 0, f"tokenizer.downsample must be a power of two, got {d}")
         require(
-            self.image_size % d == 0,
+            self.image_size >= d and self.image_size % d == 0,
             f"tokenizer.image_size {self.image_size} is not a multiple of downsample {d}",
         )
         require(self.bits >= 1, f"tokenizer.bits must be at least 1, got {self.bits}")
@@ -108,7 +108,7 @@ class TokenizerTrainConfig:
     seed: int = 0  # of initial values and order of frames
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self, limits=("clip_norm",))
         require(self.steps >= 1, f"tokenizer training: steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"tokenizer training: batch must be at least 1, got {self.batch}")
         require(

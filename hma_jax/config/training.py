@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require, require_seed
+from hma_jax.config.base import check_fields, require, require_seed
 from hma_jax.config.model import ModelConfig
 
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
@@ -70,11 +70,12 @@ class MaskingConfig:
     action_leak: ActionLeak = "none"
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain", "own_past", "displaced_past")
         for name in (*shares, "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
+        require(self.label_smoothing < 1, "masking.label_smoothing 1 leaves nothing of the labels to learn from")
         require(
             self.mask_angle_min < 1 or self.min_ratio > 0 or self.horizon_gain > 0,
             "masking.mask_angle_min 1 masks no token, so that nothing is learned; set it below 1, or masking.min_ratio",
@@ -82,6 +83,10 @@ class MaskingConfig:
         # The first frame is never masked: nothing comes before it.
         require(self.prompt_frames >= 1, f"masking.prompt_frames must be at least 1, got {self.prompt_frames}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
+        require(
+            self.action_loss_weight > 0 or self.predicts_frames,
+            f"masking.action_loss_weight is 0, and {self.setting!r} predicts actions alone: nothing would be learned",
+        )
         require(self.own_past_rounds >= 1, f"masking.own_past_rounds must be at least 1, got {self.own_past_rounds}")
         require(self.change_weight > 0, f"masking.change_weight must be positive, got {self.change_weight}")
         require(
@@ -129,7 +134,7 @@ class OptimizerConfig:
     learning_rate: float = 1e-4
     schedule: Literal["constant", "cosine", "wsd"] = "constant"  # of the learning rate, after the warmup
     warmup_steps: int = 500  # over which the learning rate rises from 0
-    final_fraction: float = 0.1  # of the learning rate, at the end of cosine and wsd
+    final_fraction: float = 0.1  # of the learning rate, which cosine and wsd come to right after the last step
     decay_fraction: float = 0.2  # of all steps, the decay phase of wsd
     beta1: float = 0.9  # AdamW's decay of the first moment
     beta2: float = 0.95  # and of the second
@@ -141,7 +146,7 @@ class OptimizerConfig:
     matrices: Literal["adamw", "muon"] = "adamw"
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self, limits=("clip_norm",))
         require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")
         require(self.warmup_steps >= 0, "optimizer.warmup_steps must not be negative")
         require(self.clip_norm > 0, f"optimizer.clip_norm must be positive, got {self.clip_norm}")
@@ -149,6 +154,10 @@ class OptimizerConfig:
             require(0 <= getattr(self, name) < 1, f"optimizer.{name} must lie in [0, 1), got {getattr(self, name)}")
         for name in ("final_fraction", "decay_fraction"):
             require(0 <= getattr(self, name) <= 1, f"optimizer.{name} must lie in [0, 1], got {getattr(self, name)}")
+        require(
+            self.schedule != "wsd" or self.decay_fraction > 0,
+            "optimizer.decay_fraction is 0, so that schedule wsd never decays; set it, or optimizer.schedule=constant",
+        )
         require(self.epsilon > 0, f"optimizer.epsilon must be positive, got {self.epsilon}")
         require(self.weight_decay >= 0, f"optimizer.weight_decay must not be negative, got {self.weight_decay}")
 
@@ -167,7 +176,7 @@ class TrainConfig:
     action_scale: ActionScale = "deviation"  # of robots new to the model
 
     def __post_init__(self):
-        check_choices(self)
+        check_fields(self)
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"train.batch must be at least 1, got {self.batch}")
         require_seed(self.seed, "train.seed")

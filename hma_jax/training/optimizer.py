@@ -45,8 +45,9 @@ class AdamState(NamedTuple):
 def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
     """Learning rate at the muP base width for each step, linear warm-up first.
 
-    `constant` holds, `cosine` falls to final_fraction over the whole run, `wsd` holds and then
-    falls linearly to final_fraction during the last decay_fraction of the steps.
+    `constant` holds, `cosine` falls towards final_fraction over the whole run, `wsd` holds and then
+    falls towards it linearly during the last decay_fraction of the steps. Both would be there with the step after the
+    last: of a decay over n steps by wsd the last one is an n-th of the way above it.
     """
     peak, end = config.learning_rate, config.learning_rate * config.final_fraction
     warmup = min(config.warmup_steps, steps)

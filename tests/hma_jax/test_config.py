@@ -22,10 +22,11 @@ from hma_jax.config import (
     ModelConfig,
     MupConfig,
     OptimizerConfig,
+    TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
 )
-from hma_jax.config.base import check_choices
+from hma_jax.config.base import check_fields
 from hma_jax.config.json import diff, to_strict_json
 
 CONFIGS = [found for found in map(config.__dict__.get, config.__all__) if dataclasses.is_dataclass(found)]
@@ -55,11 +56,11 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         whatever: str | None = None
 
     for accepted in (Some(), Some("a", (1, 2, 1), "c")):
-        check_choices(accepted)
+        check_fields(accepted)
     with pytest.raises(ConfigError, match="Some.one: 'c' is not a choice; choose one of a, b, None"):
-        check_choices(Some("c"))
+        check_fields(Some("c"))
     with pytest.raises(ConfigError, match="Some.several: 3 is not a choice; choose one of 1, 2"):
-        check_choices(Some(several=(1, 3)))
+        check_fields(Some(several=(1, 3)))
 
 
 @pytest.mark.parametrize(
@@ -68,6 +69,13 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         (ModelConfig, {"heads": 0}, "model.heads must be at least 1, got 0"),
         (ModelConfig, {"mlp_ratio": 0.0}, "model.mlp_ratio 0.0 of model.width 256 leaves the MLP no width"),
         (ModelConfig, {"mlp_ratio": -1.0}, "model.mlp_ratio -1.0"),
+        (ModelConfig, {"trunk_gain": 0.0}, "model.trunk_gain must be positive, got 0.0"),
+        (ModelConfig, {"stem_gain": -1.0}, "model.stem_gain must be positive, got -1.0"),
+        (
+            ModelConfig,
+            {"factors": 4},
+            "model.factors 4 of model.factor_vocab 512 entries make 68719476736 ids, more than",
+        ),
         (MupConfig, {"base_width": 0}, "mup.base_width must be at least 1, got 0"),
         (MupConfig, {"attention_scale": 0.0}, "mup.attention_scale must be positive, got 0.0"),
         (DiffusionConfig, {"steps": 1}, "diffusion.steps must be at least 2, got 1"),
@@ -75,8 +83,15 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         (OptimizerConfig, {"beta2": 1.5}, r"optimizer.beta2 must lie in \[0, 1\), got 1.5"),
         (OptimizerConfig, {"final_fraction": 5.0}, r"optimizer.final_fraction must lie in \[0, 1\], got 5.0"),
         (OptimizerConfig, {"decay_fraction": 2.0}, r"optimizer.decay_fraction must lie in \[0, 1\], got 2.0"),
+        (
+            OptimizerConfig,
+            {"decay_fraction": 0.0, "schedule": "wsd"},
+            "optimizer.decay_fraction is 0, so that schedule wsd",
+        ),
         (OptimizerConfig, {"epsilon": 0.0}, "optimizer.epsilon must be positive, got 0.0"),
         (OptimizerConfig, {"weight_decay": -1.0}, "optimizer.weight_decay must not be negative, got -1.0"),
+        (TokenizerConfig, {"image_size": 0}, "tokenizer.image_size 0 is not a multiple of downsample 8"),
+        (TokenizerConfig, {"image_size": -8}, "tokenizer.image_size -8 is not a multiple of downsample 8"),
         (TokenizerTrainConfig, {"weight_decay": -1.0}, "weight_decay must not be negative, got -1.0"),
         (TokenizerTrainConfig, {"final_fraction": 5.0}, r"final_fraction must lie in \[0, 1\], got 5.0"),
         (TokenizerTrainConfig, {"seed": -1}, r"tokenizer training: seed must lie in \[0, 2\^32\), got -1"),
@@ -90,6 +105,12 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         (EvalConfig, {"perplexity_group": 0}, "eval.perplexity_group must be at least 1, got 0"),
         (MeshConfig, {"min_shard_size": -1}, "mesh.min_shard_size must not be negative, got -1"),
         (MaskingConfig, {"prompt_frames": 0}, "masking.prompt_frames must be at least 1, got 0"),
+        (MaskingConfig, {"label_smoothing": 1.0}, "masking.label_smoothing 1 leaves nothing of the labels"),
+        (
+            MaskingConfig,
+            {"setting": "policy", "action_loss_weight": 0.0},
+            "'policy' predicts actions alone: nothing would",
+        ),
         (MaskingConfig, {"mask_angle_min": 1.0}, "masking.mask_angle_min 1 masks no token"),
     ],
 )
@@ -98,8 +119,31 @@ def test_numbers_that_cannot_work_are_refused(cls, values, message):
         cls(**values)
 
 
+LIMITS = {
+    (OptimizerConfig, "clip_norm"), (TokenizerTrainConfig, "clip_norm"),
+    (DiffusionConfig, "clip"), (DiffusionConfig, "weight_cap"),
+}  # fmt: skip
+"""Fields that infinity switches off."""
+
+
+def test_no_number_of_a_configuration_is_infinite_or_none_at_all():
+    """Among them are some that ended in an OverflowError, as model.mlp_ratio=inf, and many in a loss of NaN."""
+    fields = {(cls, f.name) for cls in CONFIGS for f in dataclasses.fields(cls) if f.type == "float"}
+    assert len(fields) > 30 and fields > LIMITS
+    for cls, name in fields:
+        for value in (math.inf, -math.inf, math.nan):
+            if value == math.inf and (cls, name) in LIMITS:
+                cls(**{name: value})
+                continue
+            with pytest.raises(ConfigError, match=rf"^{cls.__name__}\.{name} must be finite, got {value}"):
+                cls(**{name: value})
+
+
 def test_limits_that_can_work_are_accepted():
     OptimizerConfig(beta1=0.0, final_fraction=0.0, decay_fraction=1.0, weight_decay=0.0)
+    OptimizerConfig(schedule="cosine", decay_fraction=0.0)
+    ModelConfig(factors=31, factor_vocab=2)  # as many ids as an int32 has
+    ModelConfig(factors=9, diffusion=DiffusionConfig())  # of latents, which have none
     MaskingConfig(mask_angle_min=1.0, min_ratio=0.5)  # half of every frame
     MeshConfig(min_shard_size=0)
 
