@@ -21,6 +21,7 @@ import numpy as np
 
 from hma_jax.config import ConfigError, require
 from hma_jax.convert.tensors import Stored
+from hma_jax.runtime.arrays import UNREADABLE
 
 STORAGES = {
     "DoubleStorage": np.float64,
@@ -126,8 +127,11 @@ class _Reader(pickle.Unpickler):
         def read() -> np.ndarray:
             if not prod(shape):
                 return np.zeros(shape, storage.dtype)
-            with zipfile.ZipFile(self.path) as archive:
-                elements = np.frombuffer(archive.read(entry), storage.dtype)[offset:]
+            try:
+                with zipfile.ZipFile(self.path) as archive:
+                    elements = np.frombuffer(archive.read(entry), storage.dtype)[offset:]
+            except UNREADABLE as error:
+                raise ConfigError(f"{self.path}: {entry} is damaged ({error}); fetch the file again") from error
             strides = [s * size for s in stride]
             return np.lib.stride_tricks.as_strided(elements, shape, strides, writeable=False).copy()
 
@@ -152,15 +156,7 @@ def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
         raise
     except zipfile.BadZipFile as error:
         raise ConfigError(f"{path}: no zip file, damaged or saved by torch before 1.6{advice}") from error
-    except (
-        pickle.UnpicklingError,
-        EOFError,
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        AttributeError,
-    ) as error:
+    except (*UNREADABLE, pickle.UnpicklingError, AttributeError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path}: its description of tensors cannot be read ({error}){advice}") from error

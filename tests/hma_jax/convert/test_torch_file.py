@@ -194,3 +194,26 @@ def test_other_files_and_other_contents_are_named(tmp_path):
         archive.writestr("readme", "")
     with pytest.raises(ConfigError, match="without a torch state dict"):
         read_torch(tmp_path / "z.bin")
+
+
+@pytest.mark.parametrize(
+    ("byte", "value", "said"),
+    [
+        (0, None, "data/0 is damaged .*CRC-32"),  # of its elements
+        (6, 1, "cannot be read .*encrypted"),  # of its entry in the archive, as the next
+        (8, 99, "cannot be read .*compression"),
+    ],
+)
+def test_damage_is_told_in_words(byte, value, said, tmp_path):
+    x = np.arange(64, dtype=np.float32)
+    path = write_torch(
+        tmp_path / "x.bin", {"w": rebuild(Storage("FloatStorage", "0", 64), (64,), (1,))}, {"0": x.tobytes()}
+    )
+    content = bytearray(path.read_bytes())
+    if value is None:
+        content[content.find(x.tobytes()) + byte] ^= 1
+    else:  # `data.pkl` is the first entry; its header stands before it, and once more in the directory at the end
+        content[content.find(b"PK\x03\x04") + byte] = content[content.find(b"PK\x01\x02") + 2 + byte] = value
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=f"x.bin.*{said}"):
+        read_torch(path)["w"].read()
