@@ -9,6 +9,7 @@ multiplies with is folded into the weights where the release would multiply othe
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,6 +37,7 @@ from hma_jax.convert.tensors import Stored, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Params
 from hma_jax.training.runs import Run
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -95,6 +97,7 @@ def read_official(directory: Path) -> Run:
             "variant": _variant(config),
             "config": config,
             "table": stable_hash(table),
+            "weights": _hash_of(params),
             "halves": {n: t.dtype.name for n, t in tensors.items() if t.dtype.name != "float32"},
         }
     }
@@ -206,11 +209,21 @@ def _form(run: Run) -> ModelConfig:
 
 
 def _untouched(run: Run) -> bool:
-    """Whether it came from the release and was not trained since."""
+    """Whether it came from the release and was not trained since, nor changed in another format."""
     source = run.provenance.get("official")
     if not source or run.step or source["table"] != stable_hash(run.table):
         return False
-    return read_model(source["config"], CONFIG) == run.model
+    if read_model(source["config"], CONFIG) != run.model:
+        return False
+    return "weights" not in source or source["weights"] == _hash_of(run.params)  # earlier versions noted none
+
+
+def _hash_of(params: Params) -> str:
+    digest = hashlib.sha256()
+    for path, array in sorted(flat(params).items()):
+        digest.update(path.encode())
+        digest.update(np.ascontiguousarray(array, "<f4"))
+    return digest.hexdigest()[:16]
 
 
 def _without_constants(arrays: dict[str, np.ndarray], table: EmbodimentTable) -> dict[str, np.ndarray]:

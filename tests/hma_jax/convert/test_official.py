@@ -11,10 +11,18 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
-from hma_jax.convert import loads_in_release, official_shapes, read_official, write_official
+from hma_jax.convert import (
+    loads_in_release,
+    official_shapes,
+    read_neutral,
+    read_official,
+    write_neutral,
+    write_official,
+)
 from hma_jax.convert.table import flat, official_parts
 from hma_jax.convert.tensors import read_safetensors
 from hma_jax.model.hma import declare_model
+from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import (
     CONTINUOUS,
     DISCRETE,
@@ -89,6 +97,23 @@ def test_a_trained_run_keeps_fields_we_have_no_use_for_and_says_what_changed(tmp
     write_official(trained, tmp_path / "b")
     before, after = (json.loads((tmp_path / x / "config.json").read_text()) for x in "ab")
     assert after == before | {"non_mlm_ratio": 0.5, "factored_vocab_size": 8}
+
+
+def test_weights_that_were_changed_in_another_format_do_not_count_as_they_came(tmp_path):
+    """`_without_constants` is for what this project made: here of a value that never varies."""
+    config = official_config(DISCRETE, ONE)
+    tensors = random_tensors(config, ONE)
+    tensors["action_preprocessor.push.std"][1] = 0
+    run = read_official(write_checkpoint(tmp_path / "a", config, tensors))
+
+    def constant_of(run: Run, name: str) -> np.ndarray:
+        write_neutral(run, tmp_path / f"{name}.ours")
+        write_official(read_neutral(tmp_path / f"{name}.ours"), tmp_path / name)
+        return read_safetensors(tmp_path / name / "model.safetensors")["action_mlp.push.model.0.weight"].read()[:, 1]
+
+    assert constant_of(run, "as it came").all()
+    biases = {"linear": {**run.params["frame_head"]["linear"], "bias": run.params["frame_head"]["linear"]["bias"] + 1}}
+    assert not constant_of(replace(run, params={**run.params, "frame_head": biases}), "changed").any()
 
 
 @pytest.mark.parametrize("base", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
