@@ -29,6 +29,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from hma_jax.config import ConfigError, require
 from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.exits import Exit, hand_on, lost_request
 from hma_jax.runtime.locks import Lock
@@ -66,6 +67,10 @@ class LoopOptions:
     # Fields of the description that may change where a run resumes: asked with what the checkpoint says, and its step.
     may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: ()
     clock: Callable[[], float] = time.perf_counter  # seconds
+
+    def __post_init__(self):
+        for name in ("keep_checkpoints", "log_every"):
+            require(getattr(self, name) >= 1, f"LoopOptions.{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,8 @@ def fit(
     so that there never are two. `make_batches(start)` yields host batches from step `start` on.
     With several processes (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin
     with this start. A stop that any of them was asked for, and saves by the minute, come after the same step for all.
-    Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy.
+    Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy, and ConfigError for batches that end before
+    the steps do.
     """
     run_dir, clock = Path(run_dir), options.clock
     # One writer per run: the others of a program with several processes leave lock and log alone.
@@ -149,7 +155,7 @@ def fit(
                 return FitResult(state, log.losses, 0.0, 0.0, start)
             log.write_start(_describe_start(start, about.execution))
             batches = make_batches(start)
-            batch = put_batch(next(batches))
+            batch = put_batch(_next(batches, start, steps))
             began = clock()
             compiled = step_fn.lower(state, batch).compile()
             compile_seconds = clock() - began
@@ -167,7 +173,7 @@ def fit(
             for step in range(start + 1, steps + 1):
                 state, metrics = compiled(state, batch)
                 if step < steps:
-                    batch = put_batch(next(batches))
+                    batch = put_batch(_next(batches, step, steps))
                 if pending is not None:
                     _report(log, *pending, about.records)
                 pending = (step, metrics)
@@ -199,6 +205,14 @@ def fit(
             seconds = clock() - began - watching
             checkpoints.wait()
     return FitResult(state, log.losses, seconds, compile_seconds, start)
+
+
+def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
+    """The batch of the step after `done` ones."""
+    try:
+        return next(batches)
+    except StopIteration:
+        raise ConfigError(f"the batches end after step {done} of {steps}; give one for every step") from None
 
 
 def _report(log: RunLog | Listener, step: int, metrics: dict[str, jax.Array], records: Records) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import multiprocessing
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, Terminated, raise_lost_request, terminated_like_interrupted
 from hma_jax.training.claim import RunBusy, locked_run
 from hma_jax.training.divergence import DivergedError
@@ -151,6 +153,14 @@ class SlowToCompile:
     def compile(self):
         self.clock.seconds += 1000
         return lambda state, batch: toy_step(state, batch)
+
+
+def test_batches_that_end_too_soon_and_options_that_cannot_work_are_told_in_words(tmp_path: Path):
+    with pytest.raises(ConfigError, match="the batches end after step 3 of 6; give one for every step"):
+        fit_toy(tmp_path, 6, make=lambda start: itertools.islice(toy_batches(start), 3))
+    for name in ("log_every", "keep_checkpoints"):
+        with pytest.raises(ConfigError, match=rf"LoopOptions\.{name} must be at least 1, got 0"):
+            LoopOptions(**{name: 0})
 
 
 def test_timing_and_utilisation_are_of_steps_alone(tmp_path: Path):
