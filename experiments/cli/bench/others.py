@@ -203,7 +203,7 @@ def release(
     dtype: Dtype = "float32",
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Time the base models beside the official PyTorch release: two processes that take turns.
+    """Time the base models beside the official PyTorch release: processes that take turns, one for each stage.
 
     On a GPU both use it.
 
