@@ -114,6 +114,10 @@ def make_predictor(
         config.first_predicted < model.frames,
         f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of {model.frames} frames",
     )
+    require(
+        config.prompt_frames <= model.frames or not predicts_actions(model, setting),
+        f"eval.prompt_frames {config.prompt_frames} leaves no action to judge in a window of {model.frames} frames",
+    )
     declared = declare_model(model, table, execution)
 
     def predict(params: Params, batch: Batch) -> tuple[dict[str, jax.Array], Predicted | None]:
@@ -131,7 +135,10 @@ def make_predictor(
             causally, statistics = setting != "inverse", judged_by(batch, table)
             metrics |= _policy_errors(hma, *window, keys("policy"), config, causally, statistics, seen)
             if predicted is None:
-                metrics["finite"] = jnp.isfinite(metrics["action_error"]) | ~(statistics[1] > 0).any(-1)
+                judged = (statistics[1] > 0).any(-1)
+                if seen is not None:
+                    judged &= seen[:, config.prompt_frames - 1 :].any(1)
+                metrics["finite"] = jnp.isfinite(metrics["action_error"]) | ~judged
         return metrics, predicted
 
     return predict
@@ -248,7 +255,8 @@ def _policy_errors(
     real_BT: jax.Array | None,
 ) -> dict[str, jax.Array]:
     """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live action value, of the
-    model and of always giving the mean; nan where no value is live, as of a robot without actions."""
+    model and of always giving the mean; nan where no value is live, as of a robot without actions, and where the window
+    ends before the prompt does."""
     decode, first = config.decode, config.prompt_frames - 1
     if causally:
         predicted = predict_next_actions(model, tokens, actions_BTU, embodiment_B, key_B, decode)
@@ -265,7 +273,7 @@ def _policy_errors(
         of_window = error_BTU.mean(1)
         if real_BT is not None:
             real = real_BT[:, first:, None]
-            of_window = jnp.sum(error_BTU * real, 1) / jnp.maximum(jnp.sum(real, 1), 1)
+            of_window = jnp.sum(error_BTU * real, 1) / jnp.sum(real, 1)
         return jnp.sum(of_window * alive_BU, -1) / alive_BU.sum(-1)
 
     error, of_mean = mean((guess - truth) ** 2), mean(truth**2)

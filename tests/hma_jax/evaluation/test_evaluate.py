@@ -122,6 +122,21 @@ def test_robots_without_actions_have_no_error_of_predicted_ones(monkeypatch):
         assert name not in of_robots["arm"] and overall[name].mean == of_robots["pusher"][name].mean != 0
 
 
+def test_a_window_that_ends_before_the_prompt_has_no_error_of_predicted_actions(monkeypatch):
+    """With recorded frames a window needs no more than two; its error was 0, a perfect prediction."""
+    (batch,) = make_batches(CONFIG, each=2)
+    monkeypatch.setattr(protocol, "predict_next_actions", lambda model, tokens, actions, *_: actions + 1)
+    config = replace(EVAL, context="recorded", prompt_frames=3)
+    inputs = (batch["tokens"], batch["actions"], batch["embodiment"])
+    mean, std = (np.asarray(x)[batch["embodiment"]] for x in TABLE.statistics())
+    real = np.arange(CONFIG.frames) < np.array([2, 3, 4, CONFIG.frames])[:, None]
+    found = protocol._policy_errors(CONFIG, *inputs, None, config, True, (mean, std), real)["action_error"]
+    np.testing.assert_array_equal(np.isnan(found), [True, False, False, False])
+    np.testing.assert_allclose(found[1:3], [np.mean(own[own > 0] ** -2.0) for own in std[1:3]], rtol=1e-3)
+    with pytest.raises(ConfigError, match="eval.prompt_frames 9 leaves no action to judge in a window of"):
+        protocol.make_predictor(CONFIG, TABLE, replace(config, prompt_frames=9), "policy")
+
+
 @pytest.mark.parametrize("setting", ["policy", "inverse"])
 def test_what_was_trained_for_actions_alone_is_judged_by_them_alone(params, setting):
     """Its frames were said to have a perplexity and a PSNR, of a head that nothing had trained."""
