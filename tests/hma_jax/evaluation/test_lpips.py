@@ -140,8 +140,9 @@ class Harmful:
         lambda values: values | {"NetLinLayer_1": values["NetLinLayer_0"]},
         lambda values: pickle.dumps(values)[:-100],
         lambda values: b"",
+        lambda values: b"Ione\n.",
     ],
-    ids=["code", "missing", "shape", "torn", "empty"],
+    ids=["code", "missing", "shape", "torn", "empty", "damaged"],
 )
 def test_another_file_is_refused_by_name(weights, package, change, capsys):
     package(change(as_published(weights)))
