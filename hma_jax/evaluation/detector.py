@@ -45,9 +45,9 @@ def init_detector(key: jax.Array, robots: int, points: int) -> Weights:
     for name, shape in shapes.items():
         key, own = jax.random.split(key)
         fan_in = shape[-2] * (shape[0] * shape[1] if len(shape) == 4 else 1)
-        weights[name] = jax.random.normal(own, shape) * (2.0 / fan_in) ** 0.5
-        weights[name + "_bias"] = jnp.zeros(shape[-1])
-    return weights | {"heads_bias": jnp.full((robots, points), -4.0)}
+        weights[name] = jax.random.normal(own, shape, jnp.float32) * (2.0 / fan_in) ** 0.5
+        weights[name + "_bias"] = jnp.zeros(shape[-1], jnp.float32)
+    return weights | {"heads_bias": jnp.full((robots, points), -4.0, jnp.float32)}
 
 
 def _conv(weights: Weights, name: str, x: jax.Array, stride: int = 1) -> jax.Array:

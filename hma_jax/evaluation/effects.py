@@ -25,6 +25,7 @@ from hma_jax.config import ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.metrics import factored_cross_entropy, mean_over_frames
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.generation import next_frame_outputs
+from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
@@ -177,7 +178,7 @@ def make_loss(
         hidden = never_shown(table, setting, batch["embodiment"], model.frames)
         said = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
         if model.diffusion:
-            keys = jax.vmap(jax.random.key)(jnp.arange(len(tokens)))  # common noise under all changes
+            keys = jax.vmap(key_of)(jnp.arange(len(tokens)))  # common noise under all changes
             return mean_over_frames(frame_diffusion_loss(hma, said, tokens[:, 1:], keys), followed)
         return mean_over_frames(factored_cross_entropy(hma.logits(said, tokens[:, 1:]), tokens[:, 1:]), followed)
 

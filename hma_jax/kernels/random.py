@@ -6,13 +6,38 @@ the type of the numbers: those of JAX's default types are others under JAX_ENABL
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.extend import random as generators
 
-GENERATOR = "threefry2x32"
+
+def _partitionable(draw: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """`draw` as it is by JAX's default, whatever JAX_THREEFRY_PARTITIONABLE says."""
+
+    @functools.wraps(draw)
+    def drawn(*args: Any) -> jax.Array:
+        with jax.threefry_partitionable(True):
+            return draw(*args)
+
+    return drawn
+
+
+_THREEFRY = generators.threefry_prng_impl
+
+GENERATOR = generators.define_prng_impl(
+    key_shape=_THREEFRY.key_shape,
+    seed=_THREEFRY.seed,
+    split=_partitionable(_THREEFRY.split),
+    random_bits=_partitionable(_THREEFRY.random_bits),
+    fold_in=_THREEFRY.fold_in,
+    name="hma_threefry2x32",
+    tag="hma",
+)
 """JAX's default, from which JAX_DEFAULT_PRNG_IMPL may lead away; of others, numbers depend on batches and devices."""
 
 Sample = Callable[[jax.Array, tuple[int, ...], jnp.dtype], jax.Array]

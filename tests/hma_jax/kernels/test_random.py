@@ -1,5 +1,7 @@
 """Numbers that are drawn in a row, and keys that draw the same whatever JAX's own settings are."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,12 +40,21 @@ def draws() -> list[jax.Array]:
     ]
 
 
-def test_settings_of_jax_change_no_number_that_a_seed_decides():
+@pytest.mark.parametrize(
+    "setting",
+    [partial(jax.enable_x64, True), partial(jax.default_prng_impl, "rbg"), partial(jax.threefry_partitionable, False)],
+    ids=["x64", "rbg", "partitionable"],
+)
+def test_settings_of_jax_change_no_number_that_a_seed_decides(setting):
     usual = draws()
-    with jax.enable_x64(True):
-        twice_as_wide = draws()
-    with jax.default_prng_impl("rbg"):
+    with setting():
         elsewhere = draws()
-    for mine, wide, other in zip(usual, twice_as_wide, elsewhere, strict=True):
-        np.testing.assert_array_equal(mine, wide)
+    for mine, other in zip(usual, elsewhere, strict=True):
         np.testing.assert_array_equal(mine, other)
+
+
+def test_numbers_are_those_of_the_default_generator_of_jax():
+    ours, theirs = key_of(3), jax.random.key(3, impl="threefry2x32")
+    np.testing.assert_array_equal(jax.random.key_data(ours), jax.random.key_data(theirs))
+    for draw in (jax.random.bits, lambda key: jax.random.key_data(jax.random.split(jax.random.fold_in(key, 1)))):
+        np.testing.assert_array_equal(draw(ours), draw(theirs))
