@@ -128,8 +128,13 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def load_predictions(folder: Path) -> dict[str, Prediction]:
-    """By file name. Raises ConfigError for one that was edited or cannot be read."""
-    return {path.name: _load(path) for path in sorted(folder.glob("*.json"))}
+    """By file name; of copies, which would count twice in what came, the first. Raises ConfigError for one that was
+    edited or cannot be read."""
+    found: dict[str, Prediction] = {}
+    for path in sorted(folder.glob("*.json")):
+        if (prediction := _load(path)) not in found.values():
+            found[path.name] = prediction
+    return found
 
 
 def _load(path: Path) -> Prediction:

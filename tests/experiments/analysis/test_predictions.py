@@ -129,6 +129,17 @@ def test_a_prediction_after_the_fact_is_marked(root):
     assert any("no prediction" in mark for mark in marks[late.finished]) and not marks[prediction.finished]
 
 
+def test_a_copy_of_a_prediction_counts_once(root):
+    """It was shown twice, as if two had come true."""
+    predict(root)
+    folder = root / "predictions"
+    [path] = folder.glob("*.json")
+    shutil.copy(path, folder / "a_copy.json")
+    [prediction] = load_predictions(folder).values()
+    save_prediction(folder / "other.json", replace(prediction, high=prediction.high + 1))
+    assert len(load_predictions(folder)) == 2
+
+
 @pytest.mark.parametrize(
     "words, says",
     [
