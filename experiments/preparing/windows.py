@@ -56,6 +56,7 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
         _remark(name, facts, manifest.empty.get(name, ""))
     say_padded(summary, frames, workspace.data_summary.name)
     _say_held_out(summary, study.store)
+    say_alone(summary)
     without = [name for name, facts in summary.items() if not facts["windows"]]
     if without:
         console.print(
@@ -178,6 +179,22 @@ def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> No
         say(
             f"note: training episodes too short for {frames} frames, whose windows end with padding: {few(each)}"
             f"{f' ({file})' if len(each) > 3 else ''}"
+        )
+
+
+def say_alone(summary: dict[str, dict[str, int]]) -> None:
+    """Names the robots of one training episode: of no other one can a control take their actions."""
+    from data_pipelines.registry import get_spec
+
+    alone = [
+        name
+        for name, facts in summary.items()
+        if facts["windows"] and facts["episodes"] - facts["too_short"] == 1 and get_spec(name).action_dim
+    ]
+    if alone:
+        say(
+            f"note: one training episode to cut windows of: {few(alone)}. A control, trained on shuffled actions, gets those "
+            "of the same episode there, of a single window its own, so that it may follow them"
         )
 
 

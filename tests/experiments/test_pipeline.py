@@ -62,6 +62,23 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     assert not batch["other_seen"].any()
 
 
+def test_robots_of_which_a_control_has_no_other_episode_are_named(capsys):
+    """Trained on shuffled actions, it was given their own without a word."""
+    facts = {
+        "bridge_dataset": {"episodes": 3, "too_short": 2, "windows": 1},
+        "fractal20220817_data": {"episodes": 3, "too_short": 1, "windows": 2},
+        "rover_slate": {"episodes": 1, "too_short": 0, "windows": 9},  # has no actions
+        "arm_sand": {"episodes": 2, "too_short": 2, "windows": 0},
+    }
+    windows.say_alone(facts)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert (
+        "one training episode to cut windows of: bridge_dataset. A control, trained on shuffled actions, gets" in line
+    )
+    windows.say_alone({name: facts[name] for name in ("rover_slate", "arm_sand")})
+    assert capsys.readouterr().out == ""
+
+
 def test_what_is_held_out_of_a_small_dataset_is_said_with_what_bounds_it(capsys):
     facts = {"bridge_dataset": {"held_out": 1, "episodes": 1}}
     windows._say_held_out(facts, get_preset("smoke").store)
