@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -26,7 +27,7 @@ def unwritable(directory: Path, error: OSError, option: str | None = "--out") ->
     """That `directory` cannot be made or written in: which directory above it, or which file, is in the way."""
     there = next(p for p in (directory, *directory.parents) if os.path.exists(p))
     what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
-    advice = f"choose another {option}, in" if option else "copy it to"
-    return ConfigError(
-        f"cannot write to {directory}: {what} ({error.strerror}); {advice} a directory where you may write"
-    )
+    advice = f"{f'choose another {option}, in' if option else 'copy it to'} a directory where you may write"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        advice = "make room on its disk"
+    return ConfigError(f"cannot write to {directory}: {what} ({error.strerror}); {advice}")

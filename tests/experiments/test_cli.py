@@ -160,15 +160,18 @@ def test_report_is_drawn_again_from_disk(tmp_path, capsys):
     assert "report.html" in capsys.readouterr().out and workspace.report.exists()
 
 
-def test_a_report_that_cannot_be_written_names_no_option_that_there_is_not(tmp_path, monkeypatch, capsys):
-    def read_only(dir: Path) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(dir))
+@pytest.mark.parametrize(
+    ("why", "do"),
+    [(errno.EROFS, "copy it to a directory where you may write"), (errno.ENOSPC, "make room on its disk")],
+)
+def test_a_report_that_cannot_be_written_names_no_option_that_there_is_not(why, do, tmp_path, monkeypatch, capsys):
+    def refuse(dir: Path) -> None:
+        raise OSError(why, os.strerror(why), str(dir))
 
     save_record(finished_study(tmp_path), record_of())
-    monkeypatch.setattr(outputs.tempfile, "TemporaryFile", read_only)
+    monkeypatch.setattr(outputs.tempfile, "TemporaryFile", refuse)
     assert main(["report", str(tmp_path)]) == 2
-    said = f"nothing can be written in {tmp_path} (Read-only file system); copy it to a directory where you may write"
-    assert said in capsys.readouterr().err
+    assert f"nothing can be written in {tmp_path} ({os.strerror(why)}); {do}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["report", "fit"])
