@@ -17,6 +17,7 @@ from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial
+from experiments.words import counted
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ def plan_table(
     the tokenizer is trained here, `evaluated`: trials are judged, not only trained; `done` is not counted again."""
     plans = plan_trials(study, sweeps, devices.each, evaluated, done)
     several = len({plan.trial.train.steps for plan in plans.values()}) > 1
-    budget = f"{all_steps(sweeps)} steps x batch {study.train.batch}"
+    budget = f"{all_steps(sweeps)} x batch {study.train.batch}"
     table = tidy_table(
-        f"Study '{study.name}': {len(plans)} trial{'s' * (len(plans) != 1)} of {budget}",
+        f"Study '{study.name}': {counted(len(plans), 'trial')} of {budget}",
         "trial", "sets", "videos", "width", *["steps"] * several, "params", "one robot", "FLOPs", "time",
     )  # fmt: skip
     table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
@@ -91,7 +92,7 @@ def _say_done(done: Done, trials: int) -> str:
     before = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
     parts = [name for name, there in before.items() if there]
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
-    parts += [f"{sum(done.steps.values()):,} steps of training"] if done.steps else []
+    parts += [f"{counted(sum(done.steps.values()), 'step')} of training"] if done.steps else []
     said = f"There already, and not counted: {', '.join(parts)}. " if parts else ""
     if done.left:
         how = " or ".join(sorted(set(done.left.values())))

@@ -11,6 +11,11 @@ def few(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
+def counted(n: int, thing: str) -> str:
+    """'1 step', '2,000 steps'."""
+    return f"{n:,} {thing}{'s' * (n != 1)}"
+
+
 def number(value: float, error: float, sign: str = "") -> str:
     """`value` to two digits of its standard error, and four after the point at most; what rounds to zero has no minus.
     `sign`: "+" for one before every value."""

@@ -19,6 +19,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from experiments.analysis.fits import DRAWS, OFTEN, UNLIKELY, Coefficient, interval
 from experiments.analysis.measured import Measured
+from experiments.words import counted
 
 TOLERANCE = 0.1
 """How far off a budget a size's nearest measured FLOPs may lie beyond its ends, as a part of it."""
@@ -137,7 +138,7 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     logs = np.stack([line.at(flops) for line in covering]) if covering else np.zeros((0, 1))
     loss = np.exp(logs[:, 0])
     if len(sizes) < LEAST_SIZES:
-        few = f"{len(sizes)} sizes; at least {LEAST_SIZES} are needed"
+        few = f"{counted(len(sizes), 'size')}; at least {LEAST_SIZES} are needed"
         return Budget(flops, sizes, loss, refused=few), np.array([])
     least, at_end = int(np.argmin(loss)), np.isin(np.argmin(logs, 0), (0, len(sizes) - 1))  # at_end [1 + R]
     first = max(min(least - NEAR, len(sizes) - 2 * NEAR - 1), 0)

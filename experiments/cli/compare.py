@@ -88,7 +88,8 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     for side, other in ((a, b), (b, a)):
         if len(side.seeds) > several:
             kept, there = (", ".join(map(str, x)) for x in ([s for s in side.seeds if s in other.seeds], side.seeds))
-            table.caption += f" Of the seeds of {escape(side.name)} ({there}) only {kept} is compared."
+            verb = "is" if several == 1 else "are"
+            table.caption += f" Of the seeds of {escape(side.name)} ({there}) only {kept} {verb} compared."
             if not other.says_seed:
                 unsaid = "does not say with which seed it was trained, and stands for"
                 table.caption += f" {escape(other.name)} {unsaid} {kept}."

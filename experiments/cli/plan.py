@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 from experiments.cli.bench.arguments import Model
 from experiments.progress import console, say, step, tidy_table
 from experiments.setting import Preset, StudyArguments, make_setting
+from experiments.words import counted
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
 
@@ -83,7 +84,7 @@ def plan(
     rows: list[tuple[str, Plan]] = []
     for name in topology:
         devices = find_devices(name)
-        with step(f"compile {what} for {name} ({len(devices)} devices)"):
+        with step(f"compile {what} for {name} ({counted(len(devices), 'device')})"):
             rows.append((name, make_plan(config, table, train, execution, devices)))
     if not brief:
         for name, made in rows:
@@ -143,7 +144,7 @@ def _asked(asked: Planned, shape: Shape) -> tuple[str, ModelConfig, EmbodimentTa
     study = make_setting(asked).study
     trial = reference_trial(study, study.seeds[0])
     table = declared_table(trial.datasets, trial.rate)
-    what = f"{study.name}, width {study.model.width}, {table.size} robots"
+    what = f"{study.name}, width {study.model.width}, {counted(table.size, 'robot')}"
     return what, trial.model, table, trial.train, study.execution
 
 

@@ -18,7 +18,7 @@ from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, short
 from experiments.sweeps.sweep import reference_trial
-from experiments.words import few
+from experiments.words import counted, few
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.config.json import diff
@@ -311,9 +311,10 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
     from experiments.running.run_trial import open_materials, train_trial
     from hma_jax.runtime.processes import is_writer
 
-    materials, steps = open_materials(setting.workspace), trial.train.steps
+    materials = open_materials(setting.workspace)
     say_data(trial, materials)
-    with step(f"train width {trial.model.width} for {steps:,} steps of {trial.train.batch} windows") as update:
+    each = counted(trial.train.batch, "window")
+    with step(f"train width {trial.model.width} for {counted(trial.train.steps, 'step')} of {each}") as update:
         result = train_trial(
             trial,
             materials,
@@ -325,7 +326,7 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
         )
     if not is_writer():
         return
-    console.print(f"loss {result.losses[-1]:.4f} after {len(result.losses):,} steps")
+    console.print(f"loss {result.losses[-1]:.4f} after {counted(len(result.losses), 'step')}")
     wrote(run, then=setting.command("evaluate", run.absolute()))
 
 
@@ -339,8 +340,8 @@ def say_data(trial: Trial, materials: Materials) -> None:
     there = sum(len(materials.store.manifest(name).train.episodes) for name in trial.datasets)
     limit = "" if trial.max_trajectories is None else f" (at most {trial.max_trajectories:,} of each robot)"
     console.print(
-        f"training on {len(used)} of {len(trial.datasets)} robots: {sum(len(s.episodes) for s in used):,} of {there:,} "
-        f"trajectories{limit}, {sum(map(len, used)):,} windows of {trial.model.frames} frames",
+        f"training on {len(used)} of {counted(len(trial.datasets), 'robot')}: {sum(len(s.episodes) for s in used):,} of "
+        f"{there:,} trajectories{limit}, {sum(map(len, used)):,} windows of {trial.model.frames} frames",
         soft_wrap=True,
     )
     for name, reason in chosen.mixture.dropped.items():

@@ -39,6 +39,7 @@ from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, reference_trial, titles
+from experiments.words import counted
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_json
 from hma_jax.runtime.files import write_file
@@ -168,7 +169,7 @@ def _headline(
         f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
         f"<p class=lead>What an action-conditioned video model over many robots gains from {html.escape(gains)}: "
         f"{max(len(p.trial.datasets) for s in sweeps for p in s.points)} dataset(s), "
-        f"{all_steps(sweeps)} steps of {study.train.batch} windows per trial.</p>"
+        f"{all_steps(sweeps)} of {counted(study.train.batch, 'window')} per trial.</p>"
         f"<p class=meta>{html.escape(when)}</p></header>"
         f"<div class=cards>{''.join(cards)}</div>{warning if unfinished else ''}"
     )
@@ -314,4 +315,4 @@ def _each(found: Sequence[str]) -> str:
     counts = Counter(found).most_common()
     if len(counts) == 1:
         return counts[0][0]
-    return "; ".join(f"{n} trial{'s' * (n > 1)}: {what}" for what, n in counts) or "unknown"
+    return "; ".join(f"{counted(n, 'trial')}: {what}" for what, n in counts) or "unknown"

@@ -17,6 +17,7 @@ from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import drawn_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
+from experiments.words import counted
 
 HEADINGS = {
     "perplexity": "perplexity", "diffusion_loss": "diffusion loss", "delta_psnr": "ΔPSNR (dB)",
@@ -241,7 +242,7 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
             far = max(own, key=lambda o: abs(o.moved))
             # Whichever lies at an end: what is best beyond it may have moved further than `far`.
             open_ended = ", some at an end of the grid, so perhaps further" if any(o.edge for o in own) else ""
-            steps = f"{abs(far.moved):.0f} step{'s' * (abs(far.moved) != 1)}"
+            steps = counted(round(abs(far.moved)), "step")
             parts.append(f"{words}: the best rate of {len(own)} {kind}s moves by at most {steps}{open_ended}")
     return f"{'; '.join(parts)} (held-out loss)." if parts else ""
 

@@ -20,6 +20,7 @@ from experiments.rows import LOSS, OVERALL, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
+from experiments.words import counted
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable
 
@@ -260,7 +261,7 @@ def _prediction(outcome: Outcome) -> Check:
         text += "; its trials have not run."
     else:
         verdict = "bad" if outcome.marks or not outcome.inside else "good"
-        text += f"; came: {outcome.observed:.3f} ({outcome.seeds} seed{'s' * (outcome.seeds != 1)}), {'inside' if outcome.inside else 'outside'}."
+        text += f"; came: {outcome.observed:.3f} ({counted(outcome.seeds, 'seed')}), {'inside' if outcome.inside else 'outside'}."
     if outcome.marks:
         verdict, text = "bad", f"{text} But: {'; '.join(outcome.marks)}."
     return Check("A prediction written down before.", verdict, text)

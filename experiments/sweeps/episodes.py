@@ -16,7 +16,7 @@ from dataclasses import replace
 from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
-from experiments.words import few
+from experiments.words import counted, few
 from hma_jax.config import require
 
 
@@ -37,7 +37,7 @@ def plan(study: Study) -> Sweep:
         trial = reference_trial(study, seed, steps)
         if cap is not None:
             trial = replace(trial, max_trajectories=cap, measure_untrained=False)
-        return Point(count_episodes(study, cap), trial, series=f"{steps:,} steps")
+        return Point(count_episodes(study, cap), trial, series=counted(steps, "step"))
 
     points = [point(seed, cap, steps) for steps in budgets for cap in caps for seed in study.seeds]
     for cap in (caps[0], None):

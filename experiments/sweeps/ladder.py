@@ -23,6 +23,7 @@ from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, make_ablation, reference_trial
+from experiments.words import counted
 
 REFERENCE, RECALL, MUON, BEST = "reference", "recall", "Muon", "recall, Muon"
 CHAINED, WEIGHED, TENFOLD = f"{BEST}, chained", f"{BEST}, changes thrice", f"{BEST}, changes tenfold"
@@ -91,7 +92,7 @@ def plan(study: Study) -> Sweep:
         for seed in chosen:
             trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
             points.append(Point(len(labels), LONGER[name](trial)))
-        labels.append(f"{name}, {steps:,} steps")
+        labels.append(f"{name}, {counted(steps, 'step')}")
     # The longest goes on from the first of the best: in that order nobody waits for it at the end.
     points.sort(key=lambda point: point.x != sweep.labels.index(BEST))
     return replace(sweep, points=tuple(points), labels=tuple(labels))

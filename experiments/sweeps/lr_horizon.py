@@ -16,6 +16,7 @@ from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
+from experiments.words import counted
 from hma_jax.config import require
 
 
@@ -42,7 +43,7 @@ def plan(study: Study) -> Sweep:
         "learning rate",
         study.dataset_names(),
         tuple(
-            Point(rate * factor, trial(factor, steps, seed), series=f"{steps:,} steps")
+            Point(rate * factor, trial(factor, steps, seed), series=counted(steps, "step"))
             for steps in horizons
             for factor in study.designs.rate_factors
             for seed in study.seeds
@@ -51,7 +52,7 @@ def plan(study: Study) -> Sweep:
         "nothing over the horizon.",
         gain="its learning rate",
         title="Learning rate and horizon",
-        base=f"{longest:,} steps",
+        base=counted(longest, "step"),
     )
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, training_of, trial_id
 from experiments.study import Study
+from experiments.words import counted
 from hma_jax.config import require
 from hma_jax.config.json import diff, stable_hash
 
@@ -219,7 +220,7 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     several = len({trial.train.steps for trial in unique_trials(sweeps, provenance).values()}) > 1
 
     def add(trial: Trial, remark: str) -> None:
-        steps = f"{trial.train.steps:,} steps" if several else ""
+        steps = counted(trial.train.steps, "step") if several else ""
         lines.setdefault(trial_id(trial, provenance), " · ".join(filter(None, (trial.title, steps, remark))))
 
     for sweep in sweeps:
@@ -237,6 +238,6 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
 
 
 def all_steps(sweeps: Sequence[Sweep]) -> str:
-    """How many steps trials take, in words: '300 or 1,000'."""
-    steps = sorted({point.trial.train.steps for sweep in sweeps for point in sweep.points})
-    return " or ".join(f"{n:,}" for n in steps)
+    """How many steps trials take, in words: '300 or 1,000 steps'."""
+    *fewer, most = sorted({point.trial.train.steps for sweep in sweeps for point in sweep.points})
+    return " or ".join([*(f"{n:,}" for n in fewer), counted(most, "step")])

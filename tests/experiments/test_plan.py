@@ -181,7 +181,9 @@ def planned(monkeypatch: pytest.MonkeyPatch, capsys):
 
     def run(*arguments: str):
         assert main(["plan", "--brief", *arguments]) == 0
-        lines = map(str.strip, capsys.readouterr().out.splitlines())
+        out = capsys.readouterr().out
+        assert "(1 devices)" not in out and "1 robots" not in out
+        lines = map(str.strip, out.splitlines())
         return calls[-1], next(line for line in lines if line.startswith("local "))
 
     return run

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from experiments.words import plus_minus
+from experiments.words import counted, plus_minus
 
 
 @pytest.mark.parametrize(
@@ -24,3 +24,7 @@ from experiments.words import plus_minus
 def test_a_mean_has_the_digits_that_its_error_leaves(mean, error, said):
     assert plus_minus(mean, error) == said
     assert plus_minus(mean, error, "+") == f"+{said}"
+
+
+def test_one_thing_is_not_called_several():
+    assert [counted(n, "step") for n in (0, 1, 2000)] == ["0 steps", "1 step", "2,000 steps"]

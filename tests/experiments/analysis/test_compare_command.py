@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.analysis.compare import Side, compare
 from experiments.analysis.intervals import OVERALL
+from experiments.cli.compare import _table
 from experiments.cli.main import main
 from experiments.evaluated import STAMP
 from experiments.preparing.made_from import MadeFrom
@@ -84,6 +86,12 @@ def test_seeds_of_a_study_that_the_other_has_not_are_left_out_and_it_is_said(tab
     assert rows_of(tmp_path / "c.csv")[OVERALL, "cross_entropy"]["seeds"] == "1"
     said = " ".join(capsys.readouterr().out.split())
     assert "Of the seeds of study (0, 1) only 1 is compared." in said
+
+
+def test_several_seeds_that_are_left_are_compared_in_the_plural(table):
+    seeds = under_seeds(table, np.random.default_rng(1), 3, 0.01)
+    whole, two = Side("whole", seeds, ""), Side("two", {seed: seeds[seed] for seed in (1, 2)}, "")
+    assert "Of the seeds of whole (0, 1, 2) only 1, 2 are compared." in _table(compare(whole, two), whole, two).caption
 
 
 def test_robots_that_one_was_not_judged_on_are_left_out_and_it_is_said(table, tmp_path, capsys):
