@@ -19,9 +19,11 @@ from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
 from experiments.bench.beside import OURS, RELEASED, THEIRS
+from experiments.bench.models import EXECUTION
 from experiments.bench.record import read_record
+from experiments.presets import get_preset
 from experiments.rows import OVERALL, Row, read_csv
-from hma_jax.config import EvalConfig
+from hma_jax.config import EvalConfig, ExecutionConfig
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
 from tests.pages import table
@@ -254,6 +256,20 @@ def test_the_page_of_speed_shows_products_of_two_cores():
     )
     figures = others[0], others[-1], min(smallest), max(smallest), slow, min(plain), max(plain)
     assert said.format(*figures, min(within), max(within), min(over_time), max(over_time)) in page
+
+
+def test_pages_say_that_steps_are_timed_with_another_remat_than_training_takes():
+    assert (EXECUTION.remat, ExecutionConfig().remat) == ("products", "everything")
+    page, launching = (
+        " ".join((ROOT / "docs" / name).read_text().split()) for name in ("performance.md", "launching.md")
+    )
+    assert 'timed with `execution.remat` "products"' in page and "`remat=products`" in README.read_text()
+    assert 'timed with `execution.remat=products`; the preset takes "everything"' in launching
+    assert get_preset("accelerator").execution.remat == "everything"
+    took = {
+        name: float(seconds) for seconds, name in re.findall(r'(\d\.\d\d)(?: s a step)? (?:with|and) "(\w+)"', page)
+    }
+    assert 1 / 7 < took["everything"] / took["products"] - 1 < 1 / 5
 
 
 def test_the_page_of_speed_says_where_a_pass_goes():
