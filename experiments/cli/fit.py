@@ -107,11 +107,14 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     how = f"in {short(workspace.root / own)}" if own else "with --set"
     curve, held = _held_out(sweep, record.provenance, asked, x, how)
     ids = [place.trial for place in held]
-    states = read_states(sorted(ids), workspace.trials, Ledger(workspace.ledger))
-    for id, state in states.items():
+    ledger = Ledger(workspace.ledger)
+    ran = ledger.states()
+    for id, state in read_states(sorted(ids), workspace.trials, ledger).items():
+        there = state.event != MISSING
+        what = f"exists already ({state.event})" if there else f"has run, says {workspace.ledger.name}"
         require(
-            state.event == MISSING,
-            f"--predict {asked}: trial {id} exists already ({state.event}); a prediction is made before its trial runs",
+            not there and id not in ran,
+            f"--predict {asked}: trial {id} {what}; a prediction is made before its trial runs",
         )
     results, windows = read_results(workspace, unique_trials(sweeps, record.provenance))
     prediction = predict(curve, held, windows, result_hashes(results))

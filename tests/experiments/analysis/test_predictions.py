@@ -18,6 +18,7 @@ from experiments.report.draw import draw
 from experiments.report.fits import describe_fits
 from experiments.report.numbers import read_numbers
 from experiments.report.validity import _prediction
+from experiments.running.ledger import FINISHED, Ledger
 from experiments.running.sealed import RESULT, write_result
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
@@ -87,6 +88,16 @@ def test_a_prediction_comes_true(root, capsys):
 def test_nothing_is_predicted_of_a_trial_that_exists(root, capsys):
     assert command(root, "--predict", "width=48") == 2
     assert "exists already (finished)" in capsys.readouterr().err
+    assert not (root / "predictions").exists()
+
+
+def test_nothing_is_predicted_of_a_trial_that_ran_and_was_removed(root, capsys):
+    """Its prediction was sealed as any other, and held."""
+    for id, trial in unique_trials(plan_sweeps(WHOLE, ("width",)), PROVENANCE).items():
+        if trial.model.width == HELD:
+            Ledger(Workspace(root).ledger).append(id, FINISHED)
+    assert predict(root) == 2
+    assert "has run, says ledger.jsonl; a prediction is made before its trial runs" in capsys.readouterr().err
     assert not (root / "predictions").exists()
 
 
