@@ -251,6 +251,17 @@ def inference_params(declared: Declared, params: Params, dtype: str) -> Params:
     return jax.tree.map(cast, declared.specs, params, is_leaf=is_spec)
 
 
+def require_params(declared: Declared, params: Params, what: str) -> None:
+    """Raises ConfigError, which begins with `what`, unless `params` are those that are declared, by name and shape."""
+    expected = {name: spec.shape for name, spec in declared.leaves().items()}
+    given = {path_name(path): tuple(x.shape) for path, x in jax.tree.leaves_with_path(params)}
+    for name in sorted(expected.keys() | given.keys()):
+        require(
+            expected.get(name) == given.get(name),
+            f"{what}: {name} should be {expected.get(name, 'absent')} but is {given.get(name, 'absent')}",
+        )
+
+
 def path_name(path: tuple[Any, ...]) -> str:
     """'trunk/blocks/spatial/qkv' from a jax key path."""
     return "/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path)

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from hma_jax.config import ConfigError, MeshConfig, require
+from hma_jax.config import MeshConfig, require
 from hma_jax.config.json import to_dict
-from hma_jax.model.params import Declared, Params, path_name
+from hma_jax.model.params import Declared, Params, path_name, require_params
 from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.sharding import BATCH
 from hma_jax.tokenizers.base import PIECE, in_pieces
@@ -52,14 +52,7 @@ class BaseTokenizer(abc.ABC):
         Raises ConfigError if `params` are not those that `config` declares.
         """
         declared = self.declare(config)
-        expected = {name: spec.shape for name, spec in declared.leaves().items()}
-        given = {path_name(p): tuple(x.shape) for p, x in jax.tree.leaves_with_path(params)}
-        for name in sorted(expected.keys() | given.keys()):
-            if expected.get(name) != given.get(name):
-                raise ConfigError(
-                    f"tokenizer weights do not fit their configuration: {name} should be "
-                    f"{expected.get(name, 'absent')} but is {given.get(name, 'absent')}"
-                )
+        require_params(declared, params, "tokenizer weights do not fit their configuration")
         self.config = config
         self.params = params
         self.piece = self.default_piece(config) if piece is None else piece

@@ -10,6 +10,7 @@ whoever reads it checks them.
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import math
 import os
@@ -23,6 +24,7 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as ocp
 
+from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
 from hma_jax.runtime.processes import from_writer, is_writer, writer_first
 from hma_jax.training.claim import require_plain
@@ -58,9 +60,14 @@ class Checkpoints:
         """The newest `keep` checkpoints stay, and those of `keep_steps`. `modernise` brings a description that an
         earlier version wrote to the form of `meta`.
 
-        Raises CheckpointError if `directory` cannot be written, ConfigError if what is written there cannot be read.
+        Raises CheckpointError if `directory` cannot be written, ConfigError if what is written there cannot be read, or
+        for a description that is not JSON.
         """
         require_plain(directory)
+        try:
+            json.dumps(meta)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"what a run says of itself, its provenance too, has to be JSON: {error}") from error
         self.directory = Path(directory).absolute()
         self.meta, self.keep, self.modernise, self.keep_steps = meta, keep, modernise, keep_steps
         try:

@@ -16,7 +16,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MeshConfig
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.params import Declared, Params
+from hma_jax.model.params import Declared, Params, require_params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.sharding import place
 from hma_jax.training.optimizer import init_adam
@@ -50,13 +50,14 @@ def init_state(
 
     It is laid out as `shapes` says (`state_shapes`; default: on the default device, without an
     average). No device ever holds more than its part. `params` stay the caller's: training donates
-    its state, never them.
+    its state, never them. Raises ConfigError for `params` of another model.
     """
     shapes = state_shapes(declared, table) if shapes is None else shapes
     layout = _layout(shapes)
     if params is None:
         params = declared.init(seed, layout and layout.params)
     else:
+        require_params(declared, params, "the parameters to start from are not those of the model")
         params = jax.tree.map(lambda x, like: place(np.array(x), like.sharding), params, shapes.params)
     leaves, treedef = jax.tree.flatten(shapes)
     step, opt_state = _jitted_zeros(treedef, tuple(leaves), table.size)()

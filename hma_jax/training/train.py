@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig
+from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
@@ -22,6 +22,7 @@ from hma_jax.model.params import Params
 from hma_jax.runtime.audit import audit_sharding, plan_sharding
 from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.mesh import check_mesh, make_mesh
+from hma_jax.runtime.rows import own_rows
 from hma_jax.runtime.sharding import put_batch
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, Start, fit
@@ -65,8 +66,14 @@ def train_model(
     audit_sharding(plan_sharding(declared, device_mesh, mesh), device_mesh)
     shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0)
 
+    rows = len(own_rows(device_mesh, config.batch))
+
     def put(batch: Any) -> Any:
         return put_batch(batch, device_mesh)
+
+    def put_checked(batch: Any) -> Any:
+        check_batch(batch, rows, model, table)
+        return put(batch) | {"seed": seed}
 
     def modernised(described: dict[str, Any]) -> dict[str, Any]:
         today = modernise(described)
@@ -91,7 +98,7 @@ def train_model(
             steps=config.steps,
             run_dir=run_dir,
             about=Start(describe_run(model, config, table, provenance), to_dict(execution), modernised, records),
-            put_batch=lambda batch: put(batch) | {"seed": seed},
+            put_batch=put_checked,
             options=replace(
                 options,
                 flops_per_step=train_flops_per_step(model, table, config),
@@ -101,6 +108,28 @@ def train_model(
             watch=validation and make_watch(validation, model, table, config.masking, execution, put),
             progress=progress,
         )
+
+
+def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, table: EmbodimentTable) -> None:
+    """Raises ConfigError for a batch of the host that is not as `step.Batch` says, with so many `rows`.
+
+    A step would compute with ids and robots that there are not, and with fewer rows than `TrainConfig.batch` says.
+    """
+    channels = (model.diffusion.token_channels,) if model.diffusion else ()
+    shapes = {
+        "tokens": (rows, model.frames, model.tokens, *channels),
+        "actions": (rows, model.frames, table.action_width),
+        "embodiment": (rows,),
+    }
+    found = {name: np.shape(batch[name]) if name in batch else None for name in shapes}
+    wrong = [f"{name} {shape}, got {found[name]}" for name, shape in shapes.items() if found[name] != shape]
+    require(not wrong, f"a batch of this run has {'; '.join(wrong)}")
+    numbers = {"embodiment": ("robots", table.size)}
+    if not model.diffusion:
+        numbers["tokens"] = "ids", model.vocab_size
+    for name, (what, count) in numbers.items():
+        low, high = int(np.min(batch[name])), int(np.max(batch[name]))
+        require(0 <= low and high < count, f"a batch has {what} from {low} to {high}, the model 0 to {count - 1}")
 
 
 @lru_cache(maxsize=4)

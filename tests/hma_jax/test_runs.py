@@ -204,3 +204,31 @@ def test_how_a_run_is_computed_is_recorded_and_may_change_with_every_start(avera
     starts = [json.loads(line) for line in (run_dir / "execution.jsonl").read_text().splitlines()]
     assert [start["execution"] for start in starts] == [to_dict(ExecutionConfig()), to_dict(other)]
     assert [start["resumed_from"] for start in starts] == [0, 2]
+
+
+ROWS = next(batches(MODEL, 4)(0))
+
+
+@pytest.mark.parametrize(
+    ("batch", "message"),
+    [
+        (next(batches(MODEL, 2)(0)), r"has tokens \(4, 3, 4\), got \(2, 3, 4\); actions \(4, 3, 14\), got \(2, "),
+        ({"tokens": ROWS["tokens"]}, r"a batch of this run has actions \(4, 3, 14\), got None; embodiment"),
+        (ROWS | {"tokens": ROWS["tokens"] + MODEL.vocab_size}, "a batch has ids from 16 to 31, the model 0 to 15"),
+        (ROWS | {"embodiment": ROWS["embodiment"] - 1}, "a batch has robots from -1 to 1, the model 0 to 2"),
+    ],
+    ids=["fewer rows", "no actions", "ids", "robots"],
+)
+def test_batches_of_another_model_are_refused(batch, message, tmp_path: Path):
+    """Such ids and fewer rows were trained on without a word; other robots were told as a divergence."""
+    with pytest.raises(ConfigError, match=message):
+        train_model(MODEL, TABLE, AVERAGED, lambda start: iter([batch]), run_dir=tmp_path, provenance={})
+
+
+def test_parameters_of_another_model_and_words_that_are_not_json_are_refused(tmp_path: Path):
+    other = declare_model(replace(MODEL, recall=True), TABLE).init(0)
+    given = dict(run_dir=tmp_path, provenance={})
+    with pytest.raises(ConfigError, match=r"not those of the model: recall/gain should be absent but is \(8,\)"):
+        train_model(MODEL, TABLE, AVERAGED, batches(MODEL, 4), initial=other, **given)
+    with pytest.raises(ConfigError, match="its provenance too, has to be JSON: Object of type float32 is not"):
+        train_model(MODEL, TABLE, AVERAGED, batches(MODEL, 4), **given | {"provenance": {"hz": np.float32(2)}})
