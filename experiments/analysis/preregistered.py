@@ -84,12 +84,15 @@ def read_expected(path: Path) -> list[Expected]:
             except (TypeError, ValueError) as error:
                 raise ConfigError(f"{path}, line {number}: no prediction ({error})") from error
             e = found[-1]
-            require(e.low <= e.mean <= e.high, f"{path}, line {number}: low, mean and high do not ascend")
-            places = tuple(map(_place, (e.x, e.against)))
+            where = f"{path}, line {number}"
+            require(e.low <= e.mean <= e.high, f"{where}: low, mean and high do not ascend")
+            require(math.isfinite(e.high - e.low), f"{where}: an interval without an end holds more than can come")
+            places = frozenset(map(_place, (e.x, e.against)))  # a difference the other way round is the same number
+            require(len(places) > 1, f"{where}: x has to name a point, and against, if it is given, another one")
             first = lines.setdefault((e.sweep, e.series, places, e.metric, frozenset(e.seeds)), number)
             require(
                 first == number,
-                f"{path}, line {number}: of the same number as line {first}, which would count twice; keep the one that "
+                f"{where}: of the same number as line {first}, which would count twice; keep the one that "
                 "was written first",
             )
     return found
@@ -116,7 +119,7 @@ def _came(e: Expected, rows: Sequence[Row]) -> Came:
     rows = [r for r in rows if not e.seeds or r.seed in e.seeds]
     places = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
     for x in filter(None, (e.x, e.against)):
-        there = sorted({label or f"{place:g}" for place, label, _ in places})
+        there = dict.fromkeys(label or f"{place:g}" for place, label, _ in sorted(places))
         known = any(_names(x, place, label) for place, label, _ in places)
         require(known, f"{where} has no point {x!r}, but {', '.join(there) or 'none, nor such a curve'}")
     metrics = {r.metric for r in rows} - {""}

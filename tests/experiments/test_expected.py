@@ -73,7 +73,7 @@ def test_some_seeds_alone_may_be_meant(rows, tmp_path):
 
 def test_a_point_that_is_not_there_is_refused(rows):
     for wrong, message in (
-        (replace(WIDTH, x="12"), "width has no point '12', but 16, 8"),
+        (replace(WIDTH, x="12"), "width has no point '12', but 8, 16"),
         (replace(WIDTH, against="wide"), "has no point 'wide'"),
         (replace(WIDTH, series="8,000 steps"), "nor such a curve"),
         (replace(WIDTH, metric="cross-entropy"), "has no metric 'cross-entropy', but .*cross_entropy"),
@@ -91,6 +91,9 @@ def test_a_point_that_is_not_there_is_refused(rows):
         ("width,,8,,cross_entropy,5,4,6", "line 2: no prediction .it has too few columns"),
         ("width,,8,,cross_entropy,5,4,6,abc,more", "line 2: no prediction"),
         ("width,,8,,cross_entropy,7,4,6,abc", "line 2: low, mean and high do not ascend"),
+        ("width,,8,,cross_entropy,7,4,inf,abc", "line 2: an interval without an end holds more"),
+        ("width,,8,8.0,cross_entropy,0,-1,1,abc", "line 2: x has to name a point, and against, .* another one"),
+        ("width,,,,cross_entropy,5,4,6,abc", "line 2: x has to name a point"),
     ],
 )
 def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
@@ -100,11 +103,18 @@ def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
         read_expected(path)
 
 
-@pytest.mark.parametrize("again", ["8,,cross_entropy,5,4,6,abc1234,0 2", "8.0,,cross_entropy,9,8,10,def5678,2 0"])
+@pytest.mark.parametrize(
+    "again",
+    [
+        "8,,cross_entropy,5,4,6,abc1234,0 2", "8.0,,cross_entropy,9,8,10,def5678,2 0",
+        "16,8,cross_entropy,-1,-2,0,abc1234,0 2",
+    ],
+)  # fmt: skip
 def test_a_number_is_expected_once(tmp_path, again):
     """A line that stood twice, and one beside another interval for the same, counted as two."""
     path = tmp_path / FILE
-    lines = [f"{COLUMNS},seeds", "width,,8,,cross_entropy,5,4,6,abc1234,0 2", "width,,16,,cross_entropy,5,4,6,abc1234,"]
+    first = "8,16,cross_entropy,1,0,2" if again.startswith("16,8") else "8,,cross_entropy,5,4,6"
+    lines = [f"{COLUMNS},seeds", f"width,,{first},abc1234,0 2", "width,,16,,cross_entropy,5,4,6,abc1234,"]
     path.write_text("\n".join(lines))
     assert len(read_expected(path)) == 2
     path.write_text("\n".join([*lines, f"width,,{again}"]))
