@@ -59,7 +59,6 @@ SMOKE = Study(
         judged=2,
         counts=(2, 3),
         poor=2,
-        kinship=3,
         shots=(1, 2),
         shots_after=(2, 3),
         shots_steps=2,

@@ -19,15 +19,22 @@ from experiments.study import Study
 from experiments.sweeps.draws import draw_judged
 from experiments.sweeps.robots import require_uniform, robots_trial
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of
+from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
     """The judged robots see as many windows at every point, but where they are trained alone for as long as with all.
 
-    Newcomers have all their trajectories. Raises ConfigError under a mixture that is not uniform."""
+    Newcomers have all their trajectories. Raises ConfigError under a mixture that is not uniform, and where siblings
+    and strangers would be the same robots."""
     require_uniform(study, "newcomers")
     designs, names, most = study.designs, study.dataset_names(), study.train.steps
     alone, some, everyone = designs.judged, designs.kinship, len(names)
+    require(
+        alone < some < everyone,
+        f"designs.kinship {some} robots, siblings or strangers, have to be more than the {alone} judged and fewer than all "
+        f"{everyone}: --set designs.kinship=..., or leave the axis newcomers out",
+    )
     labels = {
         "alone": (alone, "any", most * alone // everyone),
         "alone, as long as with all": (alone, "any", most),

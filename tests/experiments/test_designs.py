@@ -174,6 +174,8 @@ def test_few_shots_start_from_trials_of_other_axes():
         ("transfer", "designs.counts=", r"designs.counts \(\) must begin"),
         ("transfer", "train.steps=7", "5 of 40 robots .* share of train.steps 7, which is none; set it to at least 8"),
         ("newcomers", "train.steps=7", "5 of 40 robots .* share of train.steps 7, which is none; set it to at least 8"),
+        ("newcomers", "designs.kinship=40", "designs.kinship 40 robots, siblings or strangers, .* fewer than all 40"),
+        ("newcomers", "designs.kinship=5", "designs.kinship 5 robots, .* more than the 5 judged"),
         ("fewshot", "designs.shots=", "designs.shots is empty"),
         ("fewshot", "designs.shots_after=", "designs.shots_after is empty"),
         ("lr_horizon", "designs.budgets=", "designs.budgets is empty"),
