@@ -6,6 +6,7 @@ import functools
 import math
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, Literal
 
 
@@ -17,6 +18,14 @@ def require(condition: bool, message: str) -> None:
     """Raises ConfigError(message) unless `condition` holds."""
     if not condition:
         raise ConfigError(message)
+
+
+def require_shapes(what: str, found: Mapping[str, Any], wanted: Mapping[str, tuple[int, ...]]) -> None:
+    """Raises ConfigError, which begins with `what`, unless arrays have the shapes that are wanted; None is said to be
+    missing."""
+    shapes = {name: getattr(array, "shape", None) for name, array in found.items()}
+    wrong = [f"{name} {shape}, got {shapes[name]}" for name, shape in wanted.items() if shapes[name] != shape]
+    require(not wrong, f"{what} {'; '.join(wrong)}")
 
 
 def require_seed(seed: int, where: str) -> None:

@@ -160,6 +160,11 @@ class ModelConfig:
         return self.tokens + (self.action_tokens if self.concat else 0)
 
     @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """(S,) of ids, or (S, C) of latents."""
+        return (self.tokens, self.diffusion.token_channels) if self.diffusion else (self.tokens,)
+
+    @property
     def position_slots(self) -> int:
         """Position embeddings kept per frame. As released there are some for latent cells that
         patches never reach, and for action tokens whether or not there are any."""

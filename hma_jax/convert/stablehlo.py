@@ -84,10 +84,9 @@ def generate_function(
 
 def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """The inputs after the weights, in order."""
-    b, channels = config.batch, (model.diffusion.token_channels,) if model.diffusion else ()
-    kind = jnp.float32 if model.diffusion else jnp.int32
+    b, kind = config.batch, jnp.float32 if model.diffusion else jnp.int32
     return {
-        "prompt": jax.ShapeDtypeStruct((b, config.prompt, model.tokens, *channels), kind),
+        "prompt": jax.ShapeDtypeStruct((b, config.prompt, *model.frame_shape), kind),
         "actions": jax.ShapeDtypeStruct((b, config.frames, table.action_width), jnp.float32),
         "embodiment": jax.ShapeDtypeStruct((b,), jnp.int32),
         "key": jax.ShapeDtypeStruct((2,), jnp.uint32),

@@ -30,10 +30,8 @@ class Frame(NamedTuple):
 
 def blank_frame(config: ModelConfig, batch: int) -> Frame:
     """A wholly masked frame."""
-    shape, dtype = (batch, config.tokens), jnp.int32
-    if config.diffusion:
-        shape, dtype = (*shape, config.diffusion.token_channels), jnp.float32
-    return Frame(jnp.zeros(shape, dtype), jnp.ones((batch, config.tokens), bool))
+    dtype = jnp.float32 if config.diffusion else jnp.int32
+    return Frame(jnp.zeros((batch, *config.frame_shape), dtype), jnp.ones((batch, config.tokens), bool))
 
 
 def cosine_schedule(progress: float) -> float:

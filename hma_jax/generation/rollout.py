@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
+from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window, cut
 from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
@@ -59,7 +60,7 @@ def rollout(
     chunks that the model is not shown; which it was trained without, says `objective.masking.never_shown`.
     Raises ConfigError for shapes that do not fit the model or each other.
     """
-    _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B)
+    _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, hidden_BT)
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape
     size = min(frames, model.config.frames)
@@ -177,11 +178,15 @@ def fold_in(key_B: jax.Array, data: int | jax.Array) -> jax.Array:
 
 
 def _require_shapes(
-    model: HMA, prompt: jax.Array, actions_BRTU: jax.Array, embodiment_B: jax.Array, key_B: jax.Array
+    model: HMA,
+    prompt: jax.Array,
+    actions_BRTU: jax.Array,
+    embodiment_B: jax.Array,
+    key_B: jax.Array,
+    hidden_BT: jax.Array | None,
 ) -> None:
-    config = model.config
     batch, *frames = jnp.shape(prompt)
-    token = [config.tokens, *([config.diffusion.token_channels] if config.diffusion else [])]
+    token = [*model.config.frame_shape]
     examples, *sequences = jnp.shape(actions_BRTU)
     fits = frames[1:] == token and len(sequences) == 3 and sequences[2] == model.table.action_width
     require(
@@ -190,6 +195,8 @@ def _require_shapes(
         "(whole chunks of a frame, filled up with zeros), B robots and B keys; got "
         + ", ".join(str(jnp.shape(x)) for x in (prompt, actions_BRTU, embodiment_B, key_B)),
     )
+    if hidden_BT is not None:
+        require_shapes("a rollout takes", {"hidden": hidden_BT}, {"hidden": (batch, sequences[1])})
 
 
 def _recent(

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
+from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
@@ -43,16 +44,25 @@ def start(
 ) -> Session:
     """A session that has seen `prompt` [B, T', S (, C)], of which the last T - 1 frames count.
 
-    `chunks_BTU` [B, T' - 1, U] are those executed between its frames. Raises ConfigError.
+    `chunks_BTU` [B, T' - 1, U] are those executed between its frames. Raises ConfigError for shapes that do not fit the
+    model or each other.
     """
     room, count = model.config.frames - 1, prompt.shape[1]
     require(room >= 1, "a model of one frame cannot continue anything")
-    require(
-        chunks_BTU.shape[1] == count - 1,
-        f"{count} prompt frames have {count - 1} chunks between them, got {chunks_BTU.shape[1]}",
+    require(count >= 1, "a session starts from 1 prompt frame or more, got 0")
+    between = (len(prompt), count - 1)
+    hidden = jnp.zeros(between, bool) if hidden_BT is None else hidden_BT
+    require_shapes(
+        f"a session of {count} prompt frames starts with",
+        {"frames": prompt, "chunks between them": chunks_BTU, "hidden": hidden, "robots": embodiment_B},
+        {
+            "frames": (len(prompt), count, *model.config.frame_shape),
+            "chunks between them": (*between, model.table.action_width),
+            "hidden": between,
+            "robots": between[:1],
+        },
     )
     old = max(count - room, 0)
-    hidden = jnp.zeros(chunks_BTU.shape[:2], bool) if hidden_BT is None else hidden_BT
     chunks, hidden = (_padded(x[:, old:], room + 1) for x in (chunks_BTU, hidden))
     past = Window.over(model, chunks, hidden, embodiment_B).start(prompt[:, old:-1], room)
     return Session(past, _padded(prompt[:, old:], room), chunks, hidden, embodiment_B, jnp.int32(count - old))
@@ -74,12 +84,24 @@ def advance(
     Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also
     shown the chunk that comes after it: `next_chunk_BU`, or the same again where nobody knows it
     (as the release's simulator does). `hidden_B` marks chunks the model is not shown. A caller who knows
-    which `phase` the session is in saves the program of the other.
+    which `phase` the session is in saves the program of the other. Raises ConfigError as `start`.
     """
     room, t = model.config.frames - 1, session.count
-    hidden_B = jnp.zeros(len(chunk_BU), bool) if hidden_B is None else hidden_B
+    batch, _, width = session.chunks_BTU.shape
+    hidden_B = jnp.zeros(batch, bool) if hidden_B is None else hidden_B
+    next_chunk_BU = chunk_BU if next_chunk_BU is None else next_chunk_BU
+    require_shapes(
+        "a session goes on by",
+        {"chunk": chunk_BU, "next chunk": next_chunk_BU, "hidden": hidden_B, "keys": key_B},
+        {
+            "chunk": (batch, width),
+            "next chunk": (batch, width),
+            "hidden": (batch,),
+            "keys": (batch, *jnp.shape(key_B)[1:]),
+        },
+    )
     last = jnp.minimum(t, room) - 1
-    both = jnp.stack([chunk_BU, chunk_BU if next_chunk_BU is None else next_chunk_BU], axis=1)
+    both = jnp.stack([chunk_BU, next_chunk_BU], axis=1)
     chunks = _written(session.chunks_BTU, both, last)
     hidden = _written(session.hidden_BT, jnp.stack([hidden_B, hidden_B], axis=1), last)
     window = Window.over(model, chunks, hidden, session.embodiment_B)

@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, require
+from hma_jax.config.base import require_shapes
 from hma_jax.config.json import to_dict
 from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
@@ -115,15 +116,12 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
 
     A step would compute with ids and robots that there are not, and with fewer rows than `TrainConfig.batch` says.
     """
-    channels = (model.diffusion.token_channels,) if model.diffusion else ()
-    shapes = {
-        "tokens": (rows, model.frames, model.tokens, *channels),
+    wanted = {
+        "tokens": (rows, model.frames, *model.frame_shape),
         "actions": (rows, model.frames, table.action_width),
         "embodiment": (rows,),
     }
-    found = {name: np.shape(batch[name]) if name in batch else None for name in shapes}
-    wrong = [f"{name} {shape}, got {found[name]}" for name, shape in shapes.items() if found[name] != shape]
-    require(not wrong, f"a batch of this run has {'; '.join(wrong)}")
+    require_shapes("a batch of this run has", {name: batch.get(name) for name in wanted}, wanted)
     numbers = {"embodiment": ("robots", table.size)}
     if not model.diffusion:
         numbers["tokens"] = "ids", model.vocab_size

@@ -382,3 +382,27 @@ def test_a_rollout_of_other_shapes_is_refused(prompt, actions, robots, message):
             jax.random.split(jax.random.key(0), 1),
             DecodeConfig(),
         )
+
+
+@pytest.mark.parametrize(
+    ("tokens", "between", "chunk", "message"),
+    [
+        (4, 1, None, r"a session of 2 prompt frames starts with frames \(2, 2, 9\), got \(2, 2, 4\)"),
+        (9, 2, None, r"chunks between them \(2, 1, 14\), got \(2, 2, 14\); hidden \(2, 1\), got \(2, 2\)"),
+        (9, 1, (2, 7), r"a session goes on by chunk \(2, 14\), got \(2, 7\); next chunk .*got \(2, 7\)"),
+        (9, 1, (1, 14), r"a session goes on by chunk \(2, 14\), got \(1, 14\)"),
+    ],
+)
+def test_a_session_of_other_shapes_is_refused(tokens, between, chunk, message):
+    """Narrower chunks left what stood there of the chunk before, and those of fewer examples moved these alone."""
+    config = shallow_config()
+    declared, params = lively_params(config)
+    chunks, hidden = np.zeros((2, between, TABLE.action_width), np.float32), np.zeros((2, between), bool)
+
+    def begin_and_go_on(params):
+        model, robots = declared.merge(params), jnp.zeros(2, jnp.int32)
+        session = start(model, jnp.zeros((2, 2, tokens), jnp.int32), chunks, robots, hidden_BT=hidden)
+        return advance(model, session, jnp.zeros(chunk), jax.random.split(jax.random.key(0), 2), DecodeConfig())
+
+    with pytest.raises(ConfigError, match=message):
+        jax.eval_shape(begin_and_go_on, params)
