@@ -241,9 +241,9 @@ def layouts_of(variable: nnx.Param) -> Layouts | None:
 
 
 def inference_params(declared: Declared, params: Params, dtype: str) -> Params:
-    """Parameters as generation and evaluation use them: matrices in `dtype`, cast once, so that in
-    bfloat16 a pass reads half the bytes. What is computed is the same: vectors, and matrices that are
-    used in float32 (`ParamSpec.precise`), stay as they are."""
+    """Parameters as generation and evaluation use them: in `dtype`, cast once, so that in bfloat16 a pass reads half
+    the bytes. What is computed is the same: a pass would cast them too, but for arrays of one axis and for those that
+    are used in float32 (`ParamSpec.precise`), which stay as they are."""
 
     def cast(spec: ParamSpec, x: jax.Array) -> jax.Array:
         return x if x.ndim < 2 or spec.precise else x.astype(dtype)

@@ -25,6 +25,15 @@ from hma_jax.runtime.sharding import BATCH
 from hma_jax.tokenizers.base import PIECE, in_pieces
 
 
+def require_images(images: np.ndarray, shape: tuple[int, int], what: str) -> None:
+    """Raises ConfigError, which begins with `what`, for anything but uint8 images of `shape` (height, width)."""
+    height, width = shape
+    require(
+        images.dtype == np.uint8 and images.ndim == 4 and images.shape[1:] == (height, width, 3),
+        f"{what} uint8 images [B, {height}, {width}, 3], got {images.dtype} {list(images.shape)}",
+    )
+
+
 class BaseTokenizer(abc.ABC):
     """Implements `base.Tokenizer` but for the meaning of a token.
 
@@ -49,8 +58,9 @@ class BaseTokenizer(abc.ABC):
     ):
         """`devices` share every batch; default: all of this process.
 
-        Raises ConfigError if `params` are not those that `config` declares.
+        Raises ConfigError if `params` are not those that `config` declares, or for a `piece` without an image.
         """
+        require(piece is None or piece >= 1, f"a tokenizer takes pieces of at least 1 image, got {piece}")
         declared = self.declare(config)
         require_params(declared, params, "tokenizer weights do not fit their configuration")
         self.config = config
@@ -137,12 +147,7 @@ class BaseTokenizer(abc.ABC):
         Raises ConfigError for another shape or type.
         """
         images = np.asarray(images)
-        shape = (*self.image_shape, 3)
-        require(
-            images.dtype == np.uint8 and images.ndim == 4 and images.shape[1:] == shape,
-            f"the tokenizer encodes uint8 images [B, {', '.join(map(str, shape))}], "
-            f"got {images.dtype} {list(images.shape)}",
-        )
+        require_images(images, self.image_shape, "the tokenizer encodes")
         return in_pieces(lambda piece: self._encode(self._placed, piece), images, self.at_once)
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.network import from_pixels
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
+from hma_jax.tokenizers.shared import require_images
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import LoopOptions, Progress, Start, fit
 from hma_jax.training.state import FINITE, TrainState, all_finite, with_sharding
@@ -46,7 +47,7 @@ def train_tokenizer(
 
     `make_batches(start)` yields uint8 images [B, image_size, image_size, 3] from step `start`
     on; `provenance` says where they come from, `records` what a batch is made of. Raises DivergedError, Interrupted,
-    and CheckpointError when `run_dir` holds a run of another configuration or other images.
+    CheckpointError when `run_dir` holds a run of another configuration or other images, and ConfigError for others.
     """
     declared = declare_tokenizer(config)
     optimizer = make_optimizer(train, declared)
@@ -54,6 +55,10 @@ def train_tokenizer(
     def make_state() -> TrainState:
         params = declared.init(train.seed)
         return TrainState(jnp.zeros((), jnp.int32), params, jax.jit(optimizer.init)(params))
+
+    def put(images: np.ndarray) -> jax.Array:
+        require_images(images, config.image_shape, "a tokenizer is trained on")
+        return jax.device_put(images)
 
     device = jax.sharding.SingleDeviceSharding(default_device())
     shapes = declared.shapes()
@@ -67,6 +72,7 @@ def train_tokenizer(
         steps=train.steps,
         run_dir=run_dir,
         about=Start(described, modernise=_modernise, records=records),
+        put_batch=put,
         options=options,
         progress=progress,
     )

@@ -215,6 +215,8 @@ def test_what_cannot_be_encoded_is_refused(tokenizer):
             tokenizer.encode(wrong)
     with pytest.raises(ConfigError, match="empty batch"):
         tokenizer.encode(images[:0])
+    with pytest.raises(ConfigError, match="pieces of at least 1 image, got 0"):
+        LfqTokenizer(CONFIG, {}, piece=0)
 
 
 def test_ids_that_cannot_be_decoded_are_refused(discrete):
@@ -306,6 +308,19 @@ def test_run_of_another_configuration_is_not_resumed(trained, tmp_path):
     with pytest.raises(CheckpointError, match="provenance.data: 'a' -> 'b'"):
         again(provenance={"data": "b"})
     assert again(provenance={"data": "a"}).identity == trained[0].identity
+
+
+@pytest.mark.parametrize(
+    ("images", "got"),
+    [
+        (np.zeros((8, 16, 16, 3), np.float32), r"float32 \[8, 16, 16, 3\]"),  # in 0..1, say: all of them would be black
+        (np.zeros((8, 3, 16, 16), np.uint8), r"uint8 \[8, 3, 16, 16\]"),
+    ],
+    ids=["floats", "channels first"],
+)
+def test_other_images_are_not_trained_on(images, got, tmp_path):
+    with pytest.raises(ConfigError, match=rf"a tokenizer is trained on uint8 images \[B, 16, 16, 3\], got {got}"):
+        train_tokenizer(CONFIG, TRAIN, lambda start: itertools.repeat(images), tmp_path)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
