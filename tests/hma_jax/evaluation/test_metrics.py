@@ -92,6 +92,9 @@ def test_images_that_cannot_be_compared_are_refused():
         metrics.psnr(image, image / 255)
     with pytest.raises(ConfigError, match="at least 7x7"):
         metrics.ssim(image[:4], image[:4])
+    for metric in (metrics.psnr, metrics.ssim):
+        with pytest.raises(ConfigError, match=r"have height, width and channels, got \(8, 8\)"):
+            metric(image[..., 0], image[..., 0])
     with pytest.raises(ConfigError, match="rows of up to 33025 values"):
         metrics.psnr(np.zeros((1, 11_009, 3), np.uint8), np.zeros((1, 11_009, 3), np.uint8))
 
