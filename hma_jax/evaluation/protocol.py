@@ -34,7 +34,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import EvalConfig, ExecutionConfig, MaskingConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config.training import PREDICT_ACTIONS, PREDICT_FRAMES
 from hma_jax.evaluation.controllability import told_apart, under_each
 from hma_jax.evaluation.draws import Purpose, own_statistics, random_actions, window_keys
 from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
@@ -69,12 +70,12 @@ class Predicted(NamedTuple):
 
 def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
     """Whether a model so trained has a policy to evaluate."""
-    return model.action_heads and MaskingConfig(setting=setting).predicts_actions
+    return model.action_heads and setting in PREDICT_ACTIONS
 
 
 def predicts_frames(setting: Setting) -> bool:
     """Whether a model so trained has frames to evaluate."""
-    return MaskingConfig(setting=setting).predicts_frames
+    return setting in PREDICT_FRAMES
 
 
 def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) -> tuple[jax.Array, jax.Array]:

@@ -43,6 +43,8 @@ class Embodiment:
     layout: str = ""  # a hash of which values its actions are, in what order; "": not known
 
     def __post_init__(self):
+        for name in ("mean", "std", "low", "high"):  # lists and arrays are as good, but have no hash
+            object.__setattr__(self, name, _as_tuple(getattr(self, name)))
         require(
             len(self.mean) == len(self.std) == self.action_dim,
             f"embodiment {self.name!r}: mean and std must have {self.action_dim} entries, "
@@ -80,6 +82,10 @@ class Embodiment:
         return self.stride * self.action_dim
 
 
+def _as_tuple(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
+    return values if isinstance(values, tuple) else tuple(np.asarray(values).tolist())
+
+
 @dataclass(frozen=True)
 class EmbodimentTable:
     """Embodiments in the order of the E axis."""
@@ -87,6 +93,7 @@ class EmbodimentTable:
     entries: tuple[Embodiment, ...]
 
     def __post_init__(self):
+        object.__setattr__(self, "entries", tuple(self.entries))
         names = [e.name for e in self.entries]
         require(len(names) >= 1, "the embodiment table is empty")
         require(len(set(names)) == len(names), f"embodiment names repeat: {sorted(names)}")

@@ -19,6 +19,12 @@ def test_parameter_count_is_the_release_s(width: int):
     assert declare_model(ModelConfig(width=width), ONE_ROBOT).count() == OFFICIAL[width]
 
 
+def test_a_table_may_be_written_with_lists_and_arrays():
+    """They have no hash, by which declarations are kept."""
+    table = EmbodimentTable([Embodiment("table", 2, 1, [0.0, 0.0], np.ones(2, np.float32), low=[], high=())])
+    assert table == ONE_ROBOT and hash(table) == hash(ONE_ROBOT)
+
+
 class Pair(nnx.Module):
     def __init__(self, extra: bool):
         self.first = param((3, 4), ("D", None), normal(1.0), role="hidden")
