@@ -41,6 +41,7 @@ from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
+from hma_jax.kernels.random import key_of
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.shared import BaseTokenizer
@@ -133,7 +134,7 @@ def train_detector(
     been. Raises ConfigError without scenes, for a damaged file, or where training diverges."""
     require(bool(scenes), "there is no robot to train a detector on")
     own, rng = list(scenes.values()), np.random.default_rng(0)
-    weights = init_detector(jax.random.key(0), len(own), max(x.there.shape[-1] for x in own))
+    weights = init_detector(key_of(0), len(own), max(x.there.shape[-1] for x in own))
     schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, min(100, steps // 4), steps)
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(schedule, weight_decay=1e-3))
 

@@ -62,7 +62,5 @@ def check(
         console.print(table)
     write_effects(run / "check.json", found, names)
     if left_out:
-        console.print(
-            f"not checked, for want of episodes: {', '.join(left_out)}; what to do stands above", soft_wrap=True
-        )
-    console.print(f"wrote {run / 'check.json'}", soft_wrap=True)
+        say(f"not checked, for want of episodes: {', '.join(left_out)}; what to do stands above")
+    say(f"wrote {run / 'check.json'}")

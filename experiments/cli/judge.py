@@ -96,9 +96,7 @@ def judge(
         for name, found in agreed.items():
             table.add_row(name, f"{found.mean:.2f} ({found.low:.2f} to {found.high:.2f})", str(found.n))
         console.print(table)
-        console.print(
-            f"the judges of {out}; nothing was judged anew, and no other option was looked at", soft_wrap=True
-        )
+        say(f"the judges of {out}; nothing was judged anew, and no other option was looked at")
         return
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
@@ -154,7 +152,7 @@ def judge(
 
 
 def _say(summary: dict) -> None:
-    from experiments.applications.judging.page import NOTHING, say_beyond, say_control, say_recorded
+    from experiments.applications.judging.page import NOTHING, say_beyond, say_control, say_head, say_recorded
     from experiments.applications.judging.summary import shown
 
     columns = list(next(iter(summary["policies"].values())))
@@ -163,7 +161,8 @@ def _say(summary: dict) -> None:
         table.add_row(name, *(shown(rates[column]) for column in columns))
     console.print(table)
     found = summary["agreement"]
-    for said in (say_control(summary), say_beyond(summary), say_recorded(summary["head"]), "" if found else NOTHING):
+    say(f"The success head. {say_head(summary)}")
+    for said in (say_recorded(summary["head"]), say_control(summary), say_beyond(summary), "" if found else NOTHING):
         if said:
             say(said)
     if not found:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from experiments.applications import DRIVEN
-from experiments.progress import console
+from experiments.progress import console, say
 from experiments.setting import UNSET
 from experiments.words import few
 from hma_jax.config import ConfigError, ExecutionConfig, require
@@ -74,14 +74,13 @@ def play(
     keep_places(simulator, run)
     begins = {start.robot for start in simulator.starts}
     if missing := [name for name in simulator.robots if name not in begins]:
-        console.print(
+        say(
             f"note: not on the page: {few(missing)}; there are no held-out frames here to start from, as of robots that "
-            "the model knew before it was given others",
-            soft_wrap=True,
+            "the model knew before it was given others"
         )
     if simulator.deaf:
-        console.print(f"note: {DEAF}", soft_wrap=True)
-    console.print(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling", soft_wrap=True)
+        say(f"note: {DEAF}")
+    say(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling")
     warm_up(simulator, together=1)
     raise_lost_request()
 
@@ -99,14 +98,14 @@ def play(
         target=warm_up_more, args=(simulator, 1), kwargs={"ended": ended.is_set, "reached": reached}
     )
 
-    def say(actual: int) -> None:
+    def ready(actual: int) -> None:
         shown = "localhost" if host == "127.0.0.1" else host
-        console.print(f"drive it at http://{shown}:{actual} (end with Ctrl-C)", soft_wrap=True)
+        say(f"drive it at http://{shown}:{actual} (end with Ctrl-C)")
         if visitors > 1:  # nobody waits for it: as long as it is not compiled for several, they take turns
             compiling.start()
 
     try:
-        asyncio.run(serve(app, host, port, say))
+        asyncio.run(serve(app, host, port, ready))
     except KeyboardInterrupt:
         if compiling.is_alive():
             console.print("ends as soon as a program is compiled")

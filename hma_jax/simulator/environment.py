@@ -10,9 +10,10 @@ Instead of `run`, `simulator` takes anything with the interface of `interface.An
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -45,6 +46,9 @@ def observation_space(simulator: AnySimulator) -> gymnasium.spaces.Box:
 class _Task:
     """What both environments need: a simulator, one of its robots, where its episodes start and who judges them."""
 
+    loaded_in: ClassVar[int | None] = None
+    """The process in which a run was loaded first; those forked from it have JAX's state, but not its threads."""
+
     def __init__(
         self,
         episodes: int,
@@ -60,6 +64,12 @@ class _Task:
         told = ", ".join(options)
         require(run is not None or not options, f"{told}: options of loading a `run`; a given simulator is as it is")
         if simulator is None:
+            _Task.loaded_in = _Task.loaded_in or os.getpid()
+            require(
+                _Task.loaded_in == os.getpid(),
+                "this process was forked from one that had loaded a run, and JAX does not go on in it: leave "
+                "vectorization_mode out (make_vec then steps all episodes in one batch), or spawn processes",
+            )
             simulator = Simulator.load(run, episodes=episodes, **options)
         require(
             getattr(simulator, "rate", "model") == "model",

@@ -24,6 +24,8 @@ class Start:
     seed: int | None = None  # with which the robot's true simulator begins the same episode
 
     def __post_init__(self):
+        for name in ("images", "actions"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name)))
         require(
             self.images.dtype == np.uint8 and self.images.ndim == 4 and len(self.images) >= 1,
             f"a start of {self.robot} needs images uint8 [n, H, W, 3], got {self.images.dtype} {self.images.shape}",

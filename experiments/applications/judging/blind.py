@@ -25,7 +25,9 @@ ENLARGED = 3
 SHOW_MS, HOLD_MS = 200, 1200
 
 SCRIPT = """
-const labels = {};
+const KEPT = `hma labels ${document.body.dataset.page}`;
+let labels = {};
+try { labels = JSON.parse(localStorage.getItem(KEPT)) ?? {}; } catch {}  // a browser may keep nothing
 let at = 0;
 const clips = [...document.querySelectorAll('img')];
 function show() {
@@ -34,7 +36,11 @@ function show() {
   document.getElementById('where').textContent = `${at + 1} of ${clips.length}, ${done} labelled: ` +
     ({true: 'success', false: 'failure'}[labels[clips[at].dataset.clip]] ?? 'not labelled');
 }
-function label(value) { labels[clips[at].dataset.clip] = value; move(1); }
+function label(value) {
+  labels[clips[at].dataset.clip] = value;
+  try { localStorage.setItem(KEPT, JSON.stringify(labels)); } catch {}
+  move(1);
+}
 function move(by) { at = Math.min(Math.max(at + by, 0), clips.length - 1); show(); }
 document.addEventListener('keydown', (event) => {
   const keys = {s: () => label(true), f: () => label(false), ArrowLeft: () => move(-1), ArrowRight: () => move(1)};
@@ -44,6 +50,7 @@ document.addEventListener('keydown', (event) => {
 document.getElementById('success').onclick = () => label(true);
 document.getElementById('failure').onclick = () => label(false);
 document.getElementById('back').onclick = () => move(-1);
+document.getElementById('on').onclick = () => move(1);
 document.getElementById('save').onclick = () => {
   const link = document.createElement('a');
   link.href = URL.createObjectURL(new Blob([JSON.stringify({page: document.body.dataset.page, labels}, null, 1)]));
@@ -84,7 +91,7 @@ def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
         f"<h1>Is the task done?</h1><p>The goal: {html.escape(judged.config.task.goal)}, for "
         f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows back and on.</p>"
         f"{''.join(pictures)}<p id=where></p><button id=success>success</button><button id=failure>failure</button>"
-        f"<button id=back>back</button><button id=save>save labels.json</button><script>{SCRIPT}</script></body>"
+        f"<button id=back>back</button><button id=on>on</button><button id=save>save labels.json</button><script>{SCRIPT}</script></body>"
         "</html>\n"
     )
     write_file(out / "blind.json", json.dumps({"page": page, "clips": chosen}) + "\n")

@@ -38,6 +38,7 @@ from experiments.applications.policies.network import (
 from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.kernels.random import key_of
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.interface import AnySimulator
 
@@ -63,7 +64,7 @@ class HeadConfig:
 
 
 def init_head(config: HeadConfig, seed: int) -> Params:
-    first, second = jax.random.split(jax.random.key(seed))
+    first, second = jax.random.split(key_of(seed))
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 2 * 3),

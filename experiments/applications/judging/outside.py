@@ -14,7 +14,9 @@ from experiments.applications.judging.head import Head, SuccessHead, measure_hea
 from experiments.applications.judging.outcomes import WORLDS
 from experiments.applications.judging.rollouts import make_starts
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
+from experiments.applications.policies.tasks import OWN, Task
 from experiments.applications.simulators import has_truth, true_simulator
+from experiments.progress import say
 from hma_jax.config import require
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
@@ -23,6 +25,9 @@ from hma_jax.simulator.starts import Start
 
 HELD_OUT = 7919
 """Added to the seed of recordings that nothing is trained on."""
+
+OFTEN = 0.5
+"""Share of its demonstrations in which an expert should do what it is cloned for."""
 
 Reconstruct = Callable[[np.ndarray], np.ndarray]
 """uint8 [n, H, W, 3] as the model's tokenizer shows them."""
@@ -77,7 +82,7 @@ class TrueOutside:
         config = self.config
         short = replace(config.task, frames=config.demonstration_frames)
         with self._step(f"record {config.demonstrations} demonstrations"):
-            return record(
+            made = record(
                 short,
                 config.demonstrations,
                 stride=self._robot.stride,
@@ -86,6 +91,9 @@ class TrueOutside:
                 after=0,
                 seed=config.seed,
             )
+        if seldom := say_seldom(made, short):
+            say(seldom)
+        return made
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
         config, size, stride = self.config, self._size, self._robot.stride
@@ -106,6 +114,18 @@ class TrueOutside:
 
     def open(self) -> AbstractContextManager[AnySimulator]:
         return closing(true_simulator(self._learned, [self._robot], self.config.batch))
+
+
+def say_seldom(demos: Demonstrations, task: Task) -> str:
+    """In words, that an expert of the suite hardly does its robot's own task; "" where it does, or where there is no
+    easier one."""
+    done = float(demos.successes.mean())
+    if not task.in_suite or task.name != OWN or done >= OFTEN:
+        return ""
+    return (
+        f"The expert of {task.robot} does its own task in {done:.0%} of the demonstrations ({task.frames} frames each). What it "
+        "does not do, no policy learns from it; reaching the mark, --task reach, is easier."
+    )
 
 
 def head_recordings(config: JudgeConfig, size: int, stride: int, episodes: int, seed: int) -> Demonstrations:

@@ -188,18 +188,24 @@ def _agreement(summary: dict[str, Any]) -> str:
 
 
 def _head(summary: dict[str, Any]) -> str:
-    measured = summary["head"]
-    said = (
-        f"{'That of the file with the policies. ' if summary['own success'] else ''}"
-        f"On {measured['episodes']:.0f} recorded {'' if 'successes' in measured else 'true '}episodes that no head was "
-        f"trained on: accuracy of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of "
-        f"episodes {measured['episode accuracy']:.3f}."
-    )
     rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
     return section(
         "The success head",
-        f"<p>{said} {html.escape(say_recorded(measured))}</p><p>Episodes per second, this machine as loaded as it was: "
+        f"<p>{html.escape(say_head(summary))} {html.escape(say_recorded(summary['head']))}</p><p>Episodes per second, this machine as loaded as it was: "
         f"{html.escape(rates)}.</p>",
+    )
+
+
+def say_head(summary: dict[str, Any]) -> str:
+    """In words, what whoever tells success is worth on frames that nobody was trained on."""
+    measured = summary["head"]
+    usual = max(measured["positive"], 1 - measured["positive"])
+    doubt = "" if measured["frame accuracy"] > usual else " It does no better: do not trust the rates that it tells."
+    return (
+        f"{'That of the file with the policies. ' if summary['own success'] else ''}"
+        f"On {measured['episodes']:.0f} recorded {'' if 'successes' in measured else 'true '}episodes that no head was "
+        f"trained on: accuracy of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of "
+        f"episodes {measured['episode accuracy']:.3f}. To call every frame the same would be right in {usual:.3f}.{doubt}"
     )
 
 

@@ -29,6 +29,7 @@ from experiments.applications.policies.network import (
     mlp,
 )
 from hma_jax.config import require
+from hma_jax.kernels.random import key_of
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class BcConfig:
 
 def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
     """float32 parameters that have learnt nothing."""
-    first, second = jax.random.split(jax.random.key(seed))
+    first, second = jax.random.split(key_of(seed))
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),

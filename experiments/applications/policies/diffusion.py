@@ -30,6 +30,7 @@ from experiments.applications.policies.network import (
     mlp,
 )
 from hma_jax.config import require
+from hma_jax.kernels.random import key_of
 
 EMBEDDED = 32
 """Values that a noise level is given as: sines and cosines."""
@@ -60,7 +61,7 @@ class DiffusionConfig:
 
 
 def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:
-    first, second = jax.random.split(jax.random.key(seed))
+    first, second = jax.random.split(key_of(seed))
     out, width = config.chunk * action_dim, config.width
     inputs = config.encoder.features + EMBEDDED + out
     return {
@@ -78,7 +79,7 @@ def signal(levels: int) -> np.ndarray:
 
 def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array) -> jax.Array:
     """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, 3 K]."""
-    rate = jnp.exp(-jnp.log(1000.0) * jnp.arange(EMBEDDED // 2) / (EMBEDDED // 2))
+    rate = jnp.exp(-jnp.log(1000.0) * jnp.arange(EMBEDDED // 2, dtype=jnp.float32) / (EMBEDDED // 2))
     angle = level[:, None] * rate
     return mlp(params["denoiser"], jnp.concatenate([seen, jnp.sin(angle), jnp.cos(angle), noised], -1))
 
@@ -113,8 +114,8 @@ def train_diffusion(
         frames = lit(frames_of(data, index), light, config.light)
         seen = encode(params["encoder"], config.encoder, beside(frames))
         chunk = jnp.clip(data["chunk"][index], -CLIP, CLIP)
-        level = jax.random.randint(level_key, (len(index),), 0, config.levels)
-        noise = jax.random.normal(noise_key, chunk.shape)
+        level = jax.random.randint(level_key, (len(index),), 0, config.levels, jnp.int32)
+        noise = jax.random.normal(noise_key, chunk.shape, jnp.float32)
         share = kept[level][:, None]
         noised = jnp.sqrt(share) * chunk + jnp.sqrt(1 - share) * noise
         return jnp.mean((denoise(params, seen, noised, level.astype(jnp.float32)) - noise) ** 2)

@@ -12,6 +12,7 @@ import numpy as np
 import optax
 
 from hma_jax.config import require
+from hma_jax.kernels.random import key_of
 
 Report = Callable[[int, int, str], None]
 """Called as report(done, total, note)."""
@@ -57,12 +58,12 @@ def fit(
     )
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay))
     arrays = {name: jnp.asarray(values) for name, values in data.items()}
-    root = jax.random.key(seed)
+    root = key_of(seed)
 
     @jax.jit
     def step(params: Any, average: Any, state: Any, n: jax.Array, arrays: Mapping[str, jax.Array]):
         draw, noise = jax.random.split(jax.random.fold_in(root, n))
-        index = jax.random.randint(draw, (config.batch,), 0, examples)
+        index = jax.random.randint(draw, (config.batch,), 0, examples, jnp.int32)
         value, grads = jax.value_and_grad(loss)(params, arrays, index, noise)
         updates, state = optimizer.update(grads, state, params)
         params = optax.apply_updates(params, updates)

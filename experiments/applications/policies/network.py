@@ -7,6 +7,7 @@ What finds a mark at one place then finds it anywhere; a dense layer on the maps
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,8 +49,8 @@ class EncoderConfig:
 
 def init_dense(key: jax.Array, inputs: int, outputs: int, gain: float = 2.0) -> Params:
     return {
-        "w": jax.random.normal(key, (inputs, outputs)) * np.sqrt(gain / inputs),
-        "b": jnp.zeros(outputs),
+        "w": jax.random.normal(key, (inputs, outputs), jnp.float32) * math.sqrt(gain / inputs),
+        "b": jnp.zeros(outputs, jnp.float32),
     }
 
 
@@ -75,12 +76,13 @@ def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
     keys = jax.random.split(key, len(kernels))
     convolutions = [
         {
-            "w": jax.random.normal(k, (side, side, widths[i], widths[i + 1])) * np.sqrt(2 / (side * side * widths[i])),
-            "b": jnp.zeros(widths[i + 1]),
+            "w": jax.random.normal(k, (side, side, widths[i], widths[i + 1]), jnp.float32)
+            * math.sqrt(2 / (side * side * widths[i])),
+            "b": jnp.zeros(widths[i + 1], jnp.float32),
         }
         for i, (k, side) in enumerate(zip(keys, kernels, strict=True))
     ]
-    return {"convolutions": convolutions, "sharpness": jnp.full(config.channels[-1], SHARPNESS)}
+    return {"convolutions": convolutions, "sharpness": jnp.full(config.channels[-1], SHARPNESS, jnp.float32)}
 
 
 def encode(params: Params, config: EncoderConfig, images: jax.Array) -> jax.Array:
@@ -99,7 +101,8 @@ def points(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
     batch, height, width, count = maps.shape
     flat = maps.reshape(batch, height * width, count)
     weight = jax.nn.softmax(flat * sharpness, axis=1)
-    rows, columns = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
+    sides = (jnp.linspace(-1, 1, n, dtype=maps.dtype) for n in (height, width))
+    rows, columns = jnp.meshgrid(*sides, indexing="ij")
     x, y = (jnp.einsum("bpk,p->bk", weight, at.ravel()) for at in (columns, rows))
     return jnp.concatenate([x, y, jnp.tanh((weight * flat).sum(1) / 4)], -1)
 
@@ -133,7 +136,7 @@ def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
 def lit(frames: jax.Array, key: jax.Array, strength: float) -> jax.Array:
     """Frames [B, n, H, W, 3] in [-1, 1] of episodes each under another light: colours scaled and moved a little."""
     shape = (len(frames), 1, 1, 1, 3)
-    gain, offset = strength * jax.random.normal(key, (2, *shape))
+    gain, offset = strength * jax.random.normal(key, (2, *shape), frames.dtype)
     return frames * (1 + gain) + offset
 
 
@@ -142,8 +145,9 @@ def moved(frames: jax.Array, key: jax.Array, most: int) -> jax.Array:
     if not most:
         return frames
     wide = jnp.pad(frames, ((0, 0), (0, 0), (most, most), (most, most), (0, 0)), mode="edge")
-    place = jax.random.randint(jax.random.fold_in(key, 1), (len(frames), 2), 0, 2 * most + 1)
-    return jax.vmap(lambda x, at: jax.lax.dynamic_slice(x, (0, at[0], at[1], 0), frames.shape[1:]))(wide, place)
+    place = jax.random.randint(jax.random.fold_in(key, 1), (len(frames), 2), 0, 2 * most + 1, jnp.int32)
+    start = jnp.pad(place, ((0, 0), (1, 1)))  # of all images and colours
+    return jax.vmap(lambda x, at: jax.lax.dynamic_slice(x, at, frames.shape[1:]))(wide, start)
 
 
 def as_floats(images: jax.Array) -> jax.Array:

@@ -15,6 +15,7 @@ from experiments.applications.policies.policy import Counts
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.generation import predict_next_actions
+from hma_jax.kernels.random import key_of
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.training.runs import Model
@@ -39,7 +40,7 @@ class OwnHeadPolicy:
         settings = decode or DecodeConfig()
 
         def predict(params, frames, actions_BTU, embodiment_B, seed_B):
-            keys = jax.vmap(jax.random.key)(seed_B)
+            keys = jax.vmap(key_of)(seed_B)
             return predict_next_actions(model.declared.merge(params), frames, actions_BTU, embodiment_B, keys, settings)
 
         self._predict = jax.jit(predict)

@@ -1,5 +1,6 @@
 """Gymnasium's view of a simulator."""
 
+import os
 import warnings
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="needs the extra `simulator`
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from hma_jax.config import ConfigError  # noqa: E402
+from hma_jax.simulator import environment  # noqa: E402
 from hma_jax.simulator.environment import ID, MAX_STEPS, RobotEnv, RobotVectorEnv  # noqa: E402
 from tests.hma_jax.simulator.small import ROBOTS, simulator, start  # noqa: E402
 
@@ -222,3 +224,12 @@ def test_native_actions_are_no_steps_of_an_environment():
 def test_what_cannot_be_made_is_said(options: dict, message: str):
     with pytest.raises(ConfigError, match=message):
         RobotEnv(**{"simulator": simulator(), "starts": STARTS, "robot": "arm", **options})
+
+
+def test_a_forked_process_does_not_load_a_run_again(monkeypatch, tmp_path):
+    monkeypatch.setattr(environment._Task, "loaded_in", os.getpid() + 1)
+    with pytest.raises(ConfigError, match="forked from one that had loaded a run, .* leave vectorization_mode out"):
+        environment.RobotEnv(tmp_path)
+    monkeypatch.setattr(environment._Task, "loaded_in", os.getpid())
+    with pytest.raises(ConfigError, match="no checkpoints"):
+        environment.RobotEnv(tmp_path)

@@ -362,6 +362,13 @@ def test_a_window_of_the_model_is_all_of_a_start_that_is_seen():
     assert sim.counts == (CONFIG.frames - 1,)
 
 
+def test_a_start_may_be_given_as_lists_and_says_what_it_lacks():
+    made = Start("arm", np.zeros((2, 1, 1, 3), np.uint8), [[0.0, 1.0]])
+    assert made.actions.shape == (1, 2)
+    with pytest.raises(ConfigError, match="needs finite actions .* got \\(0,\\)"):
+        Start("arm", made.images, [])
+
+
 def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
     class Compiling(list):
         def compile(self, together):

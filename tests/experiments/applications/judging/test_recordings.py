@@ -15,7 +15,7 @@ from experiments.applications.generating.trajectories import Outline, RldsTrajec
 from experiments.applications.judging.agreement import agree, agree_with_counts, mean_above
 from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
-from experiments.applications.judging.page import say_control, say_recorded
+from experiments.applications.judging.page import say_control, say_head, say_recorded
 from experiments.applications.judging.real import read_real
 from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
@@ -338,3 +338,10 @@ def test_a_head_that_is_no_better_than_always_saying_the_same_is_told():
     assert "9 of 10 successes and 10 of 10 failures: 0.95" in say_recorded(measured)
     assert "do not trust" not in say_recorded(measured)
     assert "do not trust" in say_recorded(measured | {"failures told": 3.0}) and say_recorded({}) == ""
+
+
+def test_whoever_tells_success_no_better_than_always_the_same_is_told():
+    measured = {"positive": 0.3, "frame accuracy": 0.71, "frame AUROC": 0.6, "episodes": 40.0, "episode accuracy": 0.7}
+    said = [say_head({"head": measured | {"frame accuracy": x}, "own success": True}) for x in (0.71, 0.7)]
+    assert all("To call every frame the same would be right in 0.700" in one for one in said)
+    assert "do not trust" not in said[0] and "do not trust" in said[1]

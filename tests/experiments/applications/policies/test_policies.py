@@ -1,5 +1,8 @@
 """Recorded demonstrations, and policies that are trained on them."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,12 +13,18 @@ from experiments.applications.policies import RandomPolicy, diffusion, find_task
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
 from experiments.applications.policies.demonstrations import load_demonstrations, save_demonstrations
-from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, init_diffusion
+from experiments.applications.policies.diffusion import (
+    DiffusionConfig,
+    DiffusionPolicy,
+    init_diffusion,
+    train_diffusion,
+)
 from experiments.applications.policies.learning import FitConfig, ladder
-from experiments.applications.policies.network import EncoderConfig
+from experiments.applications.policies.network import EncoderConfig, as_floats, moved
 from experiments.applications.policies.scripted import ScriptedPolicy
 from experiments.applications.policies.tasks import held
 from hma_jax.config import ConfigError
+from hma_jax.kernels.random import key_of
 from hma_jax.simulator import Start
 
 SMALL = EncoderConfig(8, (4, 4, 4), 16)
@@ -85,6 +94,24 @@ def test_cloning_learns_and_is_a_function_of_its_seed(demos):
     one, again, other = (train_bc(demos, short, seed)[1]["mlp"][0]["w"] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("setting", [partial(jax.enable_x64, True), partial(jax.default_prng_impl, "rbg")])
+def test_settings_of_jax_change_no_policy(setting, demos):
+    config = DiffusionConfig(encoder=SMALL, samples=2, fit=FitConfig(steps=2, batch=4))
+    images = demos.images[:2, 0]
+
+    def trained() -> tuple[list[np.ndarray], np.ndarray]:
+        params = train_diffusion(demos, config, 1)[2]
+        shown = moved(as_floats(images[:, None]), key_of(1), 2)
+        return [*jax.tree.leaves(params), shown], DiffusionPolicy(config, params, scale_of(demos)).act(images)
+
+    usual, acted = trained()
+    with setting():
+        other, acted_there = trained()
+    for mine, theirs in zip([*usual, acted], [*other, acted_there], strict=True):
+        assert mine.dtype == theirs.dtype == np.float32
+        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["cloned", "diffusion"])

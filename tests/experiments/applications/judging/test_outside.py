@@ -1,0 +1,17 @@
+"""What of a judgement comes from the true simulator."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from experiments.applications.judging.outside import say_seldom
+from experiments.applications.policies.tasks import find_task
+
+
+def test_an_expert_that_hardly_does_its_own_task_is_told():
+    seldom, often = (SimpleNamespace(successes=np.arange(10) < n) for n in (2, 6))
+    task = replace(find_task("pusher_sand"), frames=12)
+    told = "The expert of pusher_sand does its own task in 20% of the demonstrations (12 frames each)."
+    assert say_seldom(seldom, task).startswith(told) and say_seldom(often, task) == ""
+    assert say_seldom(seldom, find_task("pusher_sand", "reach")) == ""
