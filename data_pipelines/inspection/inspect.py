@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.errors import NAMED, DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
 from data_pipelines.inspection.sample import Shown, shrink
@@ -150,7 +150,13 @@ def inspect_dataset(
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
-    cameras = {f.key: _CameraLog() for f in fields if f.per_step and f.kind == "image"}
+    if not any(f.per_step for f in fields):
+        there = ", ".join(f.key for f in fields[:NAMED])
+        raise DataError(
+            f"{source.schema}: none of its fields ({there}) is one of a step, below `steps`: these are no episodes. Give a "
+            "dataset in the layout of RLDS, or write this one so (docs/own_data.md, Writing RLDS)."
+        )
+    cameras = {f.key: _CameraLog(f.key) for f in fields if f.per_step and f.kind == "image"}
     sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
     taken = {"action", *(field_slice(key)[0] for key in action_keys)}
     numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= WIDEST)]
@@ -183,8 +189,9 @@ def inspect_dataset(
         if len(examples) < shown:
             examples.append(_shown(int(source.numbers[i]), count, record, times, looked, actions))
     if not steps:
-        reasons = "; ".join(source.skipped) or "it is empty"
-        raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}")
+        reasons = "; ".join(list(source.skipped)[:NAMED]) or "it is empty"
+        more = f"; {len(source.skipped) - NAMED:,} more" if len(source.skipped) > NAMED else ""
+        raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}{more}")
     facts = Facts(
         name=source.name,
         version=source.version,
@@ -197,7 +204,7 @@ def inspect_dataset(
         bytes_read=bytes_read,
         steps=tuple(steps),
         lengths=_lengths(steps),
-        cameras=tuple(log.facts(key) for key, log in cameras.items()),
+        cameras=tuple(log.facts() for log in cameras.values()),
         actions=tuple(ActionFacts(key, dimension_facts(rows[key])) for key in numbers),
         damaged=dict(source.skipped),
         hz=source.hz,
@@ -286,15 +293,15 @@ def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence
 class _CameraLog:
     """What was seen of one camera so far."""
 
-    def __init__(self):
+    def __init__(self, key: str):
+        self._key = key
         self.sizes: set[tuple[int, int]] = set()
         self.frames = self.blank = 0
         self.still = True
 
     def look(self, encoded: Sequence[Fetched], times: Sequence[int]) -> list[np.ndarray]:
-        """The decoded frames at `times`, noted."""
-        found = (encoded[t] for t in times)
-        images = [frame if isinstance(frame, np.ndarray) else decode_image(frame) for frame in found]
+        """The decoded frames at `times`, noted. Raises ValueError for one that cannot be decoded."""
+        images = [self._decode(encoded[t], t) for t in times]
         self.sizes |= {image.shape[:2] for image in images}
         self.frames += len(images)
         self.blank += sum(bool(image.std(axis=(0, 1)).max() < BLANK_STD) for image in images)
@@ -303,8 +310,16 @@ class _CameraLog:
         self.still &= not any(moves)
         return images
 
-    def facts(self, key: str) -> CameraFacts:
-        return CameraFacts(key, tuple(sorted(self.sizes)), self.frames, self.blank, self.still)
+    def _decode(self, frame: Fetched, step: int) -> np.ndarray:
+        if isinstance(frame, np.ndarray):
+            return frame
+        try:
+            return decode_image(frame)
+        except ValueError as error:
+            raise ValueError(f"step {step} of {self._key} cannot be decoded: {error}") from error
+
+    def facts(self) -> CameraFacts:
+        return CameraFacts(self._key, tuple(sorted(self.sizes)), self.frames, self.blank, self.still)
 
 
 def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> Shown:

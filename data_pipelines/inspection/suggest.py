@@ -154,11 +154,18 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
     else:
         keys = [k for k in by_key if k.startswith("action/") and not NO_ACTION.search(k)]
     if not keys:
-        kept = ", ".join(f.key for f in facts.fields if f.kind == "bytes" and f.key.partition("/")[0] == "action")
+        parts = [f for f in facts.fields if f.key.partition("/")[0] == "action"]
+        kept = ", ".join(f.key for f in parts if f.kind == "bytes")
+        lists = ", ".join(f.key for f in parts if f.kind == "list")
+        others = ", ".join(k for k in by_key if not NO_ACTION.search(k))
         if kept:
             why = f"{kept} is kept as bytes, which are not read; write the dataset again with encoding 'none' for it"
+        elif lists:
+            why = f"{lists} has no fixed length, and is not read; write the dataset again with one"
         else:
             why = "no numeric field `action`"
+        if others:
+            why += f"; name in action_keys what was done, of {others}"
         return (), (), f"{why}: video alone"
     names, dims, dropped = [], [], []
     for key in keys:

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,12 @@ def read_meta(root: Path) -> LeRobotMeta:
     episodes = read(root, info, videos)
     if not episodes:
         raise DataError(f"{root / 'meta'}: no episode is listed. {ADVICE}")
+    for one, following in pairwise(episodes):
+        if one.index == following.index:
+            raise DataError(
+                f"{root / 'meta'}: episode {one.index} is listed twice, as after a recording that was taken up again. "
+                "Remove one of the two there, or fetch the dataset again."
+            )
     return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), _tasks(root, version))
 
 

@@ -18,6 +18,7 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -260,5 +261,8 @@ def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:
             raise DataError(f"{path}: mask/{filter_key} names {missing[0]!r}, which 'data' does not have.")
         if not chosen:
             raise DataError(f"{path}: mask/{filter_key} names no demonstration.")
+        for name, following in pairwise(sorted(chosen)):
+            if name == following:
+                raise DataError(f"{path}: mask/{filter_key} names {name!r} twice. Correct the mask.")
         there = chosen
     return sorted(there, key=lambda name: int(name.removeprefix("demo_")))

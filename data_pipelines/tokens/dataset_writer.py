@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.claims import claim, living_claim, waiting_times
 from data_pipelines.publishing.files import remove, sync
 from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts
@@ -147,7 +147,8 @@ def _publish(maker: PartMaker) -> None:
                 facts.append(known)
             manifest = _merge(plan, facts, maker.lost)
             if not manifest.train.episodes:
-                raise DataError(f"{plan.spec.name}: no usable episode is left to train on.")
+                last = f" The last left out: {without_advice(manifest.skipped[-1].reason)}" if manifest.skipped else ""
+                raise DataError(f"{plan.spec.name}: no usable episode is left to train on.{last}")
             manifest.save(work, held.scratch)
             sync(work)
             try:

@@ -193,6 +193,14 @@ def test_what_was_not_read_is_not_said_to_be_free_of_duplicates(toy, tmp_path, c
     assert not any("occur twice" in text for text in said["4"])
 
 
+def test_damage_is_not_laid_to_the_number_of_episodes_asked_for(tmp_path, capsys):
+    """Of 2 episodes 1 was read "(--episodes)", where 64 may be and the other has no step."""
+    directory = write_rlds(tmp_path, SPEC, [21, 0])
+    assert main(["data", "view", str(directory), "--hz", "8", "--out", str(tmp_path / "page.html")]) == 0
+    said = capsys.readouterr().out
+    assert "toy: cannot be read: 1 of the episodes" in said and "--episodes" not in said
+
+
 @pytest.mark.parametrize("same", [False, True])
 def test_splits_that_are_read_together_are_two_splits_none_of_which_is_another(same, toy, tmp_path, capsys):
     """An entry with split = "train+val": its episodes are not those of train again, but one may lie in both."""

@@ -24,7 +24,7 @@ from data_pipelines.sources.rlds.frame_places import FramePlaces
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.index import index_path, load_index
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing
-from data_pipelines.sources.rlds.schema import field_slice, read_metadata, resolve_version, step_key
+from data_pipelines.sources.rlds.schema import field_slice, listing, read_info, read_metadata, resolve_version, step_key
 from data_pipelines.sources.rlds.steps import load_steps, save_steps
 from data_pipelines.sources.rlds.tfrecord import open_record, read_parts, scan_shard
 from data_pipelines.sources.source import MAX_SKIPPED, SUCCESS_KEY, Corrupt, EpisodeSource, OpenEpisode, join_actions
@@ -189,8 +189,13 @@ class RldsDataset(EpisodeSource):
                 raise DataError(message)
             self.lose(str(problem or message), count - shard.records)
         if not len(self):
-            why = next(iter(self.skipped), "it is said to have none.")
+            why = next(iter(self.skipped), None) or self._said_empty()
             raise DataError(f"{self.directory}: split {self.split!r} has no readable episode: {why}")
+
+    def _said_empty(self) -> str:
+        splits = read_info(self.directory).splits.values()
+        others = listing([split.name for split in splits if sum(split.shard_lengths)])
+        return f"dataset_info.json says it has none; splits that have some: {others or 'none'}."
 
     def _place(self, i: int) -> tuple[Location, int, int]:
         if not 0 <= i < len(self):

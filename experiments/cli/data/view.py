@@ -66,7 +66,7 @@ def view(
     for directory in datasets:
         with step(f"read {directory}"):
             viewed.append(_view_one(directory, split, hz, stride, frames, episodes, shown))
-        _say_remarks(viewed[-1])
+        _say_remarks(viewed[-1], episodes)
     say_unmatched(registry, [one.facts.name for one in viewed])
     given = {
         "split": split, "hz": hz and f"{hz:g}", "stride": stride, "frames": frames, "episodes": episodes,
@@ -123,7 +123,7 @@ def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]
         return ()
 
 
-def _say_remarks(viewed: Viewed) -> None:
+def _say_remarks(viewed: Viewed, episodes: int) -> None:
     colours = {"bad": "red", "doubt": "yellow"}
     name = escape(viewed.facts.name)
     if not viewed.remarks:
@@ -132,7 +132,7 @@ def _say_remarks(viewed: Viewed) -> None:
         title = f"[{colours[remark.kind]}]{remark.title}[/]"
         console.print(f"[bold]{name}[/]: {title}: {escape(remark.text)}", soft_wrap=True)
     f = viewed.facts
-    if f.sampled < f.episodes:
+    if f.stopped or episodes < f.episodes:  # of others all that can be read were
         console.print(
             f"note: {name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); recordings that occur twice "
             "are found among these alone",

@@ -219,6 +219,22 @@ def test_line_that_describes_no_episode_is_named(tmp_path, line):
         LeRobotSource(root)
 
 
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_an_episode_that_is_listed_twice_is_named(tmp_path, version):
+    """As after a recording that was taken up again: "list each file once" was the advice."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    root = write_lerobot(tmp_path / "toy", version)
+    lines, table = root / "meta/episodes.jsonl", root / "meta/episodes/chunk-000/file-000.parquet"
+    if version == "v2.1":
+        lines.write_text(lines.read_text() * 2)
+    else:
+        pq.write_table(pa.concat_tables([pq.read_table(table)] * 2), table)
+    with pytest.raises(DataError, match="toy/meta: episode 0 is listed twice.* Remove one"):
+        LeRobotSource(root)
+
+
 @pytest.mark.parametrize("other", ["observation.images.left.wrist", "observation.left_wrist"])
 def test_two_features_of_one_name_are_refused(tmp_path, other):
     """A camera beside a camera, and beside numbers: one would hide the other."""

@@ -144,6 +144,15 @@ def test_malformed_files_are_named_to_the_field(tmp_path, change, message):
     assert not list(tmp_path.glob("lift/1.0.0"))
 
 
+def test_a_mask_that_names_a_demonstration_twice_is_refused(tmp_path):
+    def change(file):
+        file["mask/mine"] = np.array([b"demo_9", b"demo_11", b"demo_9"])
+
+    path = write_robomimic(tmp_path / "image.hdf5", change=change)
+    with pytest.raises(DataError, match="mask/mine names 'demo_9' twice"):
+        RobomimicSource(path, RobomimicSettings(filter_key="mine"))
+
+
 def test_something_else_than_hdf5_is_refused(tmp_path):
     (tmp_path / "x.hdf5").write_text("no")
     with pytest.raises(DataError, match="no readable HDF5 file"):

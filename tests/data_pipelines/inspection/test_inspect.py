@@ -128,7 +128,9 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
     first, second = sorted(facts.damaged)
     file = "toy-train.tfrecord-00000-of-00001"
     assert first.startswith(f"{file}, episode 1: its fields differ in length") and "action 4" in first
-    assert second.startswith(f"{file}, episode 2: 8 bytes that are neither JPEG nor PNG")
+    assert second.startswith(
+        f"{file}, episode 2: step 0 of observation/image cannot be decoded: 8 bytes that are neither JPEG nor PNG"
+    )
 
 
 def test_episodes_keep_their_numbers_behind_a_shard_that_is_cut_off(tmp_path):
@@ -225,6 +227,37 @@ def test_actions_that_are_kept_as_bytes_are_told_and_not_called_damage(tmp_path)
         RldsDataset(directory).check_keys("observation/image", ("action",))
 
 
+@pytest.mark.parametrize(
+    "name, shape, reason",
+    [
+        ("actions", (3,), "no numeric field `action`; name in action_keys what was done, of actions"),
+        ("action", (None,), "action has no fixed length, and is not read"),
+    ],
+)
+def test_actions_that_are_not_taken_are_told(tmp_path, name, shape, reason):
+    """They were not: a dataset of robots became video alone, for want of a field of the usual name and form."""
+    from tensorflow_datasets import features as tf
+
+    def change(episode, features):
+        features[f"steps/{name}"] = features.pop("steps/action")
+
+    directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
+    step = {"observation": {"image": tf.Image(shape=(8, 8, 3))}, name: tf.Tensor(shape=shape, dtype=np.float32)}
+    tf.FeaturesDict({"steps": tf.Dataset(step)}).save_config(str(directory))
+    suggestion = suggest_entry(inspect_dataset(directory).facts, 4)
+    assert not suggestion.action_keys and f"action: {reason}" in " ".join(suggestion.reasons)
+
+
+def test_records_that_are_no_episodes_are_told(tmp_path):
+    """As the pictures and labels of most other datasets of tfds."""
+    from tensorflow_datasets import features as tf
+
+    directory = write_rlds(tmp_path, make_spec(), [5] * 2)
+    tf.FeaturesDict({"image": tf.Image(shape=(8, 8, 3)), "label": tf.Text()}).save_config(str(directory))
+    with pytest.raises(DataError, match=r"features.json: none of its fields \(image, label\) is one of a step"):
+        inspect_dataset(directory)
+
+
 def test_an_instruction_in_numbers_is_no_text(tmp_path):
     """As some datasets keep the ids of its tokens."""
     numbers = {"steps/language_instruction": np.arange(20)}
@@ -236,9 +269,10 @@ def test_directory_without_a_usable_episode(tmp_path):
     def change(episode, features):
         features["steps/action"] = features["steps/action"][:-1]
 
-    directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
-    with pytest.raises(DataError, match="no episode of split 'train' can be read: .*differ in length"):
+    directory = write_rlds(tmp_path, make_spec(), [5] * 8, change=change)
+    with pytest.raises(DataError, match="no episode of split 'train' can be read: .*differ in length") as raised:
         inspect_dataset(directory)
+    assert str(raised.value).count("differ in length") == 6 and str(raised.value).endswith("; 2 more")
 
 
 def test_unknown_split_lists_those_there(toy):

@@ -350,3 +350,15 @@ def test_skip_counts_an_episode_once(directory):
 def test_raise_passes_the_error_on(directory):
     with pytest.raises(EpisodeError, match="broken"):
         RldsDataset(directory).skip(0, EpisodeError("broken"))
+
+
+def test_an_empty_split_names_those_with_episodes(tmp_path):
+    directory = write_rlds(tmp_path, make_spec(), [3, 3])
+    path = directory / "dataset_info.json"
+    info = json.loads(path.read_text())
+    info["splits"].append({"name": "val", "shardLengths": []})
+    path.write_text(json.dumps(info))
+    with pytest.raises(
+        DataError, match="split 'val' has no readable episode: .* says it has none; .* have some: train"
+    ):
+        RldsDataset(directory, "val")
