@@ -55,16 +55,6 @@ class Measured:
         """[n]: the number of the distinct position that each trial stands at."""
         return np.unique(self.x, axis=0, return_inverse=True)[1].ravel()
 
-    def only(self, chosen: np.ndarray) -> Measured:
-        """The trials where `chosen` [n] holds."""
-        at, panel = np.flatnonzero(chosen), self.panel
-        if panel is not None:
-            points, seeds = (tuple(column[i] for i in at) for column in (panel.points, panel.seeds))
-            panel = Panel(panel.robot, panel.episode, points, seeds)
-        trial = tuple(self.trial[i] for i in at)
-        levels = min(self.levels, len(np.unique(self.seed[at])) - 1)
-        return Measured(self.axes, self.x[at], self.run[at], trial, self.seed[at], self.value[at], panel, levels)
-
     def seeds_per_point(self) -> int:
         """The least that any position has."""
         return int(np.bincount(self.points).min())

@@ -41,6 +41,16 @@ def scaled(points: Measured, factors: dict[int, float]) -> Measured:
     return replace(points, value=points.value * by, panel=replace(points.panel, points=values))
 
 
+def only(points: Measured, chosen: np.ndarray) -> Measured:
+    """The trials where `chosen` [n] holds."""
+    at = np.flatnonzero(chosen)
+    values, seeds = (tuple(column[i] for i in at) for column in (points.panel.points, points.panel.seeds))
+    return replace(
+        points, x=points.x[at], run=points.run[at], trial=tuple(points.trial[i] for i in at), seed=points.seed[at],
+        value=points.value[at], panel=replace(points.panel, points=values, seeds=seeds),
+    )  # fmt: skip
+
+
 def sizes(count: int, span: float = 30.0) -> np.ndarray:
     """[count, 1] from 1e4 on."""
     return np.geomspace(1e4, span * 1e4, count)[:, None]

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from experiments.analysis import powerlaw
 from experiments.analysis.fits import fit_power, weight_of
-from tests.experiments.analysis.curves import measured, power, scaled, sizes
+from tests.experiments.analysis.curves import measured, only, power, scaled, sizes
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def test_dropping_seeds_is_said(rng):
     points = measured(x, power(x, 1.5, (1.0, 0.5)), 2e-3, 3, rng)
     assert not fit_power(points, 20).doubts
     for left, words in ((2, "two seeds"), (1, "one seed")):
-        fewer = points.only((points.seed < left) | (points.x[:, 0] > 2e4))
+        fewer = only(points, (points.seed < left) | (points.x[:, 0] > 2e4))
         assert any(words in doubt for doubt in fit_power(fewer, 20).doubts), left
 
 

@@ -26,7 +26,7 @@ from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
 from hma_jax.config import ModelConfig
 from hma_jax.evaluation.windows import WindowTable
-from tests.experiments.analysis.curves import measured, sizes
+from tests.experiments.analysis.curves import measured, only, sizes
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE
 
@@ -172,7 +172,7 @@ def test_the_scatter_of_few_seeds_is_known_no_better_than_by_as_many(seeds):
     x = sizes(4)
     for _ in range(300):
         points = measured(x, np.full(4, 3.0), 0.01, 2, rng)
-        points = points.only(np.array([seed < seeds[i // 2] for i, seed in enumerate(points.seed)]))
+        points = only(points, np.array([seed < seeds[i // 2] for i, seed in enumerate(points.seed)]))
         noise, freedom = noise_near(points, x[-1])
         inside.append(abs(0.01 * rng.standard_normal()) < critical(freedom, 0.9) * noise)
     assert freedom == sum(seeds) - 4
