@@ -42,8 +42,13 @@ def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
 
 def check_fields(config: Any, limits: tuple[str, ...] = ()) -> None:
     """Raises ConfigError for a field of a dataclass that is not among the choices of its type (a Literal, one or
-    None, or a tuple of such), and for a number that is not finite. Of `limits` infinity is none at all."""
+    None, or a tuple of such), and for a number that is not finite. Of `limits` infinity is none at all.
+
+    A list becomes the tuple that it is read for: it has no hash, by which programs are kept."""
     where = type(config).__name__
+    for name, value in list(vars(config).items()):
+        if isinstance(value, list):
+            object.__setattr__(config, name, tuple(value))
     for name, choices, several in _choices(type(config)):
         value = getattr(config, name)
         for one in value if several else (value,):

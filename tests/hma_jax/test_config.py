@@ -144,6 +144,15 @@ def test_no_number_of_a_configuration_is_infinite_or_none_at_all():
                 cls(**{name: value})
 
 
+def test_lists_are_as_good_as_tuples():
+    """`train_model` ended in "unhashable type"."""
+    for cls, name, value in ((TrainConfig, "only", ["arm"]), (MupConfig, "without", ["init", "readout"])):
+        written, meant = (cls(**{name: kind(value)}) for kind in (list, tuple))
+        assert written == meant and hash(written) == hash(meant)
+    with pytest.raises(ConfigError, match="MupConfig.without: 'int' is not a choice"):
+        MupConfig(without=["int"])
+
+
 def test_limits_that_can_work_are_accepted():
     OptimizerConfig(beta1=0.0, final_fraction=0.0, decay_fraction=1.0, weight_decay=0.0)
     OptimizerConfig(schedule="cosine", decay_fraction=0.0)
