@@ -62,7 +62,8 @@ class LeRobotSource:
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self.vectors}:
             raise DataError(
-                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among {', '.join(features)}."
+                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among {', '.join(features)}. "
+                "Call what was done so, there and in the tables below data."
             )
         sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self.vectors.items()}
         self.layout = Layout({k: image_field(None, None) for k in self.cameras}, sizes, SUCCESS in features)

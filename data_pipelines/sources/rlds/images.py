@@ -12,7 +12,7 @@ import numpy as np
 import simplejpeg
 from PIL import Image, UnidentifiedImageError
 
-JPEG_MAGIC = b"\xff\xd8\xff"
+JPEG_MAGIC, PNG_MAGIC = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
 MOST_PIXELS = 2**25
 """Of an image that is decoded, more than 8K video has; a few bytes can claim billions."""
@@ -36,7 +36,8 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
                 raise ValueError(f"{len(data)} bytes of grey values of 16 bits, as of depths, no picture")
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
-        raise ValueError(f"{len(data)} bytes that are neither JPEG nor PNG") from error
+        what = "of a damaged PNG image" if data.startswith(PNG_MAGIC) else "that are neither JPEG nor PNG"
+        raise ValueError(f"{len(data)} bytes {what}") from error
     except Image.DecompressionBombError as error:
         raise ValueError(f"{len(data)} bytes of an image too large to be a frame ({error})") from error
 

@@ -157,6 +157,15 @@ def test_length_and_rows_must_agree(tmp_path):
             {"features": {"top": {"dtype": "video", "shape": [8, 8, 1]}}},
             "3 channels .there are 'top': 8x8x1; grey ones",
         ),
+        (
+            {
+                "features": {
+                    "top": {"dtype": "video", "shape": [8, 8, 3]},
+                    "actions": {"dtype": "float32", "shape": [2]},
+                }
+            },
+            "no numeric feature 'action' among top, actions. Call what was done so, there and in the tables",
+        ),
     ],
 )
 def test_info_of_another_kind_is_named(tmp_path, change, message):

@@ -51,6 +51,14 @@ def test_bytes_that_are_no_image_are_refused(data):
         decode_image(data)
 
 
+@pytest.mark.parametrize("end", [20, -30])
+def test_a_png_that_was_cut_off_is_one(end):
+    """It was called neither JPEG nor PNG."""
+    data = png(np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8))
+    with pytest.raises(ValueError, match="bytes of a damaged PNG image"):
+        decode_image(data[:end])
+
+
 def test_image_that_would_fill_the_memory_is_refused(monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
     with pytest.raises(ValueError, match="too large to be a frame"):
