@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import sys
 import types
 import typing
 from typing import Any, Literal
@@ -77,6 +78,10 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         kinds = (int, float) if hint is float else hint
         fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
         require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
+        whole = hint is float and isinstance(value, int)
+        require(
+            not whole or abs(value) <= sys.float_info.max, f"{where}: a number of that size has no place in a float"
+        )
         return hint(value)
     return value
 

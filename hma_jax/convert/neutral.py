@@ -70,6 +70,8 @@ def read_neutral(directory: Path) -> Run:
         description["version"] == VERSION,
         f"{path}: version {description['version']}, this program reads {VERSION}; convert it with its own",
     )
+    step = description["step"]
+    require(type(step) is int and step >= 0, f"{path}: step: expected a number of steps, got {step!r}")
     for name in ("tensors", "provenance"):
         kind = type(description[name]).__name__
         require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
@@ -97,6 +99,6 @@ def read_neutral(directory: Path) -> Run:
         from_dict(TrainConfig, description["train"], f"{path}: train"),
         table,
         nested({name: read_finite(tensors, name, str(directory / WEIGHTS)) for name in tensors}),
-        description["step"],
+        step,
         description["provenance"],
     )

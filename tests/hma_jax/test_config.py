@@ -27,7 +27,7 @@ from hma_jax.config import (
     TrainConfig,
 )
 from hma_jax.config.base import check_fields
-from hma_jax.config.json import diff, to_strict_json
+from hma_jax.config.json import diff, from_dict, to_strict_json
 from hma_jax.model.embodiments import Embodiment
 
 ARM = {"name": "arm", "action_dim": 1, "stride": 1, "mean": (0.0,), "std": (1.0,)}
@@ -142,6 +142,14 @@ def test_no_number_of_a_configuration_is_infinite_or_none_at_all():
                 continue
             with pytest.raises(ConfigError, match=rf"^{cls.__name__}\.{name} must be finite, got {value}"):
                 cls(**{name: value})
+
+
+def test_whole_numbers_that_no_float_holds_are_refused():
+    assert from_dict(OptimizerConfig, {"learning_rate": 1}).learning_rate == 1.0
+    with pytest.raises(
+        ConfigError, match="OptimizerConfig.learning_rate: a number of that size has no place in a float"
+    ):
+        from_dict(OptimizerConfig, {"learning_rate": 10**400})
 
 
 def test_lists_are_as_good_as_tuples():

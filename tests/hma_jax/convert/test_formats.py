@@ -98,6 +98,7 @@ def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
     refused("version 2, this program reads 1", version=2)
     refused("not a description of this project", format="other")
     refused("model.width", model=good["model"] | {"width": "wide"})
+    refused("step: expected a number of steps, got 2.5", step=2.5)
     refused("tensors: expected named fields, got NoneType", tensors=None)
     refused("provenance: expected named fields, got list", provenance=[])
     refused("embed/tables", model=good["model"] | {"factor_vocab": 16})
