@@ -91,8 +91,8 @@ def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
         f"<h1>Is the task done?</h1><p>The goal: {html.escape(judged.config.task.goal)}, for "
         f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows back and on.</p>"
         f"{''.join(pictures)}<p id=where></p><button id=success>success</button><button id=failure>failure</button>"
-        f"<button id=back>back</button><button id=on>on</button><button id=save>save labels.json</button><script>{SCRIPT}</script></body>"
-        "</html>\n"
+        "<button id=back>back</button><button id=on>on</button><button id=save>save labels.json</button>"
+        f"<script>{SCRIPT}</script></body></html>\n"
     )
     write_file(out / "blind.json", json.dumps({"page": page, "clips": chosen}) + "\n")
     write_file(out / "blind.html", content)

@@ -191,8 +191,8 @@ def _head(summary: dict[str, Any]) -> str:
     rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
     return section(
         "The success head",
-        f"<p>{html.escape(say_head(summary))} {html.escape(say_recorded(summary['head']))}</p><p>Episodes per second, this machine as loaded as it was: "
-        f"{html.escape(rates)}.</p>",
+        f"<p>{html.escape(say_head(summary))} {html.escape(say_recorded(summary['head']))}</p>"
+        f"<p>Episodes per second, this machine as loaded as it was: {html.escape(rates)}.</p>",
     )
 
 
