@@ -18,19 +18,15 @@ from experiments.analysis.intervals import Interval
 from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
-from experiments.bench.beside import OURS, RELEASED, THEIRS
-from experiments.bench.models import EXECUTION
-from experiments.bench.record import read_record
-from experiments.presets import get_preset
 from experiments.rows import OVERALL, Row, read_csv
-from hma_jax.config import EvalConfig, ExecutionConfig
+from hma_jax.config import EvalConfig
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
 from tests.pages import table
 
 ROOT = Path(__file__).parents[1]
 README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
-STUDY, BENCH = (ROOT / "experiments" / "results" / name for name in ("cpu", "bench/cpu"))
+STUDY = ROOT / "experiments" / "results" / "cpu"
 
 TRAINED = {
     "untrained (vocabulary 65,536)": ("width", 48, "untrained"),
@@ -50,12 +46,6 @@ TRAINED = {
 METRICS = ("perplexity", "action_nats", "delta_psnr", "psnr")
 DIGITS = {"perplexity": 2, "action_nats": 3, "delta_psnr": 3, "psnr": 2}
 
-STAGES = {
-    "a frame while the window fills": "fill",
-    "a frame past the window, exact": "slide",
-    "a training step": "step",
-}
-
 
 def shown(row: Row, digits: int) -> str:
     return f"{row.mean:,.{digits}f} ± {row.sem:.{digits}f}"
@@ -69,245 +59,6 @@ def test_the_study_s_figures(page):
             found = "psnr_copy" if label.startswith("copying") and metric == "psnr" else metric
             assert cell in ("", shown(rows[(*TRAINED[label], found)], DIGITS[metric])), (label, metric)
         assert cells[-1], f"{label} shows nothing"
-
-
-def test_the_speed_beside_the_release():
-    record = json.loads((BENCH / "release-base-float32-cpu.json").read_text())
-    median = {stage["name"]: stage["timing"]["median"] for stage in record["stages"]}
-    for label, (release, here, times) in table(README, "| | release | here |").items():
-        stage = STAGES[label]
-        theirs, ours = median[THEIRS + RELEASED[stage]], median[OURS + stage]
-        assert (release, here) == (f"{theirs:.2f} s", f"{ours:.2f} s"), label
-        ratio = float(re.search(r"[\d.]+", times)[0])
-        digits = len(times.split(".")[1].rstrip("*").split(":")[0])
-        assert ratio == round(theirs / ours, digits), label
-        assert ("slower" in times) == (theirs < ours), label
-    assert f"`{record['machine']['commit']}`" in README.read_text() and record["date"] in README.read_text()
-
-
-def test_the_speed_on_a_gpu_beside_the_release():
-    gpu, text = ROOT / "experiments" / "results" / "bench" / "gpu", " ".join(README.read_text().split())
-    page = (ROOT / "docs" / "performance.md").read_text()
-    names = ("base-float32", "base-batch-8-bfloat16")
-    frames, steps = (read_record(gpu / f"release-{name}-nvidia-h100-80gb-hbm3.json") for name in names)
-    fill, slide, train = (
-        record.stage(THEIRS + RELEASED[stage], rows).timing.median / record.stage(OURS + stage, rows).timing.median
-        for record, stage, rows in ((frames, "fill", 1), (frames, "slide", 1), (steps, "step", 8))
-    )
-    assert (
-        f"frames are {fill:.1f} and {slide:.1f} times faster (float32, batch 1), a training step {train:.1f} times"
-        in text
-    )
-    assert all(f"| {ratio:.2f} |" in page for ratio in (fill, slide, train))
-    rollouts = read_record(next(gpu.glob("rollout-base-*.json")))
-    one, many = (rollouts.stage("rollout", rows).frames_per_second for rows in (1, 64))
-    (shown,) = read_record(next(gpu.glob("simulate-*.json"))).stages
-    for rate in (one, many, shown.frames_per_second):
-        assert f" {rate:.0f} frames/s" in " ".join(page.split())
-
-
-SPEED = ROOT / "docs" / "performance.md"
-WEIGHTS = re.compile(r"\d+ times 1 of (\d+) x (\d+) x (\d+)")
-"""A product without batch: of a weight, or of its gradient."""
-
-
-def beside_the_release(*earlier: str) -> list[dict[str, tuple[float, float]]]:
-    """Stage -> (median, p90), of the newest comparison with the release on two cores, or of earlier ones."""
-    paths = [BENCH.parent / "release-before" / f"{commit}.json" for commit in earlier]
-    records = map(read_record, paths or [BENCH / "release-base-float32-cpu.json"])
-    return [{s.name: (s.timing.median, s.timing.p90) for s in record.stages} for record in records]
-
-
-def times_longer(run: dict[str, tuple[float, float]], stage: str) -> float:
-    return run[THEIRS + RELEASED[stage]][0] / run[OURS + stage][0]
-
-
-EARLIER = ("ff60a14d7648", "9d42fe38d6dc", "beb6b0eed88e")
-"""Commits of the three comparisons of the day before, in the order of the page."""
-
-
-def test_the_page_of_speed_shows_the_release_on_two_cores():
-    (newest,), before = beside_the_release(), beside_the_release(*EARLIER)
-    rows = table(SPEED, "| stage | the release | here |")
-    few = "continuous fill, 10 evaluations by dpm++"
-    shown = {"continuous few" if label == few else label: cells for label, cells in rows.items()}
-    assert shown.keys() == RELEASED.keys()
-    for stage, cells in shown.items():
-        times = [
-            ", ".join(f"{1e3 * x:,.0f} ms" for x in newest[name]) for name in (THEIRS + RELEASED[stage], OURS + stage)
-        ]
-        others = ", ".join(f"{times_longer(run, stage):.2f}" for run in before)
-        assert cells == [*times, f"{times_longer(newest, stage):.2f}", others], stage
-    page = " ".join(SPEED.read_text().split())
-    forward = [[run[whose + "forward"][0] for run in (newest, *before)] for whose in (THEIRS, OURS)]
-    for mine, words in zip(forward, ("took {:.2f} s in it", "ours {:.2f} s"), strict=True):
-        assert f"{words.format(mine[0])}, before {min(mine[1:]):.2f} to {max(mine[1:]):.2f} s" in page
-    plain = [read_record(BENCH.parent / "release-before" / f"{c}.json").matmul_flops_per_second / 1e9 for c in EARLIER]
-    now = read_record(BENCH / "release-base-float32-cpu.json").matmul_flops_per_second / 1e9
-    assert f"({now:.0f} GFLOP/s, before {min(plain):.0f} to {max(plain):.0f})" in page
-    huge = (before[0][f"release{how}: {stage}"][0] for stage in ("frame", "step") for how in (" with huge pages", ""))
-    assert "its frame took {:.2f} s with and {:.2f} s without, its step {:.2f} and {:.2f} s".format(*huge) in page
-
-
-SUMMED = {
-    "a frame while the window fills": "fill",
-    "a frame past the window, exact": "slide",
-    "a training step": "step",
-    "a frame of latents while it fills, as released: DDPM, 100 steps": "continuous fill",
-    "the same by DPM++, 10 steps": "continuous few",
-}
-"""Row of the page's summary -> stage."""
-
-
-def test_the_summary_of_speed_gives_the_range_of_four_runs():
-    (newest,), before = beside_the_release(), beside_the_release(*EARLIER)
-    rows = table(SPEED, "| base model, M = 2 unmasking steps |")
-    gpu = table(SPEED, "| | release | here | the release over ours |")
-    on_gpu = dict(zip(("fill", "slide", "step"), gpu.values(), strict=True))
-    for label, stage in SUMMED.items():
-        took, beside, here, there = rows[label]
-        digits = 2 if stage == "step" else 1
-        mine, others = times_longer(newest, stage), [times_longer(run, stage) for run in before]
-        assert took == f"{newest[OURS + stage][0]:.2f} s", label
-        found = re.findall(r"\d+\.\d+", beside)
-        assert found == [f"{x:.{digits}f}" for x in (mine, min(others), max(others))], label
-        assert ("slower" in beside) == (mine < 1), label
-        if stage in on_gpu:
-            assert here.startswith(on_gpu[stage][1]) and there.split()[0] == f"{float(on_gpu[stage][2]):.1f}", label
-    readme = " ".join(README.read_text().split())
-    said = [[times_longer(run, stage) for run in before] for stage in ("fill", "slide", "step")]
-    ranges = [f"{min(x):.{d}f}-{max(x):.{d}f}" for x, d in zip(said, (1, 1, 2), strict=True)]
-    assert f"Three earlier runs: {', '.join(ranges)} times." in readme
-    assert f"frames {min(said[1]):.1f} to " in readme
-
-
-WITHIN = {
-    "recomputing the window, 7,215 ms": ("generate-base", "recompute", "fill"),
-    "recomputing the window": ("generate-base", "recompute", "stream"),
-    "slide, 4,170 ms": ("generate-base", "slide", "whole"),
-    "a pass with plain attention, 4,978 ms": ("generate-base", "plain", "whole"),
-    "a training step, 12,385 ms": ("train-base", "step", "forward"),
-    "evaluation pass by pass, 31,036 ms": ("eval-recorded-base-layers-2", "literal", "protocol"),
-}
-"""Row of the page -> (record, stage, over which)."""
-
-
-def test_the_page_of_speed_shows_ratios_within_one_run():
-    rows = table(SPEED, "| what | over what | ratio | record |")
-    assert rows.keys() == WITHIN.keys()
-    for label, (kind, *names) in WITHIN.items():
-        (path,) = BENCH.glob(f"{kind}-float32-cpu.json")
-        record = read_record(path)
-        one, other = (record.stage(name, 1).timing.median for name in names)
-        over, ratio, source = rows[label]
-        for cell, seconds in ((label, one), (over, other)):
-            assert re.findall(r"[\d,]+ ms", cell) in ([], [f"{1e3 * seconds:,.0f} ms"]), label
-        assert ratio == f"{one / other:.2f}", label
-        assert source.startswith(record.kind.split("-")[0]), label
-        commits = re.findall("`([0-9a-f]+)`", source)
-        assert all(commit == record.machine["commit"] for commit in commits), label
-    page = " ".join(SPEED.read_text().split())
-    held = [
-        read_record(BENCH / f"{kind}-base-float32-cpu.json").peak_memory_bytes / 2**30 for kind in ("generate", "train")
-    ]
-    assert "A process that generates held {:.1f} GiB at most, one that trains {:.1f} GiB".format(*held) in page
-
-
-def test_the_page_of_speed_shows_what_loading_gives():
-    record = read_record(BENCH / "load-store-none-cpu.json")
-    rows = table(SPEED, "| | frames/s | memory grows, per thousand |")
-    assert rows.keys() == {stage.name for stage in record.stages}
-    for stage in record.stages:
-        rate, memory = rows[stage.name]
-        assert rate == f"{stage.frames_per_second:,.0f}"
-        amount, _, over = memory.partition(" over ")
-        threads = stage.name.partition(", ")[2]
-        assert f"memory over {over}, {threads}: +{amount} per thousand" in record.notes
-
-
-def test_the_page_of_speed_shows_products_of_two_cores():
-    release = beside_the_release("9d42fe38d6dc")[0]
-    rates, smallest, plain, within, over_time = [], [], [], [], []
-    for program, theirs in (("forward", "forward"), ("fill", "frame"), ("slide", "frame"), ("step", "step")):
-        products = read_record(BENCH / f"products-{program}-base-float32-cpu.json")
-        plain.append(products.matmul_flops_per_second / 1e9)
-        cells = table(SPEED, "| program | time |")[PROGRAMS[program]]
-        whole, *each = products.stages
-        took, released = sum(stage.timing.median for stage in each), release[THEIRS + theirs][0]
-        times = whole.timing.median / took, released / took
-        assert cells == [
-            f"{whole.timing.median:.2f} s", f"{took:.2f} s", f"{times[0]:.2f}", f"{released:.2f} s", f"{times[1]:.1f}"
-        ], program  # fmt: skip
-        for stage in each:
-            rate = stage.flops / stage.timing.median / 1e9
-            sizes = WEIGHTS.fullmatch(stage.name)
-            if " times 4 of " in stage.name:
-                within.append(rate)
-            elif " times 2560 of " in stage.name:
-                over_time.append(rate)
-            elif sizes and min(map(int, sizes.groups())) >= 256:
-                (smallest if sizes.groups() == ("320", "256", "256") else rates).append(rate)
-    slow, *others = sorted(rates)
-    page = " ".join(SPEED.read_text().split())
-    said = (
-        "Products with weights run at {:.0f} to {:.0f} GFLOP/s (the smallest, of a matrix 256 wide with one frame, at {:.0f} "
-        "to {:.0f}, one of the step's at {:.0f}), a plain square product at {:.0f} to {:.0f}; those of attention within "
-        "frames at {:.0f} to {:.0f} (a head has 32 values), those over time at {:.0f} to {:.0f}"
-    )
-    figures = others[0], others[-1], min(smallest), max(smallest), slow, min(plain), max(plain)
-    assert said.format(*figures, min(within), max(within), min(over_time), max(over_time)) in page
-
-
-def test_pages_say_that_steps_are_timed_with_another_remat_than_training_takes():
-    assert (EXECUTION.remat, ExecutionConfig().remat) == ("products", "everything")
-    page, launching = (
-        " ".join((ROOT / "docs" / name).read_text().split()) for name in ("performance.md", "launching.md")
-    )
-    assert 'timed with `execution.remat` "products"' in page and "`remat=products`" in README.read_text()
-    assert 'timed with `execution.remat=products`; the preset takes "everything"' in launching
-    assert get_preset("accelerator").execution.remat == "everything"
-    took = {
-        name: float(seconds) for seconds, name in re.findall(r'(\d\.\d\d)(?: s a step)? (?:with|and) "(\w+)"', page)
-    }
-    assert 1 / 7 < took["everything"] / took["products"] - 1 < 1 / 5
-
-
-def test_the_page_of_speed_says_where_a_pass_goes():
-    page, shares = " ".join(SPEED.read_text().split()), []
-    for program in PROGRAMS:
-        whole, *each = read_record(BENCH / f"products-{program}-base-float32-cpu.json").stages
-        of = {" times 1 of ": 0.0, " times 4 of ": 0.0, " times 2560 of ": 0.0}
-        for stage in each:
-            of[next(kind for kind in of if kind in stage.name)] += 100 * stage.timing.median / whole.timing.median
-        shares.append(list(of.values()))
-    said = (
-        "products with weights are {:.0f} % of the time, those of attention within frames {:.0f} %, those over time {:.0f} %, and "
-        "what is no product {:.0f} %"
-    )
-    assert said.format(*shares[0], 100 - sum(shares[0])) in page
-    sums = [sum(each) for each in shares]
-    assert f"products of matrices take {min(sums):.0f} to {max(sums):.0f} % of the time" in page
-
-
-PROGRAMS = {
-    "forward": "a pass over the window",
-    "fill": "a frame while the window fills",
-    "slide": "a frame past the window, exact",
-    "step": "a training step",
-}
-
-
-def test_the_page_of_speed_shows_what_cheaper_decoding_costs():
-    with (BENCH.parent / "quality-continuous" / "quality-12.csv").open(newline="") as file:
-        judged = {
-            row["decoding"]: {k: float(x) for k, x in row.items() if k != "decoding"} for row in csv.DictReader(file)
-        }
-    rows = table(SPEED, "| sampler | PSNR (dB) | beside DDPM 100 |")
-    for label, cells in rows.items():
-        row = judged[label.strip("*").removesuffix(", as released").lower()]
-        gap = f"{row['psnr_gap']:.2f} ± {row['psnr_gap_sem']:.2f}" if row["psnr_gap"] else ""
-        psnr, delta = (f"{row[name]:.2f} ± {row[f'{name}_sem']:.2f}" for name in ("psnr", "delta_psnr"))
-        assert cells[:4] == [psnr, gap, f"{row['ssim']:.3f}", delta], label
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "experiments" / "results").rglob("results.csv")), ids=str)
