@@ -63,9 +63,12 @@ def test_the_axis_horizon_is_as_findings_say():
     steps, seeds, _, psnr, ahead, follow, changed, *_ = of_steps
     table = rows_of()
     (copying,) = {f"{r.mean:.2f}" for r in table if (r.sweep, r.scope, r.metric) == ("horizon", OVERALL, "psnr_copy")}
-    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; other"
-    said = f"{said} actions cost nats on {follow} of the 36 with any, dB on {changed}."
+    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}; better on {ahead} of 40 robots |"
     assert seeds == "3" and said in readme()
+    assert (
+        f"another episode's cost nats on {follow} of the 36 robots with any, random ones PSNR on {changed} |"
+        in readme()
+    )
     assert f"PSNR, copying {copying} dB" in page
 
 
@@ -94,7 +97,7 @@ def test_robots_that_do_not_stay_robots_are_as_findings_say():
     )  # fmt: skip
     assert said in page, said
     late = float(shares[32_000, "all", "model"].split()[0])
-    assert f"After 32,000, {late:.0f} % of what moved stands in place in the last frame" in readme()
+    assert f"what moved in place at the end? | {late:.0f} % after 32,000 steps;" in readme()
     assert "half of it is more than {} pixels off, in a still picture {}".format(*medians[32_000]) in page
 
 
@@ -307,7 +310,7 @@ def test_the_reference_on_latents_is_as_its_findings_say():
     gain = np.mean([r.ahead for r in robots])
     assert f"{gain:.2f} dB ahead of copying" in page and f"ΔPSNR beyond 3 on {beyond} of the 36" in page
     (psnr,) = curve(rows_of(study), "horizon", "psnr")
-    assert f"On latents three seeds of {psnr.x:,.0f} have {psnr.mean:.2f} dB" in readme() and len(psnr.seeds) == 3
+    assert f"| {psnr.mean:.2f} dB, three seeds of {psnr.x:,.0f} steps (" in readme() and len(psnr.seeds) == 3
     for e in read_expected(RESULTS / study / "predictions" / FILE):
         (point,) = curve(rows_of(study), "horizon", e.metric)
         came = f"{point.mean:.2f}" if e.low <= point.mean <= e.high else f"**{point.mean:.2f}**"
