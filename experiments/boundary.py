@@ -75,9 +75,9 @@ def _unread() -> bool:
         number = sys.stdout.fileno()
     except (OSError, ValueError):  # a test's
         return False
-    asked = select.poll()
-    asked.register(number, 0)
-    return any(event & (select.POLLERR | select.POLLHUP) for _, event in asked.poll(0))
+    poller = select.poll()
+    poller.register(number, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poller.poll(0))
 
 
 def _end_together(error: BaseException | None = None, code: int = Exit.DONE, show: bool = False) -> None:

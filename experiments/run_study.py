@@ -75,8 +75,8 @@ def run_study(
         trials = unique_trials(sweeps, provenance)
         require_agreement(workspace, shown, trials, sources, accept_code)
         kept = keep_axes(every, workspace.root)
-        if setting.asked.registry:  # some axes are planned with it
-            write_file(workspace.registry, setting.asked.registry.read_bytes())
+        if setting.arguments.registry:  # some axes are planned with it
+            write_file(workspace.registry, setting.arguments.registry.read_bytes())
         record = Record(study, setting.data, kept, whole_command(setting, kept), provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
@@ -119,23 +119,25 @@ def say_trained(jobs: Sequence[Job], former: Collection[str], workspace: Workspa
 def whole_command(setting: Setting, axes: Sequence[str]) -> str:
     """The command line that runs all `axes` of the study anew, whichever commands ran them; files of axes are relative
     to its directory."""
-    where = [short(setting.workspace.root / axis) if is_file(axis) else axis for axis in axes]
-    asked = [one for one in setting.asked.set if one.partition("=")[0].strip() != "axes"]
-    if tuple(axes) != get_preset(setting.asked.preset).axes:
-        asked.append(f"axes={','.join(where)}")
-    return dataclasses.replace(setting, asked=dataclasses.replace(setting.asked, set=tuple(asked))).command("study")
+    paths = [short(setting.workspace.root / axis) if is_file(axis) else axis for axis in axes]
+    settings = [one for one in setting.arguments.set if one.partition("=")[0].strip() != "axes"]
+    if tuple(axes) != get_preset(setting.arguments.preset).axes:
+        settings.append(f"axes={','.join(paths)}")
+    return dataclasses.replace(setting, arguments=dataclasses.replace(setting.arguments, set=tuple(settings))).command(
+        "study"
+    )
 
 
 def require_agreement(
-    workspace: Workspace, shown: Collection[str], asked: Collection[str], sources: Closure, accept_code: bool
+    workspace: Workspace, shown: Collection[str], requested: Collection[str], sources: Closure, accept_code: bool
 ) -> None:
-    """Raises ConfigError if a finished trial of those `shown`, all of the study, is not what it was, or if they, with
-    those to be run of the ids that are `asked` for, ran different sources and nobody accepts that."""
+    """Raises ConfigError if a finished trial among `shown`, all trials of the study, was changed, or if they and those
+    still to be run of `requested` ran different sources and `accept_code` is not given. Both are ids."""
     from experiments.running.agreement import check_finished, require_one_closure
     from experiments.running.sealed import RESULT
 
     check_finished(workspace.trials, shown)
-    complete = all((workspace.trials / id / RESULT).exists() for id in asked)
+    complete = all((workspace.trials / id / RESULT).exists() for id in requested)
     require_one_closure(workspace.trials, shown, None if complete else sources, accept_code)
 
 

@@ -1,4 +1,4 @@
-"""What the user asked for, the study that follows from it, and the commands that ask for the same again.
+"""The arguments of a study, the study that follows from them, and the commands that give the same again.
 
 A command that is printed is made of every field of `StudyArguments`, so nothing that the user gave is lost on the way
 from one command to the next. What holds for one command only (--workers, --replace) is not part of it.
@@ -102,7 +102,7 @@ class StudyArguments:
 class Setting:
     """A study, its data and where it lives: what every command works on."""
 
-    asked: StudyArguments
+    arguments: StudyArguments
     study: Study
     data: tuple[str, ...]  # RLDS directories, in the study's order; () for the suite
     workspace: Workspace
@@ -110,11 +110,11 @@ class Setting:
     @property
     def tokenizer(self) -> Path | None:
         """A tokenizer to use; None: one is trained on the data."""
-        return self.asked.tokenizer
+        return self.arguments.tokenizer
 
     def command(self, name: str, *arguments: str | Path) -> str:
         """The command line `hma NAME ARGUMENTS` for the same study, data, directory and devices."""
-        return command(name, *arguments, *self.asked.words())
+        return command(name, *arguments, *self.arguments.words())
 
 
 def require_local(flag: str, path: Path | None) -> None:
@@ -142,30 +142,30 @@ def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Set
     `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that
     are no datasets.
     """
-    asked = where.anywhere()
-    study, data = get_preset(asked.preset), asked.data
-    use_entries(asked.registry)
-    if asked.mixture is not None:
+    arguments = where.anywhere()
+    study, data = get_preset(arguments.preset), arguments.data
+    use_entries(arguments.registry)
+    if arguments.mixture is not None:
         from data_pipelines.registry.mixtures import get_mixture
 
-        names = get_mixture(asked.mixture)
+        names = get_mixture(arguments.mixture)
         study = on_user_data(study, names)
         data = find_directories(names, data) if data else ()
     elif data:
         from experiments.preparing.sources import name_datasets
 
         study = on_user_data(study, name_datasets(data))
-    if asked.tokenizer is not None:
+    if arguments.tokenizer is not None:
         from hma_jax.tokenizers.io import load_config
 
-        study = on_tokenizer(study, load_config(asked.tokenizer))
-    study = override(study, asked.set, model)
-    say_unmatched(asked.registry, study.all_names())
-    if asked.mesh is not None:
-        sizes = dict(zip(("data", "fsdp", "tensor"), asked.mesh, strict=True))
+        study = on_tokenizer(study, load_config(arguments.tokenizer))
+    study = override(study, arguments.set, model)
+    say_unmatched(arguments.registry, study.all_names())
+    if arguments.mesh is not None:
+        sizes = dict(zip(("data", "fsdp", "tensor"), arguments.mesh, strict=True))
         mesh = replace(study.execution.mesh, **sizes)
         study = replace(study, execution=replace(study.execution, mesh=mesh))
-    return Setting(asked, study, data, Workspace(asked.out))
+    return Setting(arguments, study, data, Workspace(arguments.out))
 
 
 def use_entries(registry: Path | None) -> None:

@@ -138,10 +138,10 @@ def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bo
     if code:
         missing = "equired" in said and "nrecognized" not in said and "invalid" not in said.lower()
         return None if missing and not whole else said
-    asked = calls[-1].get("asked") if calls else None
-    if asked is not None and asked.set:
+    arguments = calls[-1].get("arguments") if calls else None
+    if arguments is not None and arguments.set:
         with contextlib.suppress(SystemExit):  # of --set help
-            override(get_preset(asked.preset or "cpu"), list(asked.set))  # raises ConfigError
+            override(get_preset(arguments.preset or "cpu"), list(arguments.set))  # raises ConfigError
     return None
 
 

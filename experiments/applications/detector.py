@@ -265,21 +265,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)
-    asked = parser.parse_args()
-    simulator, weights, table = load_simulator(asked.run), asked.out / WEIGHTS, asked.out / ERRORS
+    args = parser.parse_args()
+    simulator, weights, table = load_simulator(args.run), args.out / WEIGHTS, args.out / ERRORS
     robots = list(known_robots(simulator.robots))
     require(
-        not weights.exists() or (asked.out / FILE).exists(),
+        not weights.exists() or (args.out / FILE).exists(),
         f"{weights} is there already, and nothing says of which run; choose another --out or remove it",
     )
-    claim(asked.out, asked.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
+    claim(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
     if there := weights.exists():
         said = f"{short(weights)} of this run is there already; remove it to have it made again"
         say(said)
     else:
-        make_detector(robots, simulator.tokenizer, asked.out)
+        make_detector(robots, simulator.tokenizer, args.out)
     print(table.read_text())
-    then = f"python -m experiments.applications.endurance {asked.run} --detector {weights}"
+    then = f"python -m experiments.applications.endurance {args.run} --detector {weights}"
     wrote(*(() if there else (weights, table)), then=then)
 
 

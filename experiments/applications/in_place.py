@@ -109,14 +109,14 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/in_place"))
     parser.add_argument("--robots", nargs="+", default=(), metavar="NAME", help="only these; all that the suite knows")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
-    simulator = load_simulator(asked.run, **options)
-    robots, weights = chosen(known_robots(simulator.robots), asked.robots), asked.out / WEIGHTS
-    settings = {"robots": sorted(robots)} if asked.robots else {}
-    claim(asked.out, asked.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
+    simulator = load_simulator(args.run, **options)
+    robots, weights = chosen(known_robots(simulator.robots), args.robots), args.out / WEIGHTS
+    settings = {"robots": sorted(robots)} if args.robots else {}
+    claim(args.out, args.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
     if not weights.exists():
-        make_detector(list(robots), simulator.tokenizer, asked.out)
+        make_detector(list(robots), simulator.tokenizer, args.out)
     detector, rows, short = Detector.load(weights), [], []
     with step("held-out episodes") as update:
         for i, robot in enumerate(robots.values()):
@@ -127,13 +127,13 @@ def main() -> None:
     if short:
         console.print(f"left out, their episodes are too short or nothing is seen at the end: {', '.join(short)}")
     require(bool(rows), "no robot is left to look at; watch others, or a model with a shorter window")
-    write_rows(asked.out / TABLE, rows)
+    write_rows(args.out / TABLE, rows)
     for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
         mine = [row for row in rows if str(row["what"]).startswith(prefix)]
         shares = {view: in_place(mine, view) for view in VIEWS}
         words = [f"{view} {share:.3f} ± {half:.3f}" for view, (share, half, _) in shares.items()]
         console.print(f"{kind} that moved, in place ({shares['true'][2]} robots): {', '.join(words)}", soft_wrap=True)
-    wrote(asked.out / TABLE)
+    wrote(args.out / TABLE)
 
 
 if __name__ == "__main__":

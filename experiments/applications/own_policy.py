@@ -235,9 +235,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
     parser.add_argument("--starts", type=int, default=Settings.starts)
-    asked = parser.parse_args()
-    settings, out = Settings(steps=asked.steps, starts=asked.starts), asked.out
-    write_results(compare(asked.run, out, settings), out)
+    args = parser.parse_args()
+    settings, out = Settings(steps=args.steps, starts=args.starts), args.out
+    write_results(compare(args.run, out, settings), out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
 
 

@@ -248,12 +248,12 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=SearchConfig.candidates)
     parser.add_argument("--iterations", type=int, default=SearchConfig.iterations)
     parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
-    asked = vars(parser.parse_args())
-    run, out, wanted = asked.pop("run"), asked.pop("out"), asked.pop("ways")
+    args = vars(parser.parse_args())
+    run, out, wanted = args.pop("run"), args.pop("out"), args.pop("ways")
     fewest = SearchConfig.elites  # whom CEM draws around
-    require(asked["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {asked['candidates']}")
-    search = SearchConfig(candidates=asked.pop("candidates"), iterations=asked.pop("iterations"))
-    settings = Settings(search=search, **asked)
+    require(args["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {args['candidates']}")
+    search = SearchConfig(candidates=args.pop("candidates"), iterations=args.pop("iterations"))
+    settings = Settings(search=search, **args)
     decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)
     simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size

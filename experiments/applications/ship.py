@@ -198,9 +198,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="directory that is replaced")
     parser.add_argument("--unmask-steps", type=int, default=USUAL.unmask_steps, help="looks at a frame")
     parser.add_argument("--temperature", type=float, default=USUAL.temperature, help="of drawing tokens")
-    arguments = parser.parse_args()
-    decode = replace(USUAL, unmask_steps=arguments.unmask_steps, temperature=arguments.temperature)
-    ship(arguments.run, arguments.out, decode, describe)
+    args = parser.parse_args()
+    decode = replace(USUAL, unmask_steps=args.unmask_steps, temperature=args.temperature)
+    ship(args.run, args.out, decode, describe)
 
 
 if __name__ == "__main__":

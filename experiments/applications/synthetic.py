@@ -115,10 +115,10 @@ def make_data(
     acted = dict.fromkeys(kinds, recorded.actions) | {"shuffled": others_actions(recorded)}
     for kind in kinds[1:]:
         if not sets[kind].exists():
-            made_by, under_way = blind if kind == BLIND_KIND else simulator, out / UNDER_WAY / kind
+            world_model, under_way = blind if kind == BLIND_KIND else simulator, out / UNDER_WAY / kind
             with step(f"replay actions: {kind}") as update:
-                asked = replace(recorded, actions=acted[kind])
-                images = imagine(made_by, lessons.robot, asked, given, under_way, update)
+                replayed = replace(recorded, actions=acted[kind])
+                images = imagine(world_model, lessons.robot, replayed, given, under_way, update)
             save_demonstrations(replace(recorded, images=images), sets[kind])
     remove(out / UNDER_WAY)
     if not sets[JUDGED_ON].exists():
@@ -218,25 +218,25 @@ def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tupl
     return found
 
 
-def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
+def find_lessons(args: argparse.Namespace, simulator: Simulator) -> Lessons:
     """Raises ConfigError for options that belong to the other kind of lessons."""
-    seeds = tuple(range(asked.seeds))
-    training = Training(seeds=seeds, steps=asked.steps, given=asked.given, with_given=asked.with_given)
+    seeds = tuple(range(args.seeds))
+    training = Training(seeds=seeds, steps=args.steps, given=args.given, with_given=args.with_given)
     scripted, recorded = (
-        {name: value for name in names if (value := getattr(asked, name)) is not None}
+        {name: value for name in names if (value := getattr(args, name)) is not None}
         for names in (("task", "frames", "starts"), ("split", "held_out", "registry"))
     )
-    if asked.actions is None:
+    if args.actions is None:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in recorded)
         require(not recorded, f"{options}: of recordings, which --actions DATASET names")
-        settings = Settings(**vars(training), robot=asked.robot or Settings.robot, **scripted)
+        settings = Settings(**vars(training), robot=args.robot or Settings.robot, **scripted)
         return ScriptedLessons(settings, simulator.robot(settings.robot), simulator.tokenizer.image_size)
     require(not scripted, f"--{', --'.join(scripted)}: of the suite's tasks, not of recordings (--actions)")
-    use_entries(asked.registry)
-    robot = simulator.robot(asked.robot) if asked.robot else None
-    place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(asked.run).store
-    trained_on, driven = open_trajectories(asked.actions, asked.split or "train", *place)
-    held_out, _ = open_trajectories(asked.actions, asked.held_out or "val", *place)
+    use_entries(args.registry)
+    robot = simulator.robot(args.robot) if args.robot else None
+    place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(args.run).store
+    trained_on, driven = open_trajectories(args.actions, args.split or "train", *place)
+    held_out, _ = open_trajectories(args.actions, args.held_out or "val", *place)
     require_layout(trained_on, driven, simulator.model.table)
     for note in filter(None, map(told_of_frames, (trained_on, held_out))):
         say(note)
@@ -273,26 +273,26 @@ def main() -> None:
     parser.add_argument(
         "--without-actions", type=Path, metavar="RUN", help="second control: of the same video, trained without actions"
     )
-    asked = parser.parse_args()
-    run, out = asked.run, asked.out
+    args = parser.parse_args()
+    run, out = args.run, args.out
     simulator = load_simulator(run, own_starts=True, episodes=BATCH, history=1)
-    lessons = find_lessons(asked, simulator)  # a mistyped name claims nothing
+    lessons = find_lessons(args, simulator)  # a mistyped name claims nothing
     second = out / SECOND
     require(
-        bool(asked.without_actions) or not second.exists(),
+        bool(args.without_actions) or not second.exists(),
         f"{second} says that policies of a model without actions are here: give --without-actions again, or another --out",
     )
-    settings, blind = lessons.settings, asked.without_actions and find_blind(asked.without_actions, lessons.robot)
+    settings, blind = lessons.settings, args.without_actions and find_blind(args.without_actions, lessons.robot)
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
     claim(out, run, simulator, asdict(settings), grows=("seeds",))
     if blind:
-        claim(out, asked.without_actions, blind, {}, file=SECOND)
+        claim(out, args.without_actions, blind, {}, file=SECOND)
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
     data = make_data(lessons, simulator, out, blind)
     trials: Trials = {}
-    asked_for = range(len(CONDITIONS) if blind else BLIND)
-    first = sorted(asked_for, key=lambda i: i not in (FEW, ALL, MOST, CONTROL, BLIND))  # what counts most
+    conditions = range(len(CONDITIONS) if blind else BLIND)
+    first = sorted(conditions, key=lambda i: i not in (FEW, ALL, MOST, CONTROL, BLIND))  # what counts most
     jobs, pace = [(i, s) for i in first for s in settings.seeds], Pace()
     with step(f"train and judge {len(jobs)} policies") as update:
         for n, (i, seed) in enumerate(jobs):

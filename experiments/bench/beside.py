@@ -91,7 +91,7 @@ def _take_turns(
     ours: Sequence[str],
     turns: int,
     progress: Callable[[str, int], None],
-    asked: Sequence[str],
+    arguments: Sequence[str],
 ) -> dict[str, list[float]]:
     """Seconds of every turn, of one stage of the release and those of ours that give the same.
 
@@ -101,10 +101,10 @@ def _take_turns(
     script = Path(__file__).with_name("released.py").read_text()
     as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
     with ExitStack() as stack:
-        their_command = [str(python), "-c", script, *asked]
+        their_command = [str(python), "-c", script, *arguments]
         workers = {THEIRS + theirs: (theirs, stack.enter_context(Worker(their_command, **as_its_users)))}
         for name in ours:
-            command = [sys.executable, "-m", "experiments.bench.stages", *asked]
+            command = [sys.executable, "-m", "experiments.bench.stages", *arguments]
             worker = stack.enter_context(Worker(command, **KEPT_PAGES, **SHARED))
             workers[OURS + name] = (name, worker)
         seconds: dict[str, list[float]] = {stage: [] for stage in workers}

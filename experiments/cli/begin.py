@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 
-def setting_of(source: Path, trained: Run, asked: StudyArguments) -> Setting:
+def setting_of(source: Path, trained: Run, arguments: StudyArguments) -> Setting:
     """The study that goes on from the model `trained`, which lies in `source`. Writes nothing.
 
     Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
     """
     from data_pipelines.registry import get_spec
 
-    asked = asked.anywhere()
-    asked = dataclasses.replace(asked, tokenizer=_tokenizer(source, trained, asked))
-    setting = make_setting(asked, trained.model)
+    arguments = arguments.anywhere()
+    arguments = dataclasses.replace(arguments, tokenizer=_tokenizer(source, trained, arguments))
+    setting = make_setting(arguments, trained.model)
     lines = diff(trained.model, setting.study.model, "model")
     require(
         not lines,
@@ -68,16 +68,20 @@ def require_another_place(source: Path, run: Path) -> None:
     )
 
 
-def _tokenizer(source: Path, trained: Run, asked: StudyArguments) -> Path:
+def _tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Path:
     """The directory of the tokenizer whose tokens a model takes: the one that is asked for, or one in the study's
     directory or beside the run. Raises ConfigError where it is none of them."""
     from hma_jax.simulator.folder import TOKENIZER
     from hma_jax.tokenizers.io import load_tokenizer
 
-    places: Sequence[Path] = (Workspace(asked.out).tokenizer, source / TOKENIZER, Workspace.of_run(source).tokenizer)
-    places = [asked.tokenizer] if asked.tokenizer else [place for place in places if place.is_dir()]
+    places: Sequence[Path] = (
+        Workspace(arguments.out).tokenizer,
+        source / TOKENIZER,
+        Workspace.of_run(source).tokenizer,
+    )
+    places = [arguments.tokenizer] if arguments.tokenizer else [place for place in places if place.is_dir()]
     advice = f"; add --tokenizer with the directory of the one that {short(source)} was trained with"
-    require(bool(places), f"{short(source)}: its tokenizer is neither beside it nor in {short(asked.out)}{advice}")
+    require(bool(places), f"{short(source)}: its tokenizer is neither beside it nor in {short(arguments.out)}{advice}")
     tokenizers = {place: load_tokenizer(place) for place in places}
     found = next((place for place in places if not misfit(trained, tokenizers[place])), places[0])
     check_tokenizer(trained, tokenizers[found], advice)

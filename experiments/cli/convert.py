@@ -63,10 +63,10 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
     if run.model.conditioning == "cross_attention":
         console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
     _describe(run)
-    asked = _study_of(run, out / RATES)
+    study = _study_of(run, out / RATES)
     wrote(
         out,
-        then=f"hma tokenize {asked} && \\\n  hma evaluate {_quoted(out)} {asked}\n"
+        then=f"hma tokenize {study} && \\\n  hma evaluate {_quoted(out)} {study}\n"
         f"or: hma convert to-safetensors {_quoted(out)} --out DIR (or to-stablehlo, to-official)",
     )
 

@@ -39,7 +39,7 @@ holds all, and windows.parquet those of every window."""
 
 def evaluate(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
-    asked: StudyOptions,
+    arguments: StudyOptions,
     hosts: OmitArgPrefixes[Hosts],
     weights: Weights = "auto",
     to: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: RUN)")] = None,
@@ -49,7 +49,7 @@ def evaluate(
 
     Args:
         run: Directory of the training run.
-        asked: The study whose windows, tokenizer and protocol are used.
+        arguments: The study whose windows, tokenizer and protocol are used.
         hosts: Several processes that evaluate together, on one host or on many.
         weights: The last weights, their moving average (train.ema_decay), or the average where there is one.
         to: Directory for the results, for those of several sets of windows beside each other.
@@ -57,7 +57,7 @@ def evaluate(
             Otherwise these stay, and the command is refused.
     """
     hosts.join()
-    evaluate_model(make_setting(asked), run, weights, to, replace)
+    evaluate_model(make_setting(arguments), run, weights, to, replace)
 
 
 def evaluate_model(

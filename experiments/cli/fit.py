@@ -79,7 +79,7 @@ def _words(fitted: Fitted) -> tuple[str, str, str]:
     return fit.formula(), intervals, "; ".join(fit.doubts)
 
 
-def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]) -> None:
+def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...]) -> None:
     from experiments.analysis.predictions import predict, save_prediction
     from experiments.override import override
     from experiments.report.numbers import read_results, result_hashes
@@ -91,21 +91,21 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     workspace = Workspace(root.absolute())
     record = load_record(workspace)
     require(record.provenance is not None, f"the study in {root} has not run yet; run `{record.command}`")
-    name, _, text = asked.rpartition("=")
+    name, _, text = target.rpartition("=")
     try:
         x = float(text)
     except ValueError:
-        raise ConfigError(f"--predict {asked}: write it as AXIS=X, such as width=96") from None
+        raise ConfigError(f"--predict {target}: write it as AXIS=X, such as width=96") from None
     study = override(record.study, settings) if settings else record.study
     sweeps, axis = plan_sweeps(study, record.axes, workspace.root), name.partition("-")[0]
     if axis not in {s.name for s in sweeps}:
         sweeps = plan_sweeps(study, (*record.axes, axis), workspace.root)
     sweep = next((s for s in sweeps if s.name == axis), None)
     if sweep is None or not sweep.measured:
-        raise ConfigError(f"--predict {asked}: {axis} is no axis over a number")
+        raise ConfigError(f"--predict {target}: {axis} is no axis over a number")
     own = next((a for a, s in zip(record.axes, sweeps, strict=False) if s is sweep and is_file(a)), None)
     how = f"in {short(workspace.root / own)}" if own else "with --set"
-    curve, held = _held_out(sweep, record.provenance, asked, x, how)
+    curve, held = _held_out(sweep, record.provenance, target, x, how)
     ids = [place.trial for place in held]
     ledger = Ledger(workspace.ledger)
     ran = ledger.states()
@@ -114,7 +114,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
         what = f"exists already ({state.event})" if there else f"has run, says {workspace.ledger.name}"
         require(
             not there and id not in ran,
-            f"--predict {asked}: trial {id} {what}; a prediction is made before its trial runs",
+            f"--predict {target}: trial {id} {what}; a prediction is made before its trial runs",
         )
     results, windows = read_results(workspace, unique_trials(sweeps, record.provenance))
     prediction = predict(curve, held, windows, result_hashes(results))
@@ -127,7 +127,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit, and only then run the trials")
 
 
-def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float, how: str) -> tuple[Curve, list[Place]]:
+def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: str) -> tuple[Curve, list[Place]]:
     """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` one is added. Raises
     ConfigError where a power law is not what the axis is to show, where it is not said which of several curves, and for
     a curve without a trial there."""
@@ -135,23 +135,23 @@ def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float, how: s
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import POINT
 
-    name, _, text = asked.rpartition("=")
+    name, _, text = target.rpartition("=")
     require(
         not sweep.valley,
-        f"--predict {asked}: along {sweep.name} the loss is lowest within, where no power law holds; `hma fit STUDY` "
+        f"--predict {target}: along {sweep.name} the loss is lowest within, where no power law holds; `hma fit STUDY` "
         "says which size is best for a budget (isoflop)",
     )
     curves = {curve.name: curve for curve in curves_of([sweep], provenance)}
     if name == sweep.name and len(curves) == 1:
         (name,) = curves
     known = ", ".join(shlex.quote(f"{one}={text}") for one in curves)
-    require(name in curves, f"--predict {asked}: which curve of {sweep.name}? Write one of {known}")
+    require(name in curves, f"--predict {target}: which curve of {sweep.name}? Write one of {known}")
     series = name.removeprefix(sweep.name).removeprefix("-")
     points = [p for p in sweep.points if p.role == POINT and p.series == series]
     ids = {trial_id(p.trial, provenance) for p in points if p.x == x}
     positions = ", ".join(f"{v:g}" for v in sorted({p.x for p in points}))
     require(
         bool(ids),
-        f"--predict {asked}: the study plans no trial there (its positions: {positions}); add it to the plan {how}",
+        f"--predict {target}: the study plans no trial there (its positions: {positions}); add it to the plan {how}",
     )
     return curves[name], [place for place in curves[name].places if place.trial in ids]

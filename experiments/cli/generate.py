@@ -73,8 +73,8 @@ def generate(
     if clips:
         require_module("av", f"--clips {clips}")
     use_entries(registry)
-    asked = {"unmask_steps": unmask_steps, "temperature": temperature}
-    decode = replace(find_decode(run), **{key: x for key, x in asked.items() if x is not None})
+    given_decode = {"unmask_steps": unmask_steps, "temperature": temperature}
+    decode = replace(find_decode(run), **{key: x for key, x in given_decode.items() if x is not None})
     simulator = load_simulator(
         run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,
         decode=decode, history=1,

@@ -31,7 +31,7 @@ class Hosts:
     lost_after: Annotated[float, arg(name="lost-after", metavar="SECONDS")] = 90.0
     """Without a sign of life of one process, after which the others end with code 75."""
 
-    def _asked(self) -> Processes:
+    def _settings(self) -> Processes:
         from hma_jax.runtime.processes import Processes
 
         return Processes(
@@ -40,16 +40,16 @@ class Hosts:
 
     def count(self) -> int:
         """How many processes are asked for; 1 also where --distributed is to find it out."""
-        return self._asked().processes or 1
+        return self._settings().processes or 1
 
     def join(self) -> None:
         """Joins the other processes, if there are any; from then on only process 0 writes to the screen."""
         from hma_jax.runtime.processes import start
 
-        asked = self._asked()
-        if not asked.several:
+        settings = self._settings()
+        if not settings.several:
             return
-        start(asked)
+        start(settings)
         from experiments.progress import console
         from hma_jax.runtime.processes import is_writer
 

@@ -54,7 +54,7 @@ class Shape:
 
 
 def plan(
-    asked: Annotated[OmitArgPrefixes[Planned], arg(name="study")],
+    arguments: Annotated[OmitArgPrefixes[Planned], arg(name="study")],
     shape: OmitArgPrefixes[Shape],
     topology: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("local",),
     memory: Annotated[str | None, arg(metavar="SIZE")] = None,
@@ -65,7 +65,7 @@ def plan(
     For a TPU topology no TPU is needed, but its compiler: pip install -e '.[tpu]'.
 
     Args:
-        asked: The study whose model is planned.
+        arguments: The study whose model is planned.
         shape: A model of `hma bench`, where no study is named.
         topology: TPU topologies such as v5e:2x4, v4:2x2x4, or v4-32 as clouds call it; `local`: the devices here.
         memory: What one device has, such as 80GiB: for a verdict on devices whose compiler does not say it.
@@ -80,7 +80,7 @@ def plan(
     from experiments.bench.plan import find_devices, make_plan
     from hma_jax.runtime.audit import size_of
 
-    what, config, table, train, execution = _asked(asked, shape)
+    what, config, table, train, execution = _choose_model(arguments, shape)
     rows: list[tuple[str, Plan]] = []
     for name in topology:
         devices = find_devices(name)
@@ -122,16 +122,18 @@ def read_memory(size: str | None) -> float | None:
     return float(found[1]) * {"GiB": 2**30, "GB": 10**9}[found[2]]
 
 
-def _asked(asked: Planned, shape: Shape) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
+def _choose_model(
+    arguments: Planned, shape: Shape
+) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
     """The model in words, then what its training step is made of: of a study's reference trial, or of a fixed model."""
-    if asked.preset is None:
+    if arguments.preset is None:
         from experiments.bench.models import make_shape
 
-        others = replace(asked, mesh=None) == Planned()
+        others = replace(arguments, mesh=None) == Planned()
         require(others, "only a study has these settings; add --preset, or choose by --model, --batch and --robots")
         said = USUAL | {name: value for name, value in vars(shape).items() if value is not None}
         config, table = make_shape(said["model"], said["robots"])
-        execution = ExecutionConfig(said["dtype"], said["remat"], mesh=MeshConfig(*asked.mesh or (1, -1, 1)))
+        execution = ExecutionConfig(said["dtype"], said["remat"], mesh=MeshConfig(*arguments.mesh or (1, -1, 1)))
         return said["model"], config, table, replace(TrainConfig(), batch=said["batch"]), execution
     from experiments.cost import declared_table
     from experiments.sweeps.sweep import reference_trial
@@ -141,7 +143,7 @@ def _asked(asked: Planned, shape: Shape) -> tuple[str, ModelConfig, EmbodimentTa
         "--model, --batch, --robots, --dtype and --remat are for a model without --preset; of a study --set says them: "
         "model.*, train.batch, datasets, execution.dtype and execution.remat",
     )
-    study = make_setting(asked).study
+    study = make_setting(arguments).study
     trial = reference_trial(study, study.seeds[0])
     table = declared_table(trial.datasets, trial.rate)
     what = f"{study.name}, width {study.model.width}, {counted(table.size, 'robot')}"

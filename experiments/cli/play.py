@@ -66,8 +66,8 @@ def play(
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
-    asked = {"slide": window, "unmask_steps": unmask_steps, "temperature": temperature}
-    decode = replace(find_decode(run), **{name: x for name, x in asked.items() if x is not None})
+    given_decode = {"slide": window, "unmask_steps": unmask_steps, "temperature": temperature}
+    decode = replace(find_decode(run), **{name: x for name, x in given_decode.items() if x is not None})
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )

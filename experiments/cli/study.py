@@ -16,7 +16,7 @@ from hma_jax.config import ConfigError, require
 
 
 def study(
-    asked: StudyOptions,
+    arguments: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
     remake: RemakeOptions,
 ) -> None:
@@ -26,12 +26,12 @@ def study(
 
     Run the same command again after an interruption: only what is missing is done.
     """
-    _run(("study",), asked, running, remake)
+    _run(("study",), arguments, running, remake)
 
 
 def sweep(
     axis: Annotated[Positional[str], arg(metavar="|".join((*AXES, "FILE.py")))],
-    asked: StudyOptions,
+    arguments: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
     remake: RemakeOptions,
 ) -> None:
@@ -44,11 +44,11 @@ def sweep(
 
     Args:
         axis: What varies.
-        asked: Which study, on which data, in which directory, on which devices.
+        arguments: Which study, on which data, in which directory, on which devices.
         running: How trials are run; none of it changes a result.
         remake: What was made with other settings or data is never replaced without being asked for.
     """
-    _run(("sweep", Path(axis).absolute() if is_file(axis) else axis), asked, running, remake, (axis,))
+    _run(("sweep", Path(axis).absolute() if is_file(axis) else axis), arguments, running, remake, (axis,))
 
 
 def report(study: Annotated[Positional[Path], arg(metavar="STUDY")]) -> None:
@@ -64,13 +64,13 @@ def report(study: Annotated[Positional[Path], arg(metavar="STUDY")]) -> None:
 
 def _run(
     words: tuple[str | Path, ...],
-    asked: StudyArguments,
+    arguments: StudyArguments,
     running: RunningArguments,
     remake: Remake,
     axes: tuple[str, ...] = (),
 ) -> None:
     """`axes`: () for those of the study."""
-    setting = make_setting(asked)
+    setting = make_setting(arguments)
     axes = axes or setting.study.axes
     require(bool(axes), "axes is empty: the study has nothing to run; name some, such as --set axes=width,datasets")
     if running.workers is not None and running.workers < 1:

@@ -20,7 +20,7 @@ from hma_jax.config import require
 
 
 def tokenize(
-    asked: StudyOptions,
+    arguments: StudyOptions,
     remake: RemakeOptions,
     batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")] = None,
@@ -33,12 +33,12 @@ def tokenize(
     or `hma tokenizer train` before.
 
     Args:
-        asked: Study, data, output directory and settings. Several processes share the directory.
+        arguments: Study, data, output directory and settings. Several processes share the directory.
         remake: What was made with other settings or data is never replaced without being asked for.
         batch: Frames encoded at a time. Changes no token.
         threads: Threads that decode frames.
     """
-    prepare_together(make_setting(asked), batch, threads, remake.replace)
+    prepare_together(make_setting(arguments), batch, threads, remake.replace)
 
 
 def prepare_together(

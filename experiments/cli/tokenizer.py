@@ -23,9 +23,9 @@ HELP = "The image tokenizer: trained here, made of published weights, or none."
 
 
 @tokenizer_app.command(name="train")
-def tokenizer_train(asked: StudyOptions, remake: RemakeOptions) -> None:
+def tokenizer_train(arguments: StudyOptions, remake: RemakeOptions) -> None:
     """Train the study's image tokenizer on its datasets."""
-    train_tokenizer(make_setting(asked), remake.replace)
+    train_tokenizer(make_setting(arguments), remake.replace)
 
 
 @tokenizer_app.command(name="import")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def train(
-    asked: StudyOptions,
+    arguments: StudyOptions,
     one: ModelOptions,
     options: SavingOptions,
     remake: RemakeOptions,
@@ -44,7 +44,7 @@ def train(
     Change it with --set. Says what it trains on, and resumes a run that was interrupted.
 
     Args:
-        asked: Study, data, output directory and settings.
+        arguments: Study, data, output directory and settings.
         one: How this model is trained; no sweep reads it.
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
@@ -55,9 +55,9 @@ def train(
     """
     if not dry_run:
         hosts.join()
-    run = one.directory() or asked.anywhere().out / "model"
+    run = one.directory() or arguments.anywhere().out / "model"
     trained = None if begin is None else _beginning(begin, run)
-    setting = make_setting(asked) if trained is None else setting_of(begin, trained, asked)
+    setting = make_setting(arguments) if trained is None else setting_of(begin, trained, arguments)
     if trained is not None:
         require_known(begin, trained, setting)
         require_another_place(begin, run)
@@ -70,7 +70,7 @@ def train(
 
 def adapt(
     source: Annotated[Positional[Path], arg(metavar="RUN")],
-    asked: StudyOptions,
+    arguments: StudyOptions,
     one: ModelOptions,
     options: SavingOptions,
     remake: RemakeOptions,
@@ -85,7 +85,7 @@ def adapt(
 
     Args:
         source: Directory of the training run that knows the other robots.
-        asked: The study with the new datasets. Its tokenizer is the one of the trained model: give it with --tokenizer
+        arguments: The study with the new datasets. Its tokenizer is the one of the trained model: give it with --tokenizer
             if it is not beside RUN.
         one: How the new robots are trained.
         options: How the run is saved and watched; each start may say it anew.
@@ -95,7 +95,7 @@ def adapt(
     """
     hosts.join()
     adapt_model(
-        asked,
+        arguments,
         source,
         one.directory(),
         options,
@@ -129,7 +129,7 @@ def train_model(
 
 
 def adapt_model(
-    asked: StudyArguments,
+    arguments: StudyArguments,
     source: Path,
     run: Path | None,
     options: RunOptions,
@@ -145,7 +145,7 @@ def adapt_model(
     from hma_jax.training.runs import load_run
 
     trained = load_run(source, "auto")
-    setting = setting_of(source, trained, asked)
+    setting = setting_of(source, trained, arguments)
     study, new = setting.study, strangers(trained, setting)
     require(
         bool(new),

@@ -100,18 +100,18 @@ def dataset_differences(there: Sequence[str], wanted: Sequence[str]) -> list[str
     return [f"datasets: {len(there)} -> {len(wanted)}, {' and '.join(parts) or 'in another order'}"]
 
 
-def may_replace(step: Step, asked: Step | None) -> bool:
+def may_replace(step: Step, replace: Step | None) -> bool:
     """Whether the user asked for `step`, or something that it is made of, to be replaced."""
     order = get_args(Step)
-    return asked is not None and order.index(asked) <= order.index(step)
+    return replace is not None and order.index(replace) <= order.index(step)
 
 
-def require_same(step: Step, place: Path, lines: Sequence[str], asked: Step | None, otherwise: str = "") -> None:
+def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | None, otherwise: str = "") -> None:
     """Raises ConfigError if `lines` say how the inputs differ and the user did not ask for a replacement.
 
     `otherwise`: one more way to go on.
     """
-    if not lines or may_replace(step, asked):
+    if not lines or may_replace(step, replace):
         return
     after = [IN_WORDS[s] for s in get_args(Step) if may_replace(s, step) and s != step]
     follows = f", and {', '.join(after)} where they depend on it" if after else ""

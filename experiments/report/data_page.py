@@ -195,15 +195,15 @@ def _curves(field: ActionFacts, shown: Shown) -> str:
 
 
 def _lengths(d: Viewed, frames: int) -> str:
-    f, asked = d.facts, _windows(d, frames)
+    f, windows = d.facts, _windows(d, frames)
     n = f.lengths
     words = (
         f"<p>{n.shortest} to {n.longest} steps, median {n.median:g}, 80 % between {n.lower:g} and {n.upper:g}"
         + (f"; the median is {n.median / d.hz:.1f} s at {d.hz:g} Hz" if d.hz else "")
         + ".</p>"
     )
-    drawn = lengths(f.steps, asked.native if asked else None)
-    if asked is None:
+    drawn = lengths(f.steps, windows.native if windows else None)
+    if windows is None:
         return words + drawn
     lines = []
     rows = [(t, d.stride) for t in {frames, *OTHER_FRAMES}] + [(frames, 1)] * (d.stride > 1)

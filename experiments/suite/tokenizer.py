@@ -54,15 +54,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)
-    arguments = parser.parse_args()
-    tokenizer, rows = load_tokenizer(arguments.run / "tokenizer"), []
-    for directory in sorted((arguments.run / "suite").iterdir()):
+    args = parser.parse_args()
+    tokenizer, rows = load_tokenizer(args.run / "tokenizer"), []
+    for directory in sorted((args.run / "suite").iterdir()):
         pairs = frame_pairs(get_spec(directory.name), directory, tokenizer.image_size)
         decoded = np.asarray(tokenizer.decode(tokenizer.encode(pairs[:, 1])))
         rows.append([directory.name, *quality(decoded, pairs)])
     rows.append(["mean", *np.mean([row[1:] for row in rows], 0)])
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.out.open("w", newline="") as file:
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    with args.out.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["robot", "psnr", "psnr_changed", "changed"])
         writer.writerows([name, *(f"{value:.3f}" for value in values)] for name, *values in rows)

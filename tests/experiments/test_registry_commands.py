@@ -278,12 +278,12 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
         STUDY, datasets=("mine", "yours"), dataset_counts=(1, 2), trajectory_counts=(40,),
         designs=replace(STUDY.designs, caps=(4, 16)),
     )  # fmt: skip
-    asked = StudyArguments("smoke", tmp_path / "study", registry=entries, data=(tmp_path,))
+    arguments = StudyArguments("smoke", tmp_path / "study", registry=entries, data=(tmp_path,))
     use_entries(entries)
     workspace = Workspace(tmp_path / "study")
     workspace.root.mkdir()
     run_study.run_study(
-        Setting(asked, study, ("somewhere",), workspace), ("episodes",), again="", launcher=Launching(),
+        Setting(arguments, study, ("somewhere",), workspace), ("episodes",), again="", launcher=Launching(),
         retry_failed=False, accept_code=False, replace=None,
     )  # fmt: skip
     entries.unlink()

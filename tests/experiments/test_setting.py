@@ -88,8 +88,8 @@ def anything_goes(monkeypatch):
     """Some combinations make no study (a mixture of data that is not there); what is tested is what is asked."""
 
     def study_of(where: StudyArguments) -> Setting:
-        asked = where.anywhere()
-        return Setting(asked, settings.get_preset(asked.preset), (), settings.Workspace(asked.out))
+        arguments = where.anywhere()
+        return Setting(arguments, settings.get_preset(arguments.preset), (), settings.Workspace(arguments.out))
 
     for module in ("study", "tokenize", "train", "evaluate", "tokenizer"):
         monkeypatch.setattr(f"experiments.cli.{module}.make_setting", study_of)

@@ -389,12 +389,12 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     assert "train.only: leave it out; the new robots alone are trained" in said
     said = refused("adapt", str(beside), "--data", *data, "--set", "train.masking.setting=passive")
     assert f"nothing that {BASE.name} alone has would be trained" in said
-    asked, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
-    setting = setting_of(beside, trained, asked)
+    arguments, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
+    setting = setting_of(beside, trained, arguments)
     assert setting.tokenizer == tokenizer and strangers(trained, setting) == [BASE.name]
     other = replace(trained, provenance={"tokenizer": "another"})
     with pytest.raises(ConfigError, match="trained on tokens of tokenizer another, .*; add --tokenizer"):
-        setting_of(beside, other, asked)
+        setting_of(beside, other, arguments)
 
 
 def test_held_out_loss_is_of_as_many_episodes_as_a_batch_takes(tmp_path):

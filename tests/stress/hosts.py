@@ -164,10 +164,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cut", type=float, default=30.0, help="seconds of the first cut")
     parser.add_argument("--lost-after", type=float, default=90.0, help="as of hma train")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="hma-hosts-") as directory:
         try:
-            figures = measure(Path(directory), asked.cut, asked.lost_after)
+            figures = measure(Path(directory), args.cut, args.lost_after)
         except AssertionError as error:
             print(f"failed: {error}")
             return 1

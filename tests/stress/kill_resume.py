@@ -212,15 +212,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--state", type=Path, help="a directory that is kept; without it, a temporary one")
-    asked = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
-        root = (asked.state or Path(temporary)).absolute()
+        root = (args.state or Path(temporary)).absolute()
         root.mkdir(parents=True, exist_ok=True)
         with exclusive(root / ".lock"):
-            stress = Stress(root, asked.kills, asked.seed)
+            stress = Stress(root, args.kills, args.seed)
             began = time.monotonic()
             good = stress.run()
-            print(f"{stress.figures()}; seed {asked.seed}, {time.monotonic() - began:.0f} s since this start")
+            print(f"{stress.figures()}; seed {args.seed}, {time.monotonic() - began:.0f} s since this start")
     return 0 if good else 1
 
 

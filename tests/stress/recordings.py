@@ -112,13 +112,13 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--rest", type=int, default=3, help="frames before anything happens")
     parser.add_argument("--to-success", action="store_true", help="recordings end with their success")
-    asked = parser.parse_args()
-    task = find_task(asked.robot, asked.task)
-    write(make(task, asked.count, asked.to_success), asked.robot, asked.out, asked.rest)
-    write_truth(asked.judged, asked.out)
+    args = parser.parse_args()
+    task = find_task(args.robot, args.task)
+    write(make(task, args.count, args.to_success), args.robot, args.out, args.rest)
+    write_truth(args.judged, args.out)
     print(
-        f"hma judge RUN --robot {asked.robot} --policies {asked.out}/policies.py --recordings {asked.out}/{asked.robot} "
-        f"--reward 1 --hold {task.hold} --frames {task.frames} --starts 30 --real {asked.out}/real.csv --out {asked.out}/judged"
+        f"hma judge RUN --robot {args.robot} --policies {args.out}/policies.py --recordings {args.out}/{args.robot} "
+        f"--reward 1 --hold {task.hold} --frames {task.frames} --starts 30 --real {args.out}/real.csv --out {args.out}/judged"
     )
 
 

@@ -163,17 +163,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="a directory that is kept; without it, a temporary one")
-    asked = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
-        o = run(asked.out or Path(temporary), asked.kills, asked.processes, asked.seed)
+        o = run(args.out or Path(temporary), args.kills, args.processes, args.seed)
     print(
         f"{o.kills} kills ({o.in_saves} within a save) and {o.left} leaves among {o.started} processes, "
-        f"about {asked.processes} at a time, {o.failed} errors, {o.seconds:.1f} s\n"
+        f"about {args.processes} at a time, {o.failed} errors, {o.seconds:.1f} s\n"
         f"{o.parts} parts, begun {o.begun} times; again because their process ended: {o.again_in_flight}; "
         f"made twice: {', '.join(o.twice) or 'none'}\n"
         f"byte-equal to the undisturbed store, nothing left over: {'yes' if o.equal else 'NO'}"
     )
-    return 0 if o.good and o.kills >= asked.kills else 1
+    return 0 if o.good and o.kills >= args.kills else 1
 
 
 if __name__ == "__main__":

@@ -101,40 +101,40 @@ def main() -> None:
     parser.add_argument("--name", default="model", help="of the run, in file names and the table")
     parser.add_argument("--table", default=TABLE, help="file in DIR; curves of the same name")
     parser.add_argument("--detector", type=Path, default=COMMITTED / WEIGHTS)
-    asked = parser.parse_args()
-    require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
-    require(asked.starts >= 1, f"--starts must be at least 1, got {asked.starts}")
+    args = parser.parse_args()
+    require(args.minutes > 0, f"--minutes must be positive, got {args.minutes:g}")
+    require(args.starts >= 1, f"--starts must be at least 1, got {args.starts}")
     require(
-        0 < asked.every < 120 * asked.minutes,
-        f"--every {asked.every:g}: a row of the table needs at least half as many seconds, and --minutes "
-        f"{asked.minutes:g} are {60 * asked.minutes:g}; give fewer",
+        0 < args.every < 120 * args.minutes,
+        f"--every {args.every:g}: a row of the table needs at least half as many seconds, and --minutes "
+        f"{args.minutes:g} are {60 * args.minutes:g}; give fewer",
     )
-    detector, simulator, rows = Detector.load(asked.detector), load_simulator(asked.run), []
-    robots = chosen(native_robots(simulator.robots), asked.robots)
-    starts = true_starts_of(simulator, robots, asked.starts)
-    claim_name(asked.out, asked.name, asked.run, simulator, asked.detector)
-    for kind in asked.drives:
-        for variant in asked.variants:
+    detector, simulator, rows = Detector.load(args.detector), load_simulator(args.run), []
+    robots = chosen(native_robots(simulator.robots), args.robots)
+    starts = true_starts_of(simulator, robots, args.starts)
+    claim_name(args.out, args.name, args.run, simulator, args.detector)
+    for kind in args.drives:
+        for variant in args.variants:
             new: list[Row] = []
-            for which in range(asked.starts):
-                path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which, asked.robots)
+            for which in range(args.starts):
+                path = film_path(args.out, args.name, variant, kind, args.minutes, which, args.robots)
                 unfinished = path.with_name(f"{path.name}.unfinished")
                 if not path.exists():
-                    with step(f"{variant}, {kind}, {asked.minutes:g} min, start {which}") as update:
-                        options = (variant, kind, asked.minutes, which, robots, starts)
-                        made = run_variant(asked.run, detector, *options, unfinished, update)
+                    with step(f"{variant}, {kind}, {args.minutes:g} min, start {which}") as update:
+                        options = (variant, kind, args.minutes, which, robots, starts)
+                        made = run_variant(args.run, detector, *options, unfinished, update)
                     save_films(made, path)
                 unfinished.unlink(missing_ok=True)
                 films = load_films(path)
                 hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
-                new += rows_of(f"{asked.name}/{variant}", kind, which, films, hz, tools, asked.every)
+                new += rows_of(f"{args.name}/{variant}", kind, which, films, hz, tools, args.every)
             show(new)
             rows += new
-            draw_sheet(films, asked.out / f"{'-'.join([asked.name, variant, kind, *asked.robots])}.png")
+            draw_sheet(films, args.out / f"{'-'.join([args.name, variant, kind, *args.robots])}.png")
             console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
-    table, curves = asked.out / asked.table, (asked.out / asked.table).with_suffix(".png")
+    table, curves = args.out / args.table, (args.out / args.table).with_suffix(".png")
     write_rows(table, rows)
-    draw_curves([row for row in rows if row["drive"] == asked.drives[0]], curves)
+    draw_curves([row for row in rows if row["drive"] == args.drives[0]], curves)
     wrote(table, curves)
 
 

@@ -80,10 +80,10 @@ def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -
         if kind == "behaviour":
             if t % again == 0:
                 behaviour = Behaviour(world, np.random.default_rng([seed, t]))
-            asked = behaviour.act()[0]
+            command = behaviour.act()[0]
         else:
-            asked = _unlike(robot, kind, t)
-        action = np.clip(np.asarray(asked, np.float32), np.float32(robot.low), np.float32(robot.high))
+            command = _unlike(robot, kind, t)
+        action = np.clip(np.asarray(command, np.float32), np.float32(robot.low), np.float32(robot.high))
         world.step(action[None].astype(np.float64))
         actions.append(action)
         q.append(world.q.copy())

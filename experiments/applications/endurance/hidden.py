@@ -141,11 +141,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
     parser.add_argument("--name", default="model", help="of the run, in the table's name")
     parser.add_argument("--detector", type=Path, default=COMMITTED / WEIGHTS)
-    asked = parser.parse_args()
-    detector, rows, table = Detector.load(asked.detector), [], asked.out / f"{asked.name}_hidden.csv"
-    simulator = load_simulator(asked.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
+    args = parser.parse_args()
+    detector, rows, table = Detector.load(args.detector), [], args.out / f"{args.name}_hidden.csv"
+    simulator = load_simulator(args.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
     robots = native_robots(simulator.robots)
-    claim_name(asked.out, asked.name, asked.run, simulator, asked.detector)
+    claim_name(args.out, args.name, args.run, simulator, args.detector)
     with step("objects that come back") as update:
         for i, name in enumerate(robots):
             spec, rng = SPECS[name], np.random.default_rng([0, i])

@@ -57,12 +57,12 @@ def motion(true: np.ndarray, seen: np.ndarray, there: np.ndarray, prefix: str) -
     last two do not mind that a robot is turned otherwise than in truth, as one whose commands are velocities in its own
     frame will be after the first error; `steers` minds where it goes from there."""
     both = there[1:] & there[:-1]
-    asked, done = np.diff(true, axis=0), np.diff(seen, axis=0)
-    pairs = {"follows": [(asked[both][:, a], done[both][:, a]) for a in (0, 1)]}
-    pairs["moves"] = [(np.linalg.norm(asked[both], axis=-1), np.linalg.norm(done[both], axis=-1))]
-    told = both[1:] & both[:-1] & (np.linalg.norm(asked[:-1], axis=-1) >= STEP)
-    turned, seen_turned = _from_the_one_before(asked)[told], _from_the_one_before(done)[told]
-    pairs["steers"] = [(turned.real, seen_turned.real), (turned.imag, seen_turned.imag)]
+    true_moves, seen_moves = np.diff(true, axis=0), np.diff(seen, axis=0)
+    pairs = {"follows": [(true_moves[both][:, a], seen_moves[both][:, a]) for a in (0, 1)]}
+    pairs["moves"] = [(np.linalg.norm(true_moves[both], axis=-1), np.linalg.norm(seen_moves[both], axis=-1))]
+    turns = both[1:] & both[:-1] & (np.linalg.norm(true_moves[:-1], axis=-1) >= STEP)
+    true_turned, seen_turned = _from_the_one_before(true_moves)[turns], _from_the_one_before(seen_moves)[turns]
+    pairs["steers"] = [(true_turned.real, seen_turned.real), (true_turned.imag, seen_turned.imag)]
     return {prefix + name: float(np.mean([_correlation(*pair) for pair in some])) for name, some in pairs.items()}
 
 
@@ -74,7 +74,8 @@ def _from_the_one_before(displacements: np.ndarray) -> np.ndarray:
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's of what was asked and done, in pixels; nan where nothing was asked, 0 where nothing was done."""
+    """Pearson's correlation of true and seen motion, in pixels; nan where the true tool rests, 0 where the seen one
+    does."""
     if len(a) < 3 or a.std() < STILL:
         return float("nan")
     return float(np.corrcoef(a, b)[0, 1]) if b.std() >= STILL else 0.0

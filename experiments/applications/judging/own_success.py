@@ -31,12 +31,12 @@ class OwnSuccess:
         shape = images.shape[-3:]
         seen, begun = (x.reshape(-1, *shape) for x in (images, np.broadcast_to(first, images.shape)))
         pieces = [slice(at, at + PIECE) for at in range(0, len(seen), PIECE)]
-        return np.concatenate([self._asked(seen[piece], begun[piece]) for piece in pieces]).reshape(images.shape[:-3])
+        return np.concatenate([self._call(seen[piece], begun[piece]) for piece in pieces]).reshape(images.shape[:-3])
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         return self.probabilities(images, first) > self.threshold
 
-    def _asked(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+    def _call(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         given = self._function(images.copy(), first.copy())
         wanted = (
             f"{self._where}: {SIGNATURE} must give [{len(images)}], for each image how probable it is that the "

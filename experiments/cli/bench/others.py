@@ -18,7 +18,7 @@ from hma_jax.config.execution import Dtype
 
 def quality(
     run: Positional[Path],
-    asked: StudyOptions,
+    arguments: StudyOptions,
     frames: int | None = None,
     windows: int = 12,
     repeats: int = 30,
@@ -30,7 +30,7 @@ def quality(
 
     Args:
         run: Directory of a trained model.
-        asked: The study whose held-out windows are used.
+        arguments: The study whose held-out windows are used.
         frames: Length of a rollout, prompt included; the model's window if not given.
         windows: Held-out windows per dataset.
         repeats: Timed rollouts of every decoding.
@@ -44,7 +44,7 @@ def quality(
     from experiments.running.run_trial import open_materials
     from hma_jax.training.runs import load_model, require_frames
 
-    setting = make_setting(asked)
+    setting = make_setting(arguments)
     trained = load_model(run).run
     require_frames(trained, "judge")
     require_prepared(setting)

@@ -18,11 +18,11 @@ CONVERT_HELP = (
 )
 
 
-def suite(asked: StudyOptions, remake: RemakeOptions) -> None:
+def suite(arguments: StudyOptions, remake: RemakeOptions) -> None:
     """Write the study's simulated datasets as RLDS directories."""
     from experiments.preparing.suite import make_suite
 
-    setting = make_setting(asked)
+    setting = make_setting(arguments)
     with setting.workspace.locked():
         make_suite(setting.study, setting.workspace, remake.replace)
     wrote(setting.workspace.suite, then=setting.command("tokenizer train"))

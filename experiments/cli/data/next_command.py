@@ -36,8 +36,8 @@ def tokenize_command(
     if rate is not None:
         changes["rate"] = f"{rate:g}"
     settings = tuple(f"{name}={value}" for name, value in changes.items())
-    asked = StudyArguments(data=tuple(directories), registry=registry, set=settings).anywhere()
-    return command("tokenize", *asked.words())
+    arguments = StudyArguments(data=tuple(directories), registry=registry, set=settings).anywhere()
+    return command("tokenize", *arguments.words())
 
 
 def single_episode(directories: Sequence[Facts]) -> str | None:

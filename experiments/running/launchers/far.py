@@ -32,10 +32,10 @@ class Attempt:
         (directory / STOP).unlink(missing_ok=True)  # it asked an earlier attempt
         self._child: subprocess.Popen | None = None
         self._code: int | None = None
-        self._asked = False
+        self._stop_requested = False
 
     def __getstate__(self) -> dict[str, object]:
-        return vars(self) | {"_child": None, "_code": None, "_asked": False}
+        return vars(self) | {"_child": None, "_code": None, "_stop_requested": False}
 
     def run(self) -> int:
         """Makes the attempt and returns its exit code, as of `subprocess`."""
@@ -52,7 +52,7 @@ class Attempt:
         # as those of `subprocess` are, so another one waits for the child.
         threading.Thread(target=self._wait, daemon=True).start()
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, lambda *_: self._ask())
+            signal.signal(signal.SIGTERM, lambda *_: self._request_stop())
         try:
             while self._code is None and not (self.directory / STOP).exists():
                 time.sleep(LOOK_EVERY)
@@ -64,16 +64,16 @@ class Attempt:
     def _wait(self) -> None:
         self._code = self._child.wait()
 
-    def _ask(self) -> None:
-        if not self._asked:  # the engine may say it by a signal, by interrupting the call and by the file
-            self._asked = True
+    def _request_stop(self) -> None:
+        if not self._stop_requested:  # the engine may say it by a signal, by interrupting the call and by the file
+            self._stop_requested = True
             self._child.send_signal(signal.SIGINT)
 
     def end(self) -> None:
         """Asks the child to save and waits until it has ended; kills it after the grace period."""
         if self._code is not None:
             return
-        self._ask()
+        self._request_stop()
         deadline = time.monotonic() + GRACE_SECONDS
         while self._code is None and time.monotonic() < deadline:
             time.sleep(LOOK_EVERY)

@@ -101,7 +101,7 @@ class SlurmLauncher(Launcher):
     ):
         self._root, self._command = root, command
         self._executor = executor or _make_executor(root / "slurm", workers, settings)
-        self._asked = -math.inf
+        self._polled = -math.inf
         self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
         self._over: dict[str, float] = {}  # when a job was first seen to be over
 
@@ -119,7 +119,7 @@ class SlurmLauncher(Launcher):
                 jobs += self._executor.submit_array(attempts[first : first + LARGEST_ARRAY])
         except FailedJobError as error:
             raise ConfigError(f"Slurm does not take the jobs: {error}; change --launcher-set") from error
-        self._asked, self._states = -math.inf, None
+        self._polled, self._states = -math.inf, None
         return jobs
 
     def ended(self, handle: Any) -> Ended | None:
@@ -151,8 +151,8 @@ class SlurmLauncher(Launcher):
 
     def _state(self, id: str) -> str:
         """Of one job; all are asked for at once, not more often than is good for the cluster."""
-        if time.monotonic() - self._asked >= self.pause:
-            self._asked = time.monotonic()
+        if time.monotonic() - self._polled >= self.pause:
+            self._polled = time.monotonic()
             answer = ask_states()
             self._states = self._states if answer is None else answer
         if self._states is None:
@@ -186,7 +186,7 @@ def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -
         executor = SlurmExecutor(folder, max_num_timeout=TIMEOUTS)
     except RuntimeError:
         raise ConfigError("no Slurm here: srun is not on the PATH; start this where jobs are submitted") from None
-    asked = {
+    options = {
         "partition": settings.partition,
         "account": settings.account,
         "qos": settings.qos,
@@ -203,6 +203,6 @@ def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -
         array_parallelism=workers or LARGEST_ARRAY,
         stderr_to_stdout=True,
         additional_parameters={"requeue": True, **further},
-        **{name: value for name, value in asked.items() if value is not None},
+        **{name: value for name, value in options.items() if value is not None},
     )
     return executor
