@@ -22,6 +22,7 @@ from tests.experiments.applications.endurance.committed import (
     rows_of_trained,
     words_of,
 )
+from tests.pages import table
 
 
 def test_the_page_shows_what_was_measured():
@@ -48,43 +49,47 @@ def test_ten_minutes_are_as_the_page_says():
         return [f"{100 * mean('object_found', minute, of):.0f}" for minute in (1, 2, 10)]
 
     first, second, last = objects(mine)
-    said = f"found in {first} % of frames of the first minute, in {second} % of those of the second, in {last} % of the last"
-    assert said in page
-    assert "two cores train in {}, {} and {} (".format(*objects(small)) in page
+    said = f"found in {first} % of the frames of the first minute, {second} % of the second and {last} % of the last; small model: "
+    assert said + "{}, {} and {} %.".format(*objects(small)) in page
     tools = f"{100 * mean('tool_found', 10):.0f}"
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
-    assert f"commands by {mean('follows', 10):.2f} after {mean('follows', 1):.2f} in the first minute" in page
+    said = f'"Follows" is {mean("follows", 1):.2f} in the first minute and {mean("follows", 10):.2f} in the last. '
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
     keeping = [robot for robot in following if mine[robot, 10]["follows"] >= mine[robot, 1]["follows"] / 2]
-    assert f"Of {len(following)} robots that follow at all (above 0.5 in the first minute) {len(keeping)} keep" in page
+    assert len(following) == 6
+    said += (
+        f"Six robots have more than 0.5 in the first minute; {len(keeping)} of them keep at least half of their value."
+    )
+    assert said in page
     places = {robot: round(100 * row["tool_close"]) for (robot, minute), row in mine.items() if minute == 10}
     grippers, arms, pusher_in_place = (
         [places.pop(f"{kind}_{name}") for name in names]
         for kind, names in (("gripper", ("wood", "night")), ("arm", ("chalk", "sand")), ("pusher", ("sand",)))
     )
-    assert "{} and {} % of the last minute of the two grippers".format(*grippers) in page
-    said = "in place in {} %, the two arms in {} and {}, the other three in {} at most"
-    assert said.format(*pusher_in_place, *arms, max(places.values())) in page and len(places) == 3
+    assert "in {} and {} % of the last minute for the two grippers".format(*grippers) in page
     pusher = mine["pusher_sand", 10]
-    assert f"follows by {pusher['follows']:.2f}, stands {pusher['tool_px']:.0f} pixels beside the truth" in page
+    followed = f'("follows" {pusher["follows"]:.2f}, but {pusher["tool_px"]:.0f} pixels off)'
+    said = f"in place in {{}} % for pusher_sand {followed}, {{}} and {{}} % for the two arms, at most {{}} % for the other three."
+    assert said.format(*pusher_in_place, *arms, max(places.values())) in page and len(places) == 3
     change = [(mine[robot, 10], mine[robot, 2]) for robot, minute in mine if minute == 10]
     for measure, words in (
-        ("psnr", "PSNR changes by {:+.1f} ± {:.1f} dB"), ("follows", "follows by {:+.2f} ± {:.2f}"),
+        ("psnr", "PSNR changes by {:+.1f} ± {:.1f} dB"), ("follows", '"follows" by {:+.2f} ± {:.2f}'),
         ("object_found", "objects found by {:+.2f} ± {:.2f}"),
     ):  # fmt: skip
         assert words.format(*gain(measure, change)) in page, measure
     variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
     colours = mean("histogram", 1), mean("histogram", 10)
-    assert f"variance is {variance:.2f} of the truth's" in page
-    assert "{:.2f} of the histogram of colours differs in the first minute, {:.2f} in the last".format(*colours) in page
+    assert f"The variance of frames is {variance:.2f} of the true one." in page
+    said = "Of the colour histogram {:.2f} differs in the first minute, {:.2f} in the last."
+    assert said.format(*colours) in page
     lasting = {robot: round(100 * row["object_found"]) for (robot, minute), row in mine.items() if minute == 10}
     assert lasting["pusher_sand"] == lasting["omni_chalk"] == 100
     assert sorted(lasting[robot] for robot in ("arm_chalk", "arm_sand", "picker_slate"))[::2] == [0, 3]
     later = [(row, small[place]) for place, row in mine.items() if place[1] > 1]
     beside = [x for measure in ("object_found", "psnr", "follows") for x in gain(measure, later)]
     said = (
-        "From the second minute on, paired by robot, objects are found in {:.2f} ± {:.2f} more of the frames, PSNR is "
-        "{:.1f} ± {:.1f} dB and follows {:.2f} ± {:.2f} higher."
+        "From the second minute on, paired by robot, the difference from the small model is {:+.2f} ± {:.2f} in objects "
+        'found, {:+.1f} ± {:.1f} dB in PSNR and {:+.2f} ± {:.2f} in "follows".'
     )
     assert said.format(*beside) in page
 
@@ -101,20 +106,21 @@ def test_robots_that_lose_their_heading_steer_to_the_end_as_the_page_says():
     ends = [steers(robot, minute) for robot in ("rover_road", "omni_chalk") for minute in (1, 10)]
     assert min(ends[1] / ends[0], ends[3] / ends[2]) > 0.5
     truly, worst = np.mean([row["true_steers"] for row in rows]), min(row["steers"] for row in rows)
-    said = "minute {:.2f} and {:.2f} for rover_road, {:.2f} and {:.2f} for omni_chalk, in no minute below {:.2f}; in the true"
-    assert said.format(*ends, worst) in page and f"simulator's own frames {truly:.2f}" in page
-    last = [f"{100 * row['object_found']:.0f}" for row in rows if (row["robot"], row["part"]) == ("rover_road", 10)]
-    assert (
-        "shows its own in {} % of the last; from the other starts in the third minute, and in {} %".format(*last)
-        in page
+    said = (
+        '"Steers" in the first and last minute is {:.2f} and {:.2f} for rover_road, {:.2f} and {:.2f} for omni_chalk; no '
+        "minute is below {:.2f}. The true simulator's own frames give {:.2f}."
     )
+    assert said.format(*ends, worst, truly) in page
+    last = [f"{100 * row['object_found']:.0f}" for row in rows if (row["robot"], row["part"]) == ("rover_road", 10)]
+    said = "rover_road's is found in {} % of the last. From the second starts it is the third minute, and {} %."
+    assert said.format(*last) in page
     lost = [
         [r["part"] for r in rows if r["robot"] == "omni_chalk" and r["start"] == s and r["object_found"] < 0.1]
         for s in (0, 1)
     ]
     assert [min(parts) for parts in lost] == [4, 3]
     follows = [row["follows"] for row in rows]
-    assert f'"follows" wanders from {min(follows):.2f} to {max(follows):.2f}' in page
+    assert f'"follows" varies from {min(follows):.2f} to {max(follows):.2f}' in page
 
 
 def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
@@ -127,34 +133,39 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
         return f"{100 * over_robots(rows, 'object_found')[0]:.0f}"
 
     kept, before = ([found(minute, of) for minute in (1, 2, 10)] for of in (ten, grown))
-    said = "in {} % of the frames of the first minute, in {} % of those of the second and in {} % of the last, where"
-    assert said.format(*kept) in page and '"grown" has {}, {} and {}.'.format(*before) in page
-    assert f"trained on a displaced past has {kept[2]} % from the first starts" in page
+    said = (
+        'in {} % of the frames of the first minute, {} % of the second and {} % of the last; "grown": {}, {} and {} %.'
+    )
+    assert said.format(*kept, *before) in page
+    assert f'Training on a displaced past ("kept") gives {kept[2]} % from the first starts;' in page
     last, later = ([(row, grown[k]) for k, row in ten.items() if k[2] >= first] for first in (10, 2))
     more, half = gain("object_found", last)
     assert more > half
-    said = "that is {:.2f} ± {:.2f} more, from the second on {:.2f} ± {:.2f}:"
+    said = "the difference is {:+.2f} ± {:.2f} in the last minute, {:+.2f} ± {:.2f} from the second on."
     assert said.format(more, half, *gain("object_found", later)) in page
     lost = [robot for (robot, _, minute), row in ten.items() if minute == 10 and row["object_found"] < 0.1]
     assert lost == ["arm_sand"]
     objects, tools, psnr = (gain(measure, later) for measure in ("object_close", "tool_close", "psnr"))
-    said = "in place are {:.2f} ± {:.2f} fewer over the ten minutes, tools {:.2f} ± {:.2f} fewer, PSNR is {:.1f} ± {:.1f} dB"
-    assert said.format(-objects[0], objects[1], -tools[0], tools[1], -psnr[0], psnr[1]) in page
+    said = "objects in place {:+.2f} ± {:.2f}, tools in place {:+.2f} ± {:.2f}, PSNR {:+.1f} ± {:.1f} dB. Over the 24"
+    assert said.format(*objects, *tools, *psnr) in page
 
     drawn = by_place("drawn_ten.csv")
     training = [gain("object_found", [(row, drawn[k]) for k, row in ten.items() if k[2] >= first]) for first in (10, 2)]
     psnr = gain("psnr", [(row, drawn[k]) for k, row in ten.items() if k[2] >= 2])
     said = (
-        "found in {:.2f} ± {:.2f} more of the frames of the last minute, from the second on in {:.2f} ± {:.2f} more "
-        "(PSNR {:+.1f} ± {:.1f} dB)"
+        'compared with "drawn", the difference is {:+.2f} ± {:.2f} in the last minute, {:+.2f} ± {:.2f} from the second '
+        "on (PSNR {:+.1f} ± {:.1f} dB)."
     )
     assert said.format(*training[0], *training[1], *psnr) in page
 
     minute, drawing = gains("kept", "object_found", "grown"), gains("drawn", "object_found", "grown")
-    assert "objects are found in {:.2f} ± {:.2f} more of the frames than with".format(*minute) in page
-    assert '"drawn" finds {:.2f} ± {:.2f} more, and'.format(*drawing) in page
-    said = "training gains {:.2f} ± {:.2f}, which eight robots do not decide"
-    assert said.format(*gains("kept", "object_found", "drawn")) in page
+    training = gains("kept", "object_found", "drawn")
+    assert training[0] < training[1]
+    said = (
+        'the gain in objects found over "grown" is {:+.2f} ± {:.2f}. About half of it comes from sampling ("drawn" over '
+        '"grown": {:+.2f} ± {:.2f}); the gain of training ("kept" over "drawn") is {:+.2f} ± {:.2f}, not significant.'
+    )
+    assert said.format(*minute, *drawing, *training) in page
 
 
 def test_what_drawing_tokens_does_is_as_the_page_says():
@@ -178,27 +189,27 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     assert f"| {last[0]} % of objects, {tools} % of tools | objects, greedy decoding: {last[1]} % |" in readme
     said = "objects are found in {} % of the frames of the last minute, in {} with the likeliest tokens"
     assert said.format(*last) in words_of(ROOT / "docs" / "results.md")
-    said = (
-        "Objects are found in {} % of the frames of the last minute, not in all, and in {} % with the likeliest tokens"
-    )
+    said = "In the last minute objects are found in {} % of the frames, with greedy decoding in {} % (three starts"
     assert said.format(*last) in page
-    said = "in {} % of the frames, by the likeliest tokens in {}, paired by robot {:+.2f} ± {:.2f}. In the last minute it is"
+    said = "on in {} % of the frames, greedy {} %; paired by robot {:+.2f} ± {:.2f}. In the last minute "
     assert said.format(share(drawn, later), share(grown, later), *more("object_found", 2)) in page
     gained, half = more("object_found", 10)
-    assert (
-        "minute it is {} % and {}, {:+.2f} ± {:.2f}, which eight".format(*last, gained, half) in page and gained < half
-    )
+    said = "In the last minute {} %, greedy {} %: {:+.2f} ± {:.2f}, not significant over eight robots."
+    assert said.format(*last, gained, half) in page and gained < half
     by_start = [share(of, end, (start,)) for of in (drawn, grown) for start in (0, 1, 2)]
-    said = "in {}, {} and {} % of the frames from the first, second and third starts, by the likeliest tokens in {}, {} and {}."
+    said = (
+        "From the first, second and third starts, objects are found in {}, {} and {} % of the frames of the last minute, "
+        "greedy {}, {} and {} %."
+    )
     assert said.format(*by_start) in page
     kept = {robot: [round(100 * drawn[robot, start, 10]["object_found"]) for start in (0, 1, 2)] for robot, *_ in drawn}
     assert "(arm_chalk: {}, {} and {} %)".format(*kept["arm_chalk"]) in page
     assert [robot for robot, shares in kept.items() if max(shares) < 10] == ["picker_slate"]
-    assert "in the last minute, {:+.2f} ± {:.2f}.".format(*more("object_found", 10, (0,))) in page
-    said = "where drawing alone has {}, and is further"
+    assert "in the last minute would be {:+.2f} ± {:.2f}.".format(*more("object_found", 10, (0,))) in page
+    said = 'sampling alone ("drawn") gives {} % there, and "kept" is otherwise further'
     assert said.format(by_start[0]) in page
     cost = [x for measure in ("psnr", "tool_close", "follows") for x in more(measure, 2)]
-    said = "PSNR {:+.1f} ± {:.1f} dB, tools in place {:+.2f} ± {:.2f}, follows {:+.2f} ± {:.2f};"
+    said = 'PSNR {:+.1f} ± {:.1f} dB, tools in place {:+.2f} ± {:.2f}, "follows" {:+.2f} ± {:.2f}. Over'
     assert said.format(*cost) in page
 
     less = read_rows(RESULTS / "drawn_less.csv")
@@ -206,37 +217,25 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     beside = [
         x for rows in each for x in gain("object_found", [(r, grown[r["robot"], r["start"], r["part"]]) for r in rows])
     ]
-    assert "({:+.2f} ± {:.2f} and {:+.2f} ± {:.2f}), where temperature 0.7 has".format(*beside) in page
     shares = [percent(rows) for rows in each]
     shares += [share(of, range(2, 6), (0,)) for of in (grown, drawn)]
     said = (
-        "in {} % of the frames from the second minute to the fifth at temperature 0.4 and in {} % where one of the two "
-        "likeliest entries of each factor is drawn, as in {} % by the likeliest tokens ("
+        "From the first starts, minutes 2 to 5, objects are found in {} % of the frames at temperature 0.4 and in {} % "
+        "when one of the two likeliest entries of each factor is drawn; greedy {} % (differences {:+.2f} ± {:.2f} and "
+        "{:+.2f} ± {:.2f}), temperature 0.7 {} % ("
     )
-    assert said.format(*shares[:3]) in page and f"where temperature 0.7 has {shares[3]} %" in page
+    assert said.format(*shares[:3], *beside, shares[3]) in page
 
 
 def test_size_and_data_keep_objects():
-    page = words_of(PAGE)
-    larger, grown = (
-        [
-            x
-            for measure in ("object_found", "object_close", "tool_close", "psnr")
-            for x in gains(name, measure, "weighed")
-        ]
-        for name in ("larger", "grown")
-    )
-    said = (
-        '"larger" finds objects in {:.2f} ± {:.2f} more of the frames than "weighed" (in place {:.2f} ± {:.2f}), has '
-        "tools in place in {:.2f} ± {:.2f} more and {:.1f} ± {:.1f} dB more PSNR"
-    )
-    assert said.format(*larger) in page
-    said = (
-        '"grown" finds objects in {:.2f} ± {:.2f} more (in place {:.2f} ± {:.2f}), tools in place in {:.2f} ± {:.2f} more, '
-        "PSNR {:+.1f} ± {:.1f} dB"
-    )
-    assert said.format(*grown) in page
-    assert "from chance (objects found {:+.2f} ± {:.2f})".format(*gains("grown", "object_found", "larger")) in page
+    columns = ("object_found", 2), ("object_close", 2), ("tool_close", 2), ("psnr", 1)
+    shown = table(PAGE, "| compared |")
+    assert shown.keys() == {"larger - weighed", "grown - weighed", "grown - larger"}
+    for label, cells in shown.items():
+        name, other = label.split(" - ")
+        apart = [(*gains(name, of, other), digits) for of, digits in columns]
+        found = [f"{mean:+.{digits}f} ± {half:.{digits}f}" for mean, half, digits in apart]
+        assert cells == (found[:1] + [""] * 3 if other == "larger" else found), label
 
 
 def test_half_of_what_was_hidden_comes_back():
@@ -248,11 +247,8 @@ def test_half_of_what_was_hidden_comes_back():
         for mine in (hidden, control)
         for name in ("found", "close")
     )
-    assert (
-        f"in {found[0]} ± {found[1]} % of the cases, in {close[0]} ± {close[1]} % in place; of those never hidden"
-        in page
-    )
-    assert f"of those never hidden {stay[0]} ± {stay[1]} and {stay_close[0]} ± {stay_close[1]} %." in page
+    said = f"shows it in {found[0]} ± {found[1]} % of the cases, and in place in {close[0]} ± {close[1]} %; controls: "
+    assert said + f"{stay[0]} ± {stay[1]} and {stay_close[0]} ± {stay_close[1]} %." in page
     short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
     assert f"it is {sum(short):.0f} of {len(short)}, after four or more {sum(long):.0f} of {len(long)}" in page
 
