@@ -83,6 +83,16 @@ def test_the_table_of_figures_has_speed_lengths_and_success(home):
         stats_table(home / "pusht")
 
 
+@pytest.mark.parametrize("text", ['{"frames": [80,', "[]", "{}", '{"frames": [], "success": null}'])
+def test_figures_that_cannot_be_read_are_told_with_their_file(tmp_path, text):
+    """As a copy that broke off leaves them: they ended the table in a traceback."""
+    path = tmp_path / "pusht" / "stats.json"
+    path.parent.mkdir()
+    path.write_text(text)
+    with pytest.raises(DataError, match=rf"{path}.*Remove the file to leave pusht out of the table"):
+        stats_table(tmp_path)
+
+
 def test_missing_packages_are_named_with_the_extra_and_what_draws(monkeypatch):
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     message = r"not installed \(gym-pusht, mujoco\): pip install -e '.\[sim\]'.*libegl1"
