@@ -21,7 +21,6 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
-from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
@@ -33,6 +32,7 @@ from data_pipelines.sources.source import (
     EpisodeSource,
     Fetched,
     OpenEpisode,
+    decode_frame,
     join_actions,
 )
 from data_pipelines.sources.video import open_video
@@ -120,7 +120,12 @@ class LeRobotDataset(EpisodeSource):
                     record, keys, self.features, steps, lambda what: EpisodeError(f"{where}: {what}").at(entry.data, -1)
                 )
             fetch = self._fetch(stack, entry, self._cameras[camera], times, where)
-            yield OpenEpisode(i, actions, success, fetch, lambda n, data: _decode(data, f"{where}, step {n}"))
+
+            def decode(n: int, frame: Fetched) -> np.ndarray:
+                advice = "Repair it, or read with corrupt='skip'."
+                return decode_frame(frame, lambda what: EpisodeError(f"{where}, step {n} {what}. {advice}"))
+
+            yield OpenEpisode(i, actions, success, fetch, decode)
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         where, entry = self._where(i), self._entries[i]
@@ -198,15 +203,6 @@ def dataset_name(root: Path) -> str:
             "it, or give a link to it of another name."
         )
     return name
-
-
-def _decode(data: Fetched, where: str) -> np.ndarray:
-    if isinstance(data, np.ndarray):
-        return data
-    try:
-        return decode_image(data)
-    except ValueError as error:
-        raise EpisodeError(f"{where} cannot be decoded: {error}. Repair it, or read with corrupt='skip'.") from error
 
 
 def _runs(numbers: np.ndarray) -> tuple[EpisodeRun, ...]:

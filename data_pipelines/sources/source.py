@@ -17,6 +17,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError, without_advice
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import FlatFeature, closest, field_slice, listing, step_key
 from hma_jax.config import ConfigError, require
 
@@ -241,6 +242,19 @@ class EpisodeSource(ABC):
                 f"The last: {without_advice(reason)} If the rest is worth it, raise the limit: "
                 "--set store.max_skipped=N."
             )
+
+
+def decode_frame(frame: Fetched, unusable: Callable[[str], Exception], at_least: int = 0) -> np.ndarray:
+    """uint8 [H, W, 3] of a frame as its source holds it; `at_least` as in `decode_image`.
+
+    Raises what `unusable` makes of a reason, for bytes that are no image.
+    """
+    if isinstance(frame, np.ndarray):
+        return frame
+    try:
+        return decode_image(frame, at_least)
+    except ValueError as error:
+        raise unusable(f"cannot be decoded: {error}") from error
 
 
 def join_actions(

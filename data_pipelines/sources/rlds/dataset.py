@@ -21,13 +21,20 @@ from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds import array_record
 from data_pipelines.sources.rlds.example import Feature, parse_record
 from data_pipelines.sources.rlds.frame_places import FramePlaces
-from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.index import index_path, load_index
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing
 from data_pipelines.sources.rlds.schema import field_slice, listing, read_info, read_metadata, resolve_version, step_key
 from data_pipelines.sources.rlds.steps import load_steps, save_steps
 from data_pipelines.sources.rlds.tfrecord import open_record, read_parts, scan_shard
-from data_pipelines.sources.source import MAX_SKIPPED, SUCCESS_KEY, Corrupt, EpisodeSource, OpenEpisode, join_actions
+from data_pipelines.sources.source import (
+    MAX_SKIPPED,
+    SUCCESS_KEY,
+    Corrupt,
+    EpisodeSource,
+    OpenEpisode,
+    decode_frame,
+    join_actions,
+)
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -220,10 +227,5 @@ class RldsDataset(EpisodeSource):
         return encoded
 
     def _image(self, i: int, key: str, step: int, data: bytes, at_least: int = 0) -> np.ndarray:
-        try:
-            return decode_image(data, at_least)
-        except ValueError as error:
-            raise self._unusable(
-                i,
-                f"step {step} of {key!r} cannot be decoded: {error}. Repair the episode, or read with corrupt='skip'.",
-            ) from error
+        advice = "Repair the episode, or read with corrupt='skip'."
+        return decode_frame(data, lambda what: self._unusable(i, f"step {step} of {key!r} {what}. {advice}"), at_least)
