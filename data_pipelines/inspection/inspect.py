@@ -24,9 +24,8 @@ from data_pipelines.sources.identity import describe
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
-from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import field_slice, read_features, read_info, step_key
-from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched
+from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched, decode_frame
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -72,10 +71,12 @@ class CameraFacts:
     frames: int  # looked at
     blank: int  # of those, frames that show one colour
     still: bool  # no sampled episode's frames differ
+    undecodable: int = 0  # sampled episodes in which a frame of it cannot be decoded; others are read of them
+    reason: str = ""  # why, in the first of these
 
     @property
     def is_blank(self) -> bool:
-        return self.blank == self.frames
+        return self.blank == self.frames > 0
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def inspect_dataset(
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
     each camera are decoded in the first `shown`, two in the others. Fields of numbers count as actions
     if they are called so, or if an entry takes them as its `action_keys`. Damaged records are counted
-    and left out. Raises DataError for a directory that is no dataset or has no readable episode,
+    and left out; of an episode with a camera that can be decoded, cameras that cannot are. Raises DataError for a directory that is no dataset or has no readable episode,
     ConfigError for an unknown split.
     """
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
@@ -173,7 +174,7 @@ def inspect_dataset(
             count = _steps(record, source, cameras, numbers)
             wanted = frames if len(examples) < shown else 2
             times = tuple(np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist())
-            looked = {key: log.look(record[step_key(key)], times) for key, log in cameras.items()}
+            looked = _look(record, cameras, times, describe(source.runs, int(source.numbers[i])))
         except EpisodeError as error:
             source.skip(int(i), error)
             continue
@@ -290,18 +291,34 @@ def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence
     return int(max(counts.values()))
 
 
+def _look(record: dict, cameras: dict[str, _CameraLog], times: Sequence[int], where: str) -> dict[str, list]:
+    """The frames at `times` of every camera that can be decoded, noted with those that cannot: an entry takes one camera,
+    whatever is wrong with the others. Raises EpisodeError where no camera can be decoded."""
+    looked, failures = {}, {}
+    for key, log in cameras.items():
+        try:
+            looked[key] = log.look(record[step_key(key)], times, where)
+        except EpisodeError as error:
+            failures[key] = error
+    if failures and not looked:
+        raise next(iter(failures.values()))
+    for key, error in failures.items():
+        cameras[key].fail(error)
+    return looked
+
+
 class _CameraLog:
     """What was seen of one camera so far."""
 
     def __init__(self, key: str):
         self._key = key
         self.sizes: set[tuple[int, int]] = set()
-        self.frames = self.blank = 0
-        self.still = True
+        self.frames = self.blank = self.undecodable = 0
+        self.still, self.reason = True, ""
 
-    def look(self, encoded: Sequence[Fetched], times: Sequence[int]) -> list[np.ndarray]:
-        """The decoded frames at `times`, noted. Raises ValueError for one that cannot be decoded."""
-        images = [self._decode(encoded[t], t) for t in times]
+    def look(self, encoded: Sequence[Fetched], times: Sequence[int], where: str) -> list[np.ndarray]:
+        """The decoded frames at `times`, noted. Raises EpisodeError for one that cannot be decoded."""
+        images = [self._decode(encoded[t], f"{where}: step {t} of {self._key}") for t in times]
         self.sizes |= {image.shape[:2] for image in images}
         self.frames += len(images)
         self.blank += sum(bool(image.std(axis=(0, 1)).max() < BLANK_STD) for image in images)
@@ -310,16 +327,18 @@ class _CameraLog:
         self.still &= not any(moves)
         return images
 
-    def _decode(self, frame: Fetched, step: int) -> np.ndarray:
-        if isinstance(frame, np.ndarray):
-            return frame
-        try:
-            return decode_image(frame)
-        except ValueError as error:
-            raise ValueError(f"step {step} of {self._key} cannot be decoded: {error}") from error
+    def fail(self, error: EpisodeError) -> None:
+        """Notes an episode in which a frame cannot be decoded."""
+        self.undecodable += 1
+        self.reason = self.reason or str(error)
+
+    @staticmethod
+    def _decode(frame: Fetched, where: str) -> np.ndarray:
+        return decode_frame(frame, lambda what: EpisodeError(f"{where} {what}"))
 
     def facts(self) -> CameraFacts:
-        return CameraFacts(self._key, tuple(sorted(self.sizes)), self.frames, self.blank, self.still)
+        sizes, still = tuple(sorted(self.sizes)), self.still and self.frames > 0
+        return CameraFacts(self._key, sizes, self.frames, self.blank, still, self.undecodable, self.reason)
 
 
 def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> Shown:

@@ -110,6 +110,12 @@ def _cameras(facts: Facts, entry: DatasetSpec | None) -> list[Remark]:
     for camera in facts.cameras:
         used = entry is not None and camera.key == entry.image_key
         whose = "the camera in use" if used else "not in use"
+        if camera.undecodable:
+            text = (
+                f"{camera.key} ({whose}): frames of {camera.undecodable} of {facts.sampled} episodes cannot be decoded; "
+                f"the first: {camera.reason.rstrip('.')}"
+            )
+            remarks.append(Remark("bad" if used else "doubt", "undecodable frames", text))
         if camera.is_blank:
             text = f"{camera.key} ({whose}): every frame looked at shows one colour"
             remarks.append(Remark("bad" if used else "doubt", "blank camera", text))

@@ -128,12 +128,13 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
 
 
 def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, str]:
-    """The camera to use, and why: one that shows something and does not ride on the arm."""
+    """The camera to use, and why: one that can be decoded, shows something and does not ride on the arm."""
     if not cameras:
         return None, "there is none"
-    seeing = [c for c in cameras if not c.is_blank]
+    decoded = [c for c in cameras if c.frames] or cameras
+    seeing = [c for c in decoded if not c.is_blank]
     if not seeing:
-        return cameras[0], "every camera is blank; nothing to predict"
+        return decoded[0], "every camera is blank; nothing to predict"
 
     def rank(camera: CameraFacts) -> tuple:
         name = camera.key.rsplit("/", 1)[-1]
@@ -143,6 +144,7 @@ def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, s
     best = min(seeing, key=rank)
     blank = [c.key for c in cameras if c.is_blank]
     why = f"of {len(cameras)}" + (f", {len(blank)} of them blank" if blank else "")
+    why += f", {lacking} that cannot be decoded" if (lacking := len(cameras) - len(decoded)) else ""
     where = "rides on the arm, as all do" if ON_THE_ARM.search(best.key) else "by its name not on the arm"
     return best, f"{best.key.removeprefix('observation/')} {why}; {where}"
 

@@ -256,6 +256,7 @@ def _cameras(d: Viewed) -> str:
     lines = []
     for c in d.facts.cameras:
         remark = "blank" if c.is_blank else "stands still" if c.still else "in use" if c.key == used else ""
+        remark = remark if c.frames else "cannot be decoded"
         sizes = ", ".join(f"{h}x{w}" for h, w in c.sizes)
         lines.append([f"<code>{html.escape(c.key)}</code>", remark, sizes, f"{c.frames}", f"{c.blank}"])
     return table(["camera", "remark", "height x width", "frames looked at", "blank"], lines, text=2)

@@ -186,6 +186,10 @@ def print_facts(facts: Facts) -> None:
         console.print(f"[yellow]damaged[/] {count} episode(s): {escape(reason)}", soft_wrap=True)
     if rest := sum(count for _, count in damaged[NAMED:]):
         console.print(f"[yellow]damaged[/] {rest:,} more episode(s): --json FILE names all", soft_wrap=True)
+    for c in facts.cameras:
+        if c.undecodable:
+            text = f"{c.key} in {c.undecodable} of {facts.sampled} episodes, the first: {c.reason}"
+            console.print(f"[yellow]cannot be decoded[/] {escape(text)}", soft_wrap=True)
     splits = tidy_table("Splits", "split", "episodes", "shards", "MB")
     for s in facts.splits:
         splits.add_row(s.name, f"{s.episodes:,}", f"{s.shards:,}", f"{s.bytes / 1e6:,.1f}")
@@ -205,6 +209,7 @@ def print_facts(facts: Facts) -> None:
     for c in facts.cameras:
         sizes = ", ".join(f"{h}x{w}" for h, w in c.sizes)
         remark = "blank: shows one colour" if c.is_blank else "stands still" if c.still else ""
+        remark = remark if c.frames else "cannot be decoded"
         cameras.add_row(escape(c.key), sizes, f"{c.frames}", f"{c.blank}", remark)
     console.print(cameras)
     for action in facts.actions:

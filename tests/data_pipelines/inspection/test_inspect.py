@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from data_pipelines.errors import DataError
 from data_pipelines.inspection.action_stats import dimension_facts
 from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, inspect_dataset
+from data_pipelines.inspection.remarks import make_remarks
 from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.registry.own import OWN
@@ -131,6 +133,37 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
     assert second.startswith(
         f"{file}, episode 2: step 0 of observation/image cannot be decoded: 8 bytes that are neither JPEG nor PNG"
     )
+
+
+@pytest.mark.parametrize("spoilt", [{2}, set(range(4))])
+def test_a_camera_that_cannot_be_decoded_costs_no_episode(tmp_path, spoilt):
+    """The whole episode was called damaged, and a dataset with one such camera unreadable; a study takes one camera."""
+    from tensorflow_datasets import features as tf
+
+    def change(episode, features):
+        frames = [png(np.eye(8, dtype=np.uint8) * 40 * t) for t in range(1, 6)]
+        features["steps/observation/image"] = frames
+        features["steps/observation/a_wrist"] = [b"no image"] * 5 if episode in spoilt else frames
+
+    directory = write_rlds(tmp_path, make_spec(), [5] * 4, change=change)
+    cameras = {name: tf.Image(shape=(8, 8, 3)) for name in ("image", "a_wrist")}
+    step = {"observation": cameras, "action": tf.Tensor(shape=(3,), dtype=np.float32)}
+    tf.FeaturesDict({"steps": tf.Dataset(step)}).save_config(str(directory))
+    sample = inspect_dataset(directory)
+    facts = sample.facts
+    assert facts.sampled == 4 and not facts.damaged and len(sample.fingerprints) == 4
+    bad, good = facts.cameras
+    assert (good.frames, good.undecodable) == (20, 0)
+    assert (bad.frames, bad.undecodable, bad.is_blank) == (5 * (4 - len(spoilt)), len(spoilt), False)
+    assert "step 0 of observation/a_wrist cannot be decoded: 8 bytes" in bad.reason
+    assert all(len(example.frames) == 2 - (example.index in spoilt) for example in sample.shown)
+    assert choose_camera(facts.cameras)[0] == good
+    for key, kind in ((good.key, "doubt"), (bad.key, "bad")):
+        remarks = make_remarks(facts, replace(make_spec(), image_key=key), None, ())
+        (said,) = [r for r in remarks if r.title == "undecodable frames"]
+        assert (
+            said.kind == kind and f"frames of {len(spoilt)} of 4 episodes cannot be decoded; the first: " in said.text
+        )
 
 
 def test_episodes_keep_their_numbers_behind_a_shard_that_is_cut_off(tmp_path):
