@@ -6,17 +6,21 @@ import errno
 import json
 import os
 import shlex
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from data_pipelines.inspection.inspect import Shown
-from data_pipelines.registry import get_spec
+from data_pipelines.registry import get_spec, toml_file
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments import run_study
+from experiments.cli.data.registry import _write_entry
 from experiments.cli.main import main
 from experiments.contact_sheet import TILE, draw_sheet
 from experiments.running.launchers.registry import Launching
@@ -197,6 +201,23 @@ def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path, capsys
     assert text.count('["my_robot"]') == 1 and "hz = 5.0" in text and "hz = 4" not in text
     assert text.startswith("# what the lab has\n")
     assert "in place of the entry of my_robot that was there; changed: hz: 4.0 -> 5.0\n" in capsys.readouterr().out
+
+
+def test_entries_written_at_the_same_moment_are_both_kept(tmp_path, monkeypatch):
+    """Each was put into the text as it was before the other."""
+    put, names = toml_file.put_entry, ("one", "other")
+
+    def slowly(*arguments) -> str:
+        text = put(*arguments)
+        time.sleep(0.2)
+        return text
+
+    monkeypatch.setattr(toml_file, "put_entry", slowly)
+    file = tmp_path / "my.toml"
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda name: _write_entry(file, SimpleNamespace(spec=lambda: make_spec(name))), names))
+    assert {entry.name for entry in toml_file.load_entries(file)} == set(names)
+    assert [path.name for path in tmp_path.iterdir()] == ["my.toml"]
 
 
 def test_a_misspelt_heading_of_a_known_dataset_is_told(tmp_path, capsys):
