@@ -292,8 +292,8 @@ def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence
 
 
 def _look(record: dict, cameras: dict[str, _CameraLog], times: Sequence[int], where: str) -> dict[str, list]:
-    """The frames at `times` of every camera that can be decoded, noted with those that cannot: an entry takes one camera,
-    whatever is wrong with the others. Raises EpisodeError where no camera can be decoded."""
+    """The frames at `times` of every camera that can be decoded; the logs count those that cannot. An entry takes one
+    camera, whatever is wrong with the others. Raises EpisodeError where no camera can be decoded."""
     looked, failures = {}, {}
     for key, log in cameras.items():
         try:
