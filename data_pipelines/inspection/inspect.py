@@ -144,9 +144,11 @@ def inspect_dataset(
 
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
     each camera are decoded in the first `shown`, two in the others. Fields of numbers count as actions
-    if they are called so, or if an entry takes them as its `action_keys`. Damaged records are counted
-    and left out; of an episode with a camera that can be decoded, cameras that cannot are. Raises DataError for a directory that is no dataset or has no readable episode,
-    ConfigError for an unknown split.
+    if they are called so, or if an entry takes them as its `action_keys`. Damaged records are counted and
+    left out. A camera that cannot be decoded in an episode is counted as such, and the others are read.
+
+    Raises DataError for a directory that is no dataset or has no readable episode, ConfigError for an
+    unknown split.
     """
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
