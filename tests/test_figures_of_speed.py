@@ -97,7 +97,7 @@ def test_the_page_of_speed_shows_the_release_on_two_cores():
         assert cells == [*times, f"{times_longer(newest, stage):.2f}", others], stage
     page = " ".join(SPEED.read_text().split())
     forward = [[run[whose + "forward"][0] for run in (newest, *before)] for whose in (THEIRS, OURS)]
-    for mine, words in zip(forward, ("took {:.2f} s in it", "ours {:.2f} s"), strict=True):
+    for mine, words in zip(forward, ("release's forward pass took {:.2f} s", "ours {:.2f} s"), strict=True):
         assert f"{words.format(mine[0])}, before {min(mine[1:]):.2f} to {max(mine[1:]):.2f} s" in page
     plain = [read_record(BENCH.parent / "release-before" / f"{c}.json").matmul_flops_per_second / 1e9 for c in EARLIER]
     now = read_record(BENCH / "release-base-float32-cpu.json").matmul_flops_per_second / 1e9
@@ -164,12 +164,12 @@ def test_the_page_of_speed_shows_ratios_within_one_run():
     held = [
         read_record(BENCH / f"{kind}-base-float32-cpu.json").peak_memory_bytes / 2**30 for kind in ("generate", "train")
     ]
-    assert "A process that generates held {:.1f} GiB at most, one that trains {:.1f} GiB".format(*held) in page
+    assert "Peak memory is {:.1f} GiB for generating and {:.1f} GiB for training.".format(*held) in page
 
 
 def test_the_page_of_speed_shows_what_loading_gives():
     record = read_record(BENCH / "load-store-none-cpu.json")
-    rows = table(SPEED, "| | frames/s | memory grows, per thousand |")
+    rows = table(SPEED, "| | frames/s | memory growth per thousand |")
     assert rows.keys() == {stage.name for stage in record.stages}
     for stage in record.stages:
         rate, memory = rows[stage.name]
@@ -204,9 +204,9 @@ def test_the_page_of_speed_shows_products_of_two_cores():
     slow, *others = sorted(rates)
     page = " ".join(SPEED.read_text().split())
     said = (
-        "Products with weights run at {:.0f} to {:.0f} GFLOP/s (the smallest, of a matrix 256 wide with one frame, at {:.0f} "
-        "to {:.0f}, one of the step's at {:.0f}), a plain square product at {:.0f} to {:.0f}; those of attention within "
-        "frames at {:.0f} to {:.0f} (a head has 32 values), those over time at {:.0f} to {:.0f}"
+        "products with weights: {:.0f} to {:.0f}; the smallest, of a matrix 256 wide with one frame, {:.0f} to {:.0f}; one of "
+        "the step's {:.0f}; * a plain square product: {:.0f} to {:.0f}; * attention within frames: {:.0f} to {:.0f} (a head "
+        "has 32 values); temporal attention: {:.0f} to {:.0f} (matrices"
     )
     figures = others[0], others[-1], min(smallest), max(smallest), slow, min(plain), max(plain)
     assert said.format(*figures, min(within), max(within), min(over_time), max(over_time)) in page
@@ -235,8 +235,8 @@ def test_the_page_of_speed_says_where_a_pass_goes():
             of[next(kind for kind in of if kind in stage.name)] += 100 * stage.timing.median / whole.timing.median
         shares.append(list(of.values()))
     said = (
-        "products with weights are {:.0f} % of the time, those of attention within frames {:.0f} %, those over time {:.0f} %, and "
-        "what is no product {:.0f} %"
+        "products with weights take {:.0f} % of the time, attention within frames {:.0f} %, temporal attention {:.0f} %, and the "
+        "rest {:.0f} %: softmax"
     )
     assert said.format(*shares[0], 100 - sum(shares[0])) in page
     sums = [sum(each) for each in shares]
@@ -248,7 +248,7 @@ def test_the_page_of_speed_shows_what_cheaper_decoding_costs():
         judged = {
             row["decoding"]: {k: float(x) for k, x in row.items() if k != "decoding"} for row in csv.DictReader(file)
         }
-    rows = table(SPEED, "| sampler | PSNR (dB) | beside DDPM 100 |")
+    rows = table(SPEED, "| sampler | PSNR (dB) | minus DDPM 100 |")
     for label, cells in rows.items():
         row = judged[label.strip("*").removesuffix(", as released").lower()]
         gap = f"{row['psnr_gap']:.2f} ± {row['psnr_gap_sem']:.2f}" if row["psnr_gap"] else ""
