@@ -85,8 +85,8 @@ def adapt(
 
     Args:
         source: Directory of the training run that knows the other robots.
-        arguments: The study with the new datasets. Its tokenizer is the one of the trained model: give it with --tokenizer
-            if it is not beside RUN.
+        arguments: The study with the new datasets. Its tokenizer is the one of the trained model: give it with
+            --tokenizer if it is not beside RUN.
         one: How the new robots are trained.
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
