@@ -187,7 +187,7 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     last, tools = [share(of, end) for of in (drawn, grown)], share(drawn, end, measure="tool_found")
     readme = words_of(ROOT / "README.md")
     assert f"| {last[0]} % of objects, {tools} % of tools | objects, greedy decoding: {last[1]} % |" in readme
-    said = "objects are found in {} % of the frames of the last minute, in {} with the likeliest tokens"
+    said = "objects are found in {} % of the frames of the last minute, in {} % with greedy decoding"
     assert said.format(*last) in words_of(ROOT / "docs" / "results.md")
     said = "In the last minute objects are found in {} % of the frames, with greedy decoding in {} % (three starts"
     assert said.format(*last) in page
