@@ -1,12 +1,13 @@
 """Resampling over seeds and episodes: of the right things, by the right amount, quickly."""
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel, resample
-from experiments.analysis.intervals import OVERALL
+from experiments.analysis.intervals import OVERALL, critical
 from experiments.analysis.paired import NotComparable
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.summary import summarise
@@ -18,6 +19,12 @@ LOSS = "cross_entropy"
 def three_seeds(seed: int, of_seed: float, **world) -> Panel:
     rng = np.random.default_rng(seed)
     return make_panel([under_seeds(judged(rng, **world), rng, 3, of_seed)], LOSS)
+
+
+def panel_of(robots: str, episode: Sequence[int], *points: Sequence[Sequence[float]]) -> Panel:
+    """Of windows whose robots are the letters of `robots`; a point has a row for each of its seeds."""
+    values = tuple(np.array(rows, float) for rows in points)
+    return Panel(np.array(list(robots)), np.array(episode), values, tuple(tuple(range(len(v))) for v in values))
 
 
 @pytest.mark.parametrize(("of_seed", "episodes"), [(1.0, 12), (0.02, 6)])
@@ -72,6 +79,42 @@ def test_a_robot_of_one_episode_is_taken_to_scatter_as_the_others():
     assert np.isnan(nothing.sem) and np.isnan(nothing.low)
 
 
+def test_robots_count_equally_however_many_windows_they_have():
+    episode, loss = [0, 0, 1, 0, 1], [1, 1, 4, 5, 7]
+    panel = panel_of("aaabb", episode, [loss])
+    assert resample(panel, 5).value == pytest.approx([4]) and bootstrap_intervals(panel)[0].mean == pytest.approx(4)
+    # An episode of two windows weighs twice in a draw, too: what is the same everywhere stays so.
+    np.testing.assert_allclose(resample(panel_of("aaabb", episode, [[3] * 5]), 50).drawn, 3)
+
+
+def test_half_an_interval_is_the_t_of_each_level_times_its_error():
+    seeds = panel_of("aabb", [0, 1, 0, 1], [[0] * 4, [1] * 4, [5] * 4])
+    # Each seed finds the episodes of another robot hard; on average over seeds those of both are, three freedoms each.
+    hard = [2, -2, 2, -2, 0, 0, 0, 0]
+    each = panel_of("aaaabbbb", [0, 1, 2, 3] * 2, [hard, hard[::-1]])
+    # Variances of 1 with one degree of freedom and with four: (1 + 1)^2 / (1 / 1 + 1 / 4) of both.
+    unequal = panel_of("aabbbbb", [0, 1, 0, 1, 2, 3, 4], [[1, -1, *np.sqrt(5) * np.array([1, -1, 1, -1, 0])]])
+    for panel, freedom, error in (
+        (seeds, 2, np.std([0, 1, 5], ddof=1) / np.sqrt(3)),
+        (each, 6, np.sqrt(1 / 6)),
+        (unequal, 3.2, np.sqrt(1 / 2)),
+    ):
+        (interval,) = bootstrap_intervals(panel, 20_000)
+        assert interval.high - interval.mean == pytest.approx(critical(freedom) * error, rel=0.03)
+
+
+def test_points_of_the_same_seeds_draw_the_same_ones():
+    rows = np.repeat([[0.0], [1.0], [5.0]], 4, axis=1)
+    panel = panel_of("aabb", [0, 1, 0, 1], rows, rows + 10)
+    drawn = resample(panel, 50, over_episodes=False).drawn
+    np.testing.assert_allclose(drawn[:, 1] - drawn[:, 0], 10)
+    assert [interval.mean for interval in bootstrap_intervals(panel)] == pytest.approx([2, 12])
+
+
+def test_a_window_is_known_where_every_seed_has_it():
+    assert panel_of("ab", [0, 0], [[1, np.nan], [1, 2]]).known.tolist() == [True, False]
+
+
 def test_permuted_episode_ids_change_the_error():
     panel = three_seeds(3, 0.01, episodes=20, each=8, of_window=0.1)
     tampered = Panel(panel.robot, np.random.default_rng(0).permutation(panel.episode), panel.points, panel.seeds)
@@ -123,5 +166,11 @@ def test_what_does_not_belong_together_is_refused():
         one.minus(two)
     with pytest.raises(NotComparable, match="different windows"):
         one.minus(make_panel([{0: table.of("r0")}], LOSS))
+    with pytest.raises(NotComparable, match="different windows"):
+        one.minus(Panel(one.robot, one.episode + 1, one.points, one.seeds))
+    with pytest.raises(NotComparable, match="or points"):
+        one.minus(make_panel([{0: table}] * 2, LOSS))
     with pytest.raises(ConfigError, match="seeds repeat"):
         Panel(one.robot, one.episode, one.points, ((),))
+    with pytest.raises(ConfigError, match="seeds repeat"):
+        Panel(one.robot, one.episode, (np.repeat(one.points[0], 2, axis=0),), ((0, 0),))

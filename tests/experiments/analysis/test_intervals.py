@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments.analysis.intervals import OVERALL, critical, interval_of, nats_first, overall
+from experiments.analysis.intervals import OVERALL, Interval, critical, interval_of, nats_first, overall
 from hma_jax.evaluation.statistics import Stat, mean_and_sem
 from hma_jax.evaluation.summary import summarise
 from tests.experiments.analysis.worlds import intervals, judged
@@ -79,6 +79,7 @@ def test_one_episode_has_no_interval_and_takes_none_from_the_others():
     table = judged(np.random.default_rng(3), episodes=1, each=5)
     alone = interval_of(mean_and_sem(table.metrics["cross_entropy"], table.episode))
     assert math.isnan(alone.sem) and math.isnan(alone.low) and math.isnan(alone.errors)
+    assert Interval(-0.1, 0.0, -0.1, -0.1).errors == -math.inf  # every episode says so
     among = overall([Stat(1.0, math.nan, 5, 1), Stat(3.0, 0.5, 40, 4)])
     assert among.mean == 2.0 and among.high > 2.0
 
