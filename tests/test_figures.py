@@ -151,7 +151,7 @@ def test_plans_from_further_starts_are_as_their_page_says():
     assert many == told(of_all.mean, of_all.low, of_all.high)
     assert of_all.high < float(summary["MPPI in the model"]["low"])
     gain = crossed(plans - policies)
-    assert f"by {gain.mean:.2f} ({gain.low:.2f} to {gain.high:.2f}), start by start" in page
+    assert f"by {gain.mean:.2f} ({gain.low:.2f} to {gain.high:.2f}), paired by start" in page
     settings = Settings(starts=120, skip=30)
     away = ~begins_there(settings.make_task(), settings.start_seeds())
     less = crossed(plans - policies, away)
@@ -192,8 +192,8 @@ def test_ways_of_acting_are_compared_start_by_start_as_their_page_says():
         ),
     )  # fmt: skip
     assert f"at the mark from {mppi.sum():.0f} of 30 starts**, CEM from {cem.sum():.0f}." in page
-    assert f"MPPI succeeds alone {(mppi > cloned).sum()} times, it alone {(cloned > mppi).sum()} times" in page
-    assert f"(alone {(true > cem).sum()} times, CEM in the model alone {(cem > true).sum()} times)" in page
+    assert f"only MPPI succeeds {(mppi > cloned).sum()} times, only the policy {(cloned > mppi).sum()} times" in page
+    assert f"(only it succeeds {(true > cem).sum()} times, only CEM in the model {(cem > true).sum()} times)" in page
 
 
 MODELS = {"first": "planning", "weighed": "planning_weighed", "grown, served": "planning_grown"}

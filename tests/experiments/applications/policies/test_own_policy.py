@@ -145,7 +145,7 @@ def test_the_page_says_what_came_from_starts_that_do_not_begin_at_the_goal():
     *first, last = (f"{np.mean([s for s, _ in np.array(found)[away]]):.2f}" for found in trials.values())
     page = " ".join((root / "docs/policies.md").read_text().split())
     assert f"for 4 frames; {(~away).sum()} starts have it there already" in page
-    assert f"From the {away.sum()} starts that begin elsewhere it is {', '.join(first)} and {last}." in page
+    assert f"From the {away.sum()} starts that begin elsewhere success is {', '.join(first)} and {last}." in page
 
 
 @pytest.mark.slow
