@@ -1,11 +1,13 @@
 """Best sizes for budgets of training FLOPs, on a law whose optimum is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from experiments.analysis.isoflop import fit_isoflop
 from experiments.report.fits import describe_fits, fit_rows
-from tests.experiments.analysis.curves import measured, power
+from tests.experiments.analysis.curves import measured, only, power
 
 SIZES, BUDGETS = np.geomspace(1e4, 1e7, 7), np.geomspace(6e10, 6e12, 5)
 
@@ -83,3 +85,75 @@ def test_few_sizes_or_budgets_out_of_reach_are_refused():
     rng = np.random.default_rng(3)
     assert "3 sizes" in fit_isoflop(runs(rng, sizes=np.geomspace(1e4, 1e6, 3)), draws=5).refused
     assert fit_isoflop(runs(rng), np.array([1e20]), draws=5).budgets[0].refused.startswith("0 sizes")
+
+
+def valley(of_budget, opens=0.1):
+    """Losses [runs] that are exact parabolas over log N, lowest (or, opening downwards, highest) at `of_budget` of C;
+    the two seeds of a run are off by as much to either side."""
+    log_loss = opens * (np.log(EXACT[:, 0]) - np.log(of_budget(EXACT[:, 1]))) ** 2
+    return np.exp(log_loss) * np.tile([0.9, 1.1], len(EXACT) // 2)
+
+
+GRID = np.geomspace(1e3, 1e5, 7)
+EXACT = np.repeat([(n, c) for n in GRID for c in GRID[[1, 3, 5]] ** 2], 2, axis=0)
+
+
+def fit_exactly(value, draw, budgets=GRID[[1, 3, 5]] ** 2):
+    """With the losses `draw` as the one bootstrap."""
+    return fit_isoflop(SimpleNamespace(x=EXACT, value=value, draw=lambda *_: draw[None]), budgets, draws=1)
+
+
+def test_values_come_from_the_losses_and_intervals_from_the_draws():
+    fit = fit_exactly(valley(lambda c: c**0.5), valley(lambda c: 1e4 * (c / 1e8) ** 0.7))
+    assert (fit.exponent.value, fit.exponent.low, fit.exponent.high) == pytest.approx((0.5, 0.7, 0.7))
+    assert fit.scale == pytest.approx(1)
+    for budget, first in zip(fit.budgets, (0, 1, 2), strict=True):  # the best size and two on either side, or five
+        assert budget.sizes == pytest.approx(GRID[first : first + 5])
+        assert (budget.best.value, budget.best.low) == pytest.approx(
+            (budget.flops**0.5, 1e4 * (budget.flops / 1e8) ** 0.7)
+        )
+        assert budget.loss == pytest.approx(np.exp(0.1 * np.log(budget.sizes / budget.flops**0.5) ** 2))
+
+
+@pytest.mark.parametrize(("top", "end"), [(9e4, 0), (1.1e3, -1)])
+def test_a_draw_that_opens_downwards_is_lowest_where_it_falls_to(top, end):
+    fit = fit_exactly(valley(lambda c: c**0.5), valley(lambda c: top, opens=-0.1))
+    for budget in fit.budgets:
+        assert budget.best.low == budget.best.high == pytest.approx(budget.sizes[end])
+        assert budget.doubt == "in 100% of the bootstraps the best size is at an end"
+
+
+def test_a_smallest_size_that_is_best_is_refused():
+    fit = fit_exactly(valley(lambda c: 1e3), valley(lambda c: 1e3))
+    assert all("the smallest size is best" in budget.refused for budget in fit.budgets)
+
+
+def test_a_parabola_that_is_lowest_beyond_the_sizes_is_refused():
+    """Of the losses themselves the last but one is the least."""
+    losses = dict(zip(GRID, [1.7, 1.3, 0.9, 0.64, 0.40, 0.16, 0.17], strict=True))
+    value = np.exp([losses[n] for n in EXACT[:, 0]])
+    fit = fit_exactly(value, value)
+    assert all("the largest size is best" in budget.refused for budget in fit.budgets)
+
+
+def test_two_minima_make_no_exponent():
+    value = valley(lambda c: c**0.5)
+    fit = fit_exactly(value, value, GRID[[1, 3]] ** 2)
+    assert fit.refused == "2 of 2 budgets have a minimum; the exponent needs at least 3" and fit.exponent is None
+
+
+def test_a_budget_may_lie_a_tenth_beyond_what_was_measured():
+    value = valley(lambda c: c**0.5)
+    low, high = GRID[1] ** 2, GRID[5] ** 2
+    fit = fit_exactly(value, value, np.array([0.85 * low, 0.95 * low, 1.05 * high, 1.15 * high]))
+    assert [len(budget.sizes) for budget in fit.budgets] == [0, 5, 5, 0]
+
+
+def test_where_one_size_has_one_seed_nothing_is_said_of_the_parabola():
+    sizes = np.geomspace(1e4, 1e6, 5)
+    x = np.array([(n, c) for n in sizes for c in BUDGETS])
+    off = np.log(x[:, 0] / 1e5)
+    points = measured(x, 3 * np.exp((0.02 + 0.06 * (off < 0)) * off**2), 3e-3, 3, np.random.default_rng(0))
+    fewer = only(points, (points.seed == 0) | (points.x[:, 0] != sizes[2]))
+    said = ["off the parabola" in b.remarks for p in (points, fewer) for b in fit_isoflop(p, BUDGETS, draws=50).budgets]
+    assert said == [True] * 5 + [False] * 5
