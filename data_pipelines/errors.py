@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-NAMED = 6
-"""Examples that are said one by one, the others by their number: of a dataset that was fetched in part every shard may
-be damage."""
+MAX_EXAMPLES = 6
+"""Cases that a message lists one by one; of the others it gives the number. Of a dataset that was fetched in part,
+every shard may be damaged."""
 
 ADVICE = re.compile(r"[.;] (?:Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
 """The end of a message that says how damage is left out."""

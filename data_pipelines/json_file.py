@@ -1,7 +1,7 @@
-"""JSON files of others: an object, or a message that says which file and what to do.
+"""Reading JSON files of unknown origin: a value, or a DataError that names the file and says what to do.
 
-Owns the bounds on what is read: parsing takes many times the memory of the text, so the size of a file
-and the number of its values are looked at first.
+Owns the limits: parsing takes many times the memory of the text, so the size of a file and the number of its
+values are checked first.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_pipelines.errors import DataError
-from data_pipelines.sources.rlds.location import read_start
+from data_pipelines.sources.rlds.location import read_head
 
 if TYPE_CHECKING:
     from upath import UPath
 
-MOST_BYTES = 16 * 2**20
-"""Of a file or a line that is parsed as a whole."""
+MAX_BYTES = 16 * 2**20
+"""Bytes of a JSON file, or of a line of a JSON Lines file."""
 
-MOST_VALUES = 400_000
-"""Commas, colons and opening brackets of a text: none stands for more than 100 bytes of memory."""
+MAX_VALUES = 400_000
+"""Commas, colons and opening brackets in a JSON text; each costs at most 100 bytes of memory when it is parsed."""
 
 STRUCTURE = (b",", b":", b"[", b"{")
 
@@ -36,7 +36,7 @@ def read_object(path: Path | UPath, *, if_missing: str, advice: str) -> dict[str
 
 
 def read_json(path: Path | UPath, *, if_missing: str, advice: str) -> Any:
-    """As `read_object`, of any kind of value."""
+    """As `read_object`, for a JSON value of any type."""
     return _parse(_read(path, if_missing), path, advice)
 
 
@@ -45,7 +45,7 @@ def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[in
     try:
         with open(path, "rb") as file:
             number = 0
-            while line := file.readline(MOST_BYTES + 1):
+            while line := file.readline(MAX_BYTES + 1):
                 number += 1
                 if line.isspace():
                     continue
@@ -61,16 +61,16 @@ def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[in
 
 def _read(path: Path | UPath, if_missing: str) -> bytes:
     try:
-        return read_start(path, MOST_BYTES + 1)
+        return read_head(path, MAX_BYTES + 1)
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {if_missing}") from None
 
 
 def _parse(text: bytes, where: object, advice: str) -> Any:
-    if len(text) > MOST_BYTES:
-        raise DataError(f"{where} has more than {MOST_BYTES:,} bytes, too many for what it should say. {advice}")
-    if len(text) > MOST_VALUES and sum(map(text.count, STRUCTURE)) > MOST_VALUES:
-        raise DataError(f"{where} has more than {MOST_VALUES:,} values, too many for what it should say. {advice}")
+    if len(text) > MAX_BYTES:
+        raise DataError(f"{where} has more than {MAX_BYTES:,} bytes, too many for what it should say. {advice}")
+    if len(text) > MAX_VALUES and sum(map(text.count, STRUCTURE)) > MAX_VALUES:
+        raise DataError(f"{where} has more than {MAX_VALUES:,} values, too many for what it should say. {advice}")
     try:
         return json.loads(text.decode("utf-8-sig"))
     except ValueError as error:

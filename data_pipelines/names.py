@@ -1,7 +1,7 @@
-"""Names and paths that files of others give, before they become places on this machine's disk.
+"""Validation of names and relative paths read from untrusted files, before they become paths on this machine.
 
-Owns what a dataset may be called and what a path inside a dataset may look like. Symbolic links are
-followed, as caches of downloads are made of them; only the text of a path is judged here.
+Owns what a dataset may be called and what a path inside a dataset may look like. Only the text of a path is
+checked: symbolic links are followed, as download caches consist of them.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-LONGEST_NAME = 128
-LONGEST_PATH = 1024
+MAX_NAME_LENGTH = 128
+MAX_PATH_LENGTH = 1024
 
-NAME_RULE = f"use up to {LONGEST_NAME} letters, digits, '_', '.' and '-', the first a letter, a digit or '_'"
+NAME_RULE = f"use up to {MAX_NAME_LENGTH} letters, digits, '_', '.' and '-', the first a letter, a digit or '_'"
 
-_NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")
+_NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{MAX_NAME_LENGTH - 1}}}")
 
 
 def is_name(text: object) -> bool:
@@ -27,23 +27,23 @@ def inside(root: Path, text: object) -> Path:
 
     Raises ValueError, saying why, for anything else.
     """
-    if not isinstance(text, str) or not 0 < len(text) <= LONGEST_PATH or not text.isprintable():
-        raise ValueError(f"{shown(text)} is no path of up to {LONGEST_PATH} printable characters")
+    if not isinstance(text, str) or not 0 < len(text) <= MAX_PATH_LENGTH or not text.isprintable():
+        raise ValueError(f"{shown(text)} is no path of up to {MAX_PATH_LENGTH} printable characters")
     if text[0] == "/" or "\\" in text or ".." in text.split("/"):
         raise ValueError(f"{shown(text)} leaves the dataset's directory")
     return root / text
 
 
 def brief(text: object) -> str:
-    """A message that may quote a file of others, of bounded length."""
+    """A message that may quote an untrusted file, cut to a bounded length."""
     text = str(text)
-    longest = 500
-    return text if len(text) <= longest else f"{text[:longest]} ..."
+    max_length = 500
+    return text if len(text) <= max_length else f"{text[:max_length]} ..."
 
 
-def shown(value: object, longest: int = 80) -> str:
-    """A value of others for a message: on one line, of bounded length."""
+def shown(value: object, max_length: int = 80) -> str:
+    """A value read from an untrusted file, for a message: on one line, of bounded length."""
     if isinstance(value, (list, dict)):  # of any depth
         return f"a {type(value).__name__} of {len(value):,}"
-    text = ascii(value[:longest]) if isinstance(value, (str, bytes)) else ascii(value)
-    return text if len(text) <= longest + 8 else f"{text[:longest]}..."
+    text = ascii(value[:max_length]) if isinstance(value, (str, bytes)) else ascii(value)
+    return text if len(text) <= max_length + 8 else f"{text[:max_length]}..."

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import NAMED, DataError, EpisodeError
+from data_pipelines.errors import MAX_EXAMPLES, DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
 from data_pipelines.inspection.sample import Shown, shrink
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
 INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
-WIDEST = 256
-"""Values of an action field at most; wider ones are embeddings or images in disguise. But `action` itself is what was
-done, however wide: a model's frame has the actions of its whole stride."""
+MAX_ACTION_WIDTH = 256
+"""Values of a field that is taken for an action by its name; wider ones are usually embeddings or flattened images. The
+field `action` itself may be wider: it may hold the actions of several steps."""
 
 NOT_READ = "no camera"
 """What pictures are called that are not read as such: LeRobot's depths and grey ones, robomimic's of other names."""
@@ -154,7 +154,7 @@ def inspect_dataset(
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
     if not any(f.per_step for f in fields):
-        there = ", ".join(f.key for f in fields[:NAMED])
+        there = ", ".join(f.key for f in fields[:MAX_EXAMPLES])
         raise DataError(
             f"{source.schema}: none of its fields ({there}) is one of a step, below `steps`: these are no episodes. Give a "
             "dataset in the layout of RLDS, or write this one so (docs/own_data.md, Writing RLDS)."
@@ -162,7 +162,7 @@ def inspect_dataset(
     cameras = {f.key: _CameraLog(f.key) for f in fields if f.per_step and f.kind == "image"}
     sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
     taken = {"action", *(field_slice(key)[0] for key in action_keys)}
-    numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= WIDEST)]
+    numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= MAX_ACTION_WIDTH)]
     rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
     steps, examples, prints, bytes_read = [], [], [], 0
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
@@ -192,8 +192,8 @@ def inspect_dataset(
         if len(examples) < shown:
             examples.append(_shown(int(source.numbers[i]), count, record, times, looked, actions))
     if not steps:
-        reasons = "; ".join(list(source.skipped)[:NAMED]) or "it is empty"
-        more = f"; {len(source.skipped) - NAMED:,} more" if len(source.skipped) > NAMED else ""
+        reasons = "; ".join(list(source.skipped)[:MAX_EXAMPLES]) or "it is empty"
+        more = f"; {len(source.skipped) - MAX_EXAMPLES:,} more" if len(source.skipped) > MAX_EXAMPLES else ""
         raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}{more}")
     facts = Facts(
         name=source.name,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from data_pipelines.errors import NAMED
+from data_pipelines.errors import MAX_EXAMPLES
 from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.duplicates import Fingerprint
 from data_pipelines.inspection.inspect import ActionFacts, Facts
@@ -56,9 +56,14 @@ def chosen_actions(facts: Facts, entry: DatasetSpec | None) -> list[ActionFacts]
 
 def _damaged(facts: Facts) -> list[Remark]:
     damaged = list(facts.damaged.items())
-    lost = [Remark("bad", "cannot be read", f"{count} of the episodes: {reason}") for reason, count in damaged[:NAMED]]
-    if rest := sum(count for _, count in damaged[NAMED:]):
-        lost.append(Remark("bad", "cannot be read", f"{rest:,} more episodes, for {len(damaged) - NAMED} more reasons"))
+    lost = [
+        Remark("bad", "cannot be read", f"{count} of the episodes: {reason}")
+        for reason, count in damaged[:MAX_EXAMPLES]
+    ]
+    if rest := sum(count for _, count in damaged[MAX_EXAMPLES:]):
+        lost.append(
+            Remark("bad", "cannot be read", f"{rest:,} more episodes, for {len(damaged) - MAX_EXAMPLES} more reasons")
+        )
     short = sum(n < 2 for n in facts.steps)
     if short:
         lost.append(Remark("doubt", "single steps", f"{short} episodes of {facts.sampled} have one step: no motion"))
@@ -193,8 +198,8 @@ def _duplicates(groups: Sequence[tuple[Fingerprint, ...]]) -> list[Remark]:
 
 
 def _listed(groups: Sequence[tuple[Fingerprint, ...]]) -> str:
-    words = [" = ".join(e.name for e in group[:4]) for group in groups[:NAMED]]
-    return ", ".join(words) + (", ..." if len(groups) > NAMED else "")
+    words = [" = ".join(e.name for e in group[:4]) for group in groups[:MAX_EXAMPLES]]
+    return ", ".join(words) + (", ..." if len(groups) > MAX_EXAMPLES else "")
 
 
 def _values(field: ActionFacts, which: Sequence[int]) -> str:

@@ -15,7 +15,7 @@ from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.sources.rlds.schema import field_slice
 from data_pipelines.sources.units import told_left_out
 from data_pipelines.windows.cut import Cut
-from data_pipelines.windows.windows import TO_TRAIN
+from data_pipelines.windows.windows import MIN_TRAIN_FRAMES
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 DEPTHS = re.compile(r"depth|dispar", re.IGNORECASE)
@@ -200,7 +200,7 @@ def _choose_angles(facts: Facts, keys: Sequence[str], dims: Sequence[int]) -> tu
 
 def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:
     """Windows of `frames` at `stride`, counted over the sampled episodes."""
-    cut, least = Cut(frames, stride, stride), min(TO_TRAIN, frames)
+    cut, least = Cut(frames, stride, stride), min(MIN_TRAIN_FRAMES, frames)
     steps = np.array(facts.steps)
     counts = cut.count(steps, least)
     whole, some, mean = int((steps >= cut.native).sum()), int((counts > 0).sum()), float(counts.mean())

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from hma_jax.runtime.locks import Held, Lock, exclusive
 
-FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0
-"""Seconds between two checks of what another process holds; from one to the next half as long again."""
+MIN_WAIT, MAX_WAIT = 0.1, 5.0
+"""Seconds between two checks whether another process has finished; each wait is 1.5 times the one before."""
 
 
 class Claim:
@@ -83,7 +83,7 @@ def living_claim(directory: Path) -> Held | None:
 
 def waiting_times() -> Iterator[float]:
     """Seconds to wait before the next check, for ever."""
-    pause = FIRST_WAIT
+    pause = MIN_WAIT
     while True:
         yield pause
-        pause = min(1.5 * pause, LONGEST_WAIT)
+        pause = min(1.5 * pause, MAX_WAIT)

@@ -14,8 +14,8 @@ from data_pipelines.registry.own import OWN
 from data_pipelines.registry.spec import DatasetSpec
 from hma_jax.config import ConfigError
 
-LISTED = 12
-"""Names that a message shows at most; `hma data list` shows all."""
+MAX_LISTED = 12
+"""Names in a message; `hma data list` shows all."""
 
 _registered: dict[str, DatasetSpec] = {}
 
@@ -52,7 +52,7 @@ def get_spec(name: str) -> DatasetSpec:
     if close:
         hint = f"did you mean {', '.join(close)}?"
     else:
-        hint = f"known: {', '.join([*table][:LISTED])}, ... (`hma data list` shows all)."
+        hint = f"known: {', '.join([*table][:MAX_LISTED])}, ... (`hma data list` shows all)."
     raise ConfigError(
         f"unknown dataset {name!r}; {hint} A new one is an entry: `hma data inspect DIR` suggests it, for "
         "data_pipelines/registry/own.py or for a file given with --registry."

@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import BinaryIO
 
-from data_pipelines.errors import NAMED, DataError
+from data_pipelines.errors import MAX_EXAMPLES, DataError
 from data_pipelines.publishing.claims import Claim, claim
 from data_pipelines.publishing.marks import FINGERPRINT, is_complete, read_metadata, shard_lengths
 from data_pipelines.simulators.embodiments import select
@@ -77,10 +77,10 @@ def made_before(root: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
     """
     found = {s.name: differences(s, root / s.name / VERSION, episodes, size, seed) for s in specs}
     lines = [f"{root / name / VERSION}: {'; '.join(how)}" for name, how in found.items() if how]
-    more = f" and {len(lines) - NAMED} more" if len(lines) > NAMED else ""
+    more = f" and {len(lines) - MAX_EXAMPLES} more" if len(lines) > MAX_EXAMPLES else ""
     require(
         not lines,
-        f"datasets are there that were made otherwise (there -> asked for): {', '.join(lines[:NAMED])}{more}. Nothing "
+        f"datasets are there that were made otherwise (there -> asked for): {', '.join(lines[:MAX_EXAMPLES])}{more}. Nothing "
         "was changed. Choose another directory, or give the settings that they were made with, or remove them to have them "
         "made again.",
     )

@@ -22,8 +22,8 @@ from data_pipelines.sources.parquet_rows import ADVICE, read_table
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 
-MOST = 10**9
-"""Of an episode's number, its length, a chunk, a task, or the values of a feature."""
+MAX_COUNT = 10**9
+"""Largest accepted episode index, episode length, chunk or task index, and number of values of a feature."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _place(root: Path, info: dict[str, Any], field: str, **place: Any) -> Path:
 def _check_info(info: dict[str, Any], path: Path) -> None:
     """Raises DataError for a field of info.json of the wrong kind."""
     fps, features = info["fps"], info["features"]
-    if type(fps) not in (int, float) or not 0 < fps <= MOST:
+    if type(fps) not in (int, float) or not 0 < fps <= MAX_COUNT:
         raise DataError(f"{path}: fps is {shown(fps)}, not a rate. {ADVICE}")
     for field in ("data_path", "video_path"):
         if not isinstance(info.get(field) or "", str):
@@ -179,7 +179,7 @@ def _check_info(info: dict[str, Any], path: Path) -> None:
         usable = isinstance(feature, dict) and isinstance(feature.get("dtype"), str) and name.isprintable()
         shape = feature.get("shape") if usable else None
         sizes = isinstance(shape, list) and all(type(n) is int and 0 <= n for n in shape)
-        if not sizes or math.prod(shape) > MOST:
+        if not sizes or math.prod(shape) > MAX_COUNT:
             raise DataError(f"{path}: feature {shown(name)} has no usable dtype and shape. {ADVICE}")
         for key in ("info", "video_info"):
             if not isinstance(feature.get(key) or {}, dict):
@@ -188,14 +188,14 @@ def _check_info(info: dict[str, Any], path: Path) -> None:
 
 def _count(row: Mapping[str, Any], name: str, where: str) -> int:
     value = row.get(name)
-    if type(value) is not int or not 0 <= value <= MOST:
+    if type(value) is not int or not 0 <= value <= MAX_COUNT:
         raise DataError(f"{where} has no usable {name!r} ({shown(value)}). {ADVICE}")
     return value
 
 
 def _seconds(row: Mapping[str, Any], name: str, where: str) -> float:
     value = row.get(name)
-    if type(value) not in (int, float) or not 0 <= value <= MOST:
+    if type(value) not in (int, float) or not 0 <= value <= MAX_COUNT:
         raise DataError(f"{where} has no usable {name!r} ({shown(value)}). {ADVICE}")
     return float(value)
 

@@ -1,9 +1,9 @@
-"""What the pages of a Parquet file say they hold, looked at before a library takes memory for it.
+"""Checks of a Parquet file's footer and page headers, made before a library allocates what they state.
 
-A page's header states its size unpacked, in up to 31 bits, and a reader takes that much memory at once: a damaged
-file of 800 bytes asked for 520 MB. Headers, and the file's footer that says where they lie, are structs of Thrift's
-compact protocol (https://github.com/apache/parquet-format). pyarrow shows the footer too, but ends the process
-over some that are damaged.
+A page header states the page's uncompressed size, in up to 31 bits, and readers allocate that much at once: a damaged
+file of 800 bytes made pyarrow allocate 520 MB. Page headers and the footer, which lists their offsets, are structs of
+Thrift's compact protocol (https://github.com/apache/parquet-format). pyarrow can read the footer too, but some
+damaged ones abort the process.
 """
 
 from __future__ import annotations
@@ -12,55 +12,63 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-MOST_UNPACKED = 32 * 2**20
-"""Bytes of any page, unpacked. Writers aim at 1 MB, but look after a thousand rows only."""
+MAX_UNCOMPRESSED = 32 * 2**20
+"""Bytes of any page, uncompressed. Writers aim at 1 MB, but check the size after every thousand rows only."""
 
-MOST_TIMES = 8
-"""As many times the bytes that a page takes in the file, it may have too: a thousand images are hardly packed."""
+MAX_COMPRESSION_RATIO = 8
+"""A page may exceed MAX_UNCOMPRESSED up to this ratio to its compressed size: a thousand images hardly compress."""
 
-MOST_HEADER = 64 * 1024
-"""Bytes; a header may hold the smallest and the largest value of its page."""
+MAX_HEADER = 64 * 1024
+"""Bytes of a page header, which may hold the smallest and the largest value of its page."""
 
-MAGIC, END = b"PAR1", 8
-"""A file ends with the footer's length, in four bytes, and the magic."""
+MAGIC, FOOTER_TAIL = b"PAR1", 8
+"""The last 8 bytes of a file: the footer's length, in four bytes, and the magic."""
 
-# Fields of FileMetaData, RowGroup, ColumnChunk, ColumnMetaData and PageHeader.
+# Thrift field ids in FileMetaData, RowGroup, ColumnChunk, ColumnMetaData and PageHeader.
 ROW_GROUPS, COLUMNS, ROWS, META = 4, 1, 3, 3
-PLACE, CHUNK_SIZE, DATA_AT, DICTIONARY_AT, UNPACKED, PACKED = 3, 7, 9, 11, 2, 3
+PATH_IN_SCHEMA, COMPRESSED_CHUNK_SIZE, DATA_PAGE_OFFSET, DICTIONARY_PAGE_OFFSET, UNCOMPRESSED_SIZE, COMPRESSED_SIZE = (
+    3,
+    7,
+    9,
+    11,
+    2,
+    3,
+)
 
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
-DEEPEST = 12
+MAX_DEPTH = 12
 
 
 Chunk = tuple[int, int]
-"""First byte and bytes of what a group of rows holds of a column, or of one field of it."""
+"""A column chunk, what a row group holds of one leaf column: its first byte and its length in bytes."""
 
 
 @dataclass(frozen=True)
 class RowGroup:
-    """Rows that lie together: how many, and where each column of theirs does."""
+    """A row group: its number of rows, and the chunks of each top-level column."""
 
     rows: int
     columns: dict[str, list[Chunk]]
 
 
 def read_groups(file: BinaryIO) -> list[RowGroup]:
-    """What the footer says. Raises ValueError for one that is damaged."""
+    """The row groups that the footer lists. Raises ValueError for a damaged footer."""
     groups = []
     for group in _structs(_read_footer(file), ROW_GROUPS):
         columns: dict[str, list[Chunk]] = {}
         for column in _structs(group, COLUMNS):
             meta = column.get(META)
             if not isinstance(meta, dict):
-                raise ValueError("the footer says of a column nothing")
+                raise ValueError("the footer does not describe a column")
             columns.setdefault(_column(meta), []).append(_chunk(meta))
         groups.append(RowGroup(_number(group, ROWS), columns))
     return groups
 
 
 def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
-    """Raises ValueError for a page of `chunks`, by default of all, that is damaged, lies outside of its column or of
-    the file, or says that it holds more than MOST_UNPACKED bytes and MOST_TIMES its own."""
+    """Raises ValueError for a page of `chunks` (default: of all) whose header is damaged, that reaches out of its chunk
+    or the file, or that states an uncompressed size above both MAX_UNCOMPRESSED and MAX_COMPRESSION_RATIO times its
+    compressed size."""
     if chunks is None:
         chunks = [chunk for group in read_groups(file) for column in group.columns.values() for chunk in column]
     whole = file.seek(0, 2)
@@ -70,39 +78,39 @@ def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
             raise ValueError(f"a column reaches to byte {end}, the file has {whole}")
         while at < end:
             file.seek(at)
-            header = _Compact(file.read(min(MOST_HEADER, end - at)))
+            header = _Compact(file.read(min(MAX_HEADER, end - at)))
             sizes = header.read_struct()
-            unpacked, packed = _number(sizes, UNPACKED), _number(sizes, PACKED)
-            most = max(MOST_UNPACKED, MOST_TIMES * packed)
-            after = at + header.at + packed
-            if packed < 0 or after > end:
-                raise ValueError(f"a page of {packed} bytes reaches out of its column, which ends at byte {end}")
-            if not 0 <= unpacked <= most:
-                raise ValueError(f"the page at byte {at} says that it holds {unpacked} bytes, {most} are the most")
+            uncompressed, compressed = _number(sizes, UNCOMPRESSED_SIZE), _number(sizes, COMPRESSED_SIZE)
+            limit = max(MAX_UNCOMPRESSED, MAX_COMPRESSION_RATIO * compressed)
+            after = at + header.at + compressed
+            if compressed < 0 or after > end:
+                raise ValueError(f"a page of {compressed} bytes reaches out of its column, which ends at byte {end}")
+            if not 0 <= uncompressed <= limit:
+                raise ValueError(f"the page at byte {at} says that it holds {uncompressed} bytes, {limit} are the most")
             at = after
 
 
 def _read_footer(file: BinaryIO) -> dict[int, Any]:
     size = file.seek(0, 2)
-    file.seek(max(size - END, 0))
-    end = file.read(END)
+    file.seek(max(size - FOOTER_TAIL, 0))
+    end = file.read(FOOTER_TAIL)
     length = int.from_bytes(end[:4], "little")
-    if end[4:] != MAGIC or length > size - END - len(MAGIC):
+    if end[4:] != MAGIC or length > size - FOOTER_TAIL - len(MAGIC):
         raise ValueError("it does not end as a Parquet file does")
-    file.seek(size - END - length)
+    file.seek(size - FOOTER_TAIL - length)
     return _Compact(file.read(length)).read_struct()
 
 
 def _column(meta: dict[int, Any]) -> str:
-    """The column that a part of it, a field of a struct or what a list holds, belongs to; "" if it does not say."""
-    place = meta.get(PLACE)
+    """The top-level column of a leaf column, such as a field of a struct or the items of a list; "" if unknown."""
+    place = meta.get(PATH_IN_SCHEMA)
     first = place[0] if isinstance(place, list) and place else b""
     return first.decode(errors="replace") if isinstance(first, bytes) else ""
 
 
 def _chunk(meta: dict[int, Any]) -> Chunk:
-    starts = [at for at in (_number(meta, DATA_AT), _number(meta, DICTIONARY_AT)) if at > 0]
-    return min(starts, default=0), _number(meta, CHUNK_SIZE)
+    starts = [at for at in (_number(meta, DATA_PAGE_OFFSET), _number(meta, DICTIONARY_PAGE_OFFSET)) if at > 0]
+    return min(starts, default=0), _number(meta, COMPRESSED_CHUNK_SIZE)
 
 
 def _structs(values: dict[int, Any], field: int) -> list[dict[int, Any]]:
@@ -113,30 +121,30 @@ def _structs(values: dict[int, Any], field: int) -> list[dict[int, Any]]:
 
 
 def _number(values: dict[int, Any], field: int) -> int:
-    """A whole number, -1 where there is none."""
+    """An integer field; -1 if it is absent."""
     found = values.get(field)
     return found if isinstance(found, int) else -1
 
 
 class _Compact:
-    """Thrift's compact protocol: values from bytes, and in `at` how many were read. Raises ValueError."""
+    """A reader of Thrift's compact protocol; `at` is its position in the bytes. Raises ValueError."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
 
     def read_struct(self, depth: int = 0) -> dict[int, Any]:
-        """Field -> value; of truth values None."""
+        """Field id -> value; booleans, which nothing here needs, become None."""
         fields: dict[int, Any] = {}
         field = 0
         while (byte := self._byte()) != 0:
             delta, kind = byte >> 4, byte & 15
             field = field + delta if delta else self._integer()
-            # A field's own byte says whether it is true.
+            # A boolean field has no bytes of its own: its type says true or false.
             fields[field] = None if kind in (TRUE, FALSE) else self._read(kind, depth)
         return fields
 
     def _read(self, kind: int, depth: int) -> Any:
-        if depth > DEEPEST:
+        if depth > MAX_DEPTH:
             raise ValueError("it is nested too deep")
         if kind in (I16, I32, I64):
             return self._integer()

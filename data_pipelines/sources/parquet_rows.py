@@ -1,7 +1,7 @@
-"""Rows of Parquet files: of the columns and groups of rows that hold what is asked for, and of no others.
+"""Rows of Parquet files, of which only the columns and row groups are read that hold what is asked for.
 
-Owns what is kept in memory of them. A group of rows is the least that can be read of a column; writers make one per
-episode, per hundred images or per file.
+Owns the cache of decoded columns. A row group is the smallest part of a column that can be read; writers make one
+per episode, per hundred images or per file.
 """
 
 from __future__ import annotations

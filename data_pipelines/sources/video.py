@@ -50,20 +50,20 @@ def stored_jpeg(data: bytes, short_side: int | None, where: str) -> bytes:
     return data if small is image and data.startswith(b"\xff\xd8\xff") else encode_jpeg(small)
 
 
-LEAST_BYTES = 4
-"""Of a frame in a video file: its size, in the file's own index."""
+MIN_FRAME_BYTES = 4
+"""A frame takes at least this many bytes of a video file: the entry for its size in the file's index."""
 
 
 class Video:
-    """An opened video. `rate` in frames per second, `width` and `height` in pixels; `most_frames` is more
-    than it can have, whatever its header claims."""
+    """An opened video. `rate` in frames per second, `width` and `height` in pixels; `max_frames` is an
+    upper bound on its frames that follows from the file's size, whatever its header claims."""
 
     def __init__(self, path: Path, container: Any):
         self._path, self._container = path, container
         self._stream = container.streams.video[0]
         self._stream.thread_type = "AUTO"
         self._start = self._stream.start_time or 0
-        self.most_frames = path.stat().st_size // LEAST_BYTES
+        self.max_frames = path.stat().st_size // MIN_FRAME_BYTES
         self.rate = float(self._stream.average_rate or self._stream.guessed_rate or 0)
         self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
         self._coming: Iterator[tuple[float, Any]] | None = None

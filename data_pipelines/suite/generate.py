@@ -27,10 +27,10 @@ from hma_jax.config import ConfigError, require
 GENERATOR = 8
 """Raise it when simulation, rendering or encoding change: older datasets are then remade."""
 
-FEWEST = 8
-"""Training episodes of the smallest datasets, at any scale."""
+MIN_EPISODES = 8
+"""Training episodes of the smallest datasets, at any scale, unless `fewest` says otherwise."""
 
-MOST = 500
+MAX_EPISODES = 500
 """Training episodes of the largest dataset at scale 1."""
 
 VALIDATION = 24
@@ -50,15 +50,15 @@ def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
     return tuple(known[n] for n in names)
 
 
-def episode_count(spec: EmbodimentSpec, scale: float, fewest: int = FEWEST) -> int:
+def episode_count(spec: EmbodimentSpec, scale: float, fewest: int = MIN_EPISODES) -> int:
     """Training episodes at a scale: the largest dataset has `scale` times as many as at 1, the
     smallest always `fewest`, and what lies between is stretched evenly in the logarithm."""
-    stretch = max(math.log(scale * MOST / fewest) / math.log(MOST / FEWEST), 0.0)
-    return round(fewest * (spec.episodes / FEWEST) ** stretch)
+    stretch = max(math.log(scale * MAX_EPISODES / fewest) / math.log(MAX_EPISODES / MIN_EPISODES), 0.0)
+    return round(fewest * (spec.episodes / MIN_EPISODES) ** stretch)
 
 
 def fingerprint(
-    spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION, fewest: int = FEWEST
+    spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION, fewest: int = MIN_EPISODES
 ) -> str:
     """Hash of everything the bytes of this dataset depend on."""
     text = repr((GENERATOR, spec, episode_count(spec, scale, fewest), validation, seed))
@@ -71,7 +71,7 @@ def generate_suite(
     scale: float = 1.0,
     seed: int = 0,
     validation: int = VALIDATION,
-    fewest: int = FEWEST,
+    fewest: int = MIN_EPISODES,
     names: Sequence[str] | None = None,
     workers: int = 1,
     progress: Progress | None = None,

@@ -20,7 +20,7 @@ IMAGE_KEY = "image"
 IMAGE_SIZE = 64
 """Pixels along each side of a recorded frame. Studies on two cores see them at 32."""
 
-LONGEST_SECONDS = 60.0
+MAX_SECONDS = 60.0
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class EmbodimentSpec:
         joints = sorted(j for c in self.controls for j in c.joints)
         require(joints == list(range(self.body.size)), f"{name}: controls must move every joint once, got {joints}")
         require(
-            1.0 <= self.seconds[0] <= self.seconds[1] <= LONGEST_SECONDS,
-            f"{name}: seconds must be (shortest, longest) within 1..{LONGEST_SECONDS:g}, got {self.seconds}",
+            1.0 <= self.seconds[0] <= self.seconds[1] <= MAX_SECONDS,
+            f"{name}: seconds must be (shortest, longest) within 1..{MAX_SECONDS:g}, got {self.seconds}",
         )
         require(self.delay >= 0, f"{name}: delay must not be negative, got {self.delay}")
 

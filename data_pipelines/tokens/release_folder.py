@@ -26,8 +26,8 @@ from hma_jax.config import ConfigError
 
 ADVICE = "Fetch the folder again."
 DTYPES = ("uint8", "uint16", "uint32", "int32", "float16", "float32")
-MOST = 10**9
-"""Of every number in metadata.json."""
+MAX_COUNT = 10**9
+"""Largest accepted number in metadata.json."""
 FACTOR_VOCAB = 512
 """The released models read an id of 2^18 as two digits of this base."""
 
@@ -98,7 +98,7 @@ def _metadata(path: Path) -> dict[str, Any]:
         value = meta.get(field)
         if value is None and field in ("latent_channels", "action_dim"):
             continue
-        if type(value) is not int or not 1 <= value <= MOST:
+        if type(value) is not int or not 1 <= value <= MAX_COUNT:
             raise DataError(f"{path}: {field} is {shown(value)}, not a positive number. {ADVICE}")
     if meta.get("token_dtype", "uint32") not in DTYPES:
         raise DataError(f"{path}: token_dtype is {shown(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}")

@@ -25,8 +25,8 @@ ROWS = 4096
 QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
 """Those that are kept."""
 
-MOST_STEPS = np.uint64(2**32)
-"""Of an episode, so that every (episode, step) has a number of its own."""
+MAX_STEPS = np.uint64(2**32)
+"""Steps of an episode, so that episode * MAX_STEPS + step is unique."""
 
 SEED = stream_seed("quantiles")
 
@@ -119,7 +119,7 @@ def _hashes(episodes: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """uint64 of every row of `episodes`, which have so many `steps`, one after the other."""
     first = np.cumsum(steps) - steps
     step = np.arange(int(steps.sum()), dtype=np.uint64) - np.repeat(first.astype(np.uint64), steps)
-    return hash64(np.repeat(episodes.astype(np.uint64), steps) * MOST_STEPS + step, SEED)
+    return hash64(np.repeat(episodes.astype(np.uint64), steps) * MAX_STEPS + step, SEED)
 
 
 def sampled_episodes(episodes: np.ndarray, steps: np.ndarray, limit: int = ROWS) -> np.ndarray:

@@ -29,7 +29,7 @@ _File = tuple[str, str, int]  # dataset, split, part
 
 READ_OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 
-MOST_OPEN = 512
+MAX_OPEN_FILES = 512
 """Files kept open. Opening one again takes about as long as two windows: mixed from 40 datasets of
 one part each, 72 thousand frames are read per second on one core, of 25 parts each 44 thousand.
 """
@@ -170,7 +170,7 @@ class TokenStore:
             reader = self._readers.get(key)
             if reader is None:
                 reader = self._readers[key] = self._open(name, split, part)
-                if len(self._readers) > MOST_OPEN:
+                if len(self._readers) > MAX_OPEN_FILES:
                     self._readers.popitem(last=False)  # closed when the last thread is done with it
             else:
                 self._readers.move_to_end(key)

@@ -15,7 +15,7 @@ import numpy as np
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.cut import Cut
-from data_pipelines.windows.windows import TO_TRAIN, WindowSet, train_windows, val_windows
+from data_pipelines.windows.windows import MIN_TRAIN_FRAMES, WindowSet, train_windows, val_windows
 
 KEPT = 512
 """Episodes whose actions are kept in memory."""
@@ -76,7 +76,9 @@ class OtherWindows:
         """The windows of a split, and the real frames of each."""
         if (name, split) not in self._sets:
             if split == "val":
-                found = val_windows(self._store, name, self._frames, min(TO_TRAIN, self._frames), rate=self._rate)
+                found = val_windows(
+                    self._store, name, self._frames, min(MIN_TRAIN_FRAMES, self._frames), rate=self._rate
+                )
             else:
                 found = train_windows(self._store, name, self._frames, rate=self._rate)
             steps = np.asarray(self._store.manifest(name).split(split).steps, np.int64)[found.episode_idx]

@@ -3,7 +3,7 @@
 Owns which windows exist; how one is cut from an episode is in `cut`. Reads no record to count them.
 
 In an episode that is long enough every start counts whose T frames all have whole chunks. A shorter one
-gives padded windows of as many real frames as it has: at least `TO_TRAIN` to train on, the prompt and one
+gives padded windows of as many real frames as it has: at least `MIN_TRAIN_FRAMES` to train on, the prompt and one
 more to judge.
 DIFFERS: the release has no padded windows, accepts windows whose last chunk runs up to stride - 1 actions
 past the end of the episode, into the next one, drops the last window of a dataset, and keeps
@@ -26,8 +26,8 @@ from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.cut import Cut, make_cut
 from hma_jax.config import require
 
-TO_TRAIN = 2
-"""Real frames of a window to train on, at least: one to see and one to predict."""
+MIN_TRAIN_FRAMES = 2
+"""Real frames of a training window: one to see and one to predict."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
             f"there is no {split} episode to cut windows of. {reasons}. Of a single episode none can be held out: add more. "
             "Of several, store.val_fraction, store.min_val and store.max_val say how many are, of all that there should be."
         )
-    shorter = " or a shorter prompt" if any(s.least > TO_TRAIN for s in sets.values()) else ""
+    shorter = " or a shorter prompt" if any(s.least > MIN_TRAIN_FRAMES for s in sets.values()) else ""
     raise DataError(
         f"no {split} episode is long enough for a window. {reasons}. Use a higher rate of frames{shorter}, or datasets "
         "with more or longer episodes."
@@ -118,7 +118,7 @@ def train_windows(
     subset_seed: int = 0,
     *,
     rate: float | None = FRAME_RATE,
-    least: int = TO_TRAIN,
+    least: int = MIN_TRAIN_FRAMES,
 ) -> WindowSet:
     """Windows of the train split, optionally of `max_trajectories` episodes chosen by hash.
 

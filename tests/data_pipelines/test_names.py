@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from data_pipelines.names import LONGEST_NAME, inside, is_name, shown
+from data_pipelines.names import MAX_NAME_LENGTH, inside, is_name, shown
 from data_pipelines.registry import DatasetSpec, all_specs
 from data_pipelines.registry.toml_file import load_entries
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import make_spec
 
-GOOD = ["toy", "bridge_dataset", "fractal20220817_data", "_x", "0", "A.b-c", "x" * LONGEST_NAME]
+GOOD = ["toy", "bridge_dataset", "fractal20220817_data", "_x", "0", "A.b-c", "x" * MAX_NAME_LENGTH]
 BAD = [
     "",
     ".",
@@ -27,7 +27,7 @@ BAD = [
     "-rf",
     "ä",
     "\x00",
-    "x" * (LONGEST_NAME + 1),
+    "x" * (MAX_NAME_LENGTH + 1),
 ]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.json_file import MOST_BYTES, read_json
+from data_pipelines.json_file import MAX_BYTES, read_json
 from data_pipelines.sources.rlds.example import BATCH, encode_example, parse_example
 from tests.stress.fuzz import EXTRA_MEMORY, Checker, fuzz
 from tests.stress.targets import TARGETS, make_target
@@ -104,7 +104,7 @@ def test_example_takes_memory_in_proportion(name):
 @pytest.mark.parametrize(
     "unit, size",
     [(u, 2**19) for u in (b"[],", b"{},", b'{"":0},', b"0,", b"1.5,", b'"",', b'"ab",', b"[[[]]],")]
-    + [(u, MOST_BYTES - 10) for u in (b"[],", b'"0123456789abcdefghijklmnopqrstuvwxyz01234567",')],
+    + [(u, MAX_BYTES - 10) for u in (b"[],", b'"0123456789abcdefghijklmnopqrstuvwxyz01234567",')],
 )
 def test_json_takes_memory_in_proportion(tmp_path, unit, size):
     path = tmp_path / "features.json"
@@ -121,9 +121,9 @@ def test_json_takes_memory_in_proportion(tmp_path, unit, size):
 
 def test_text_of_wide_characters_takes_memory_in_proportion(tmp_path):
     path = tmp_path / "features.json"
-    path.write_bytes(b'["' + "\N{GRINNING FACE}".encode() + b"a" * (MOST_BYTES - 10) + b'"]')
+    path.write_bytes(b'["' + "\N{GRINNING FACE}".encode() + b"a" * (MAX_BYTES - 10) + b'"]')
     peak = peak_of(lambda: read_json(path, if_missing="", advice=""))
-    assert peak < EXTRA_MEMORY + 10 * MOST_BYTES
+    assert peak < EXTRA_MEMORY + 10 * MAX_BYTES
 
 
 @pytest.mark.parametrize("count", [1, 9, BATCH - 1, BATCH, BATCH + 1, 3 * BATCH])

@@ -123,7 +123,7 @@ class Ego4dSource:
                 row = self._centres(frame, size, f"{where}, frame {frame.get('frame_number')}")
                 if row is not None:
                     number = self._field(frame, "frame_number", where)
-                    if type(number) is not int or not 0 <= number < video.most_frames:
+                    if type(number) is not int or not 0 <= number < video.max_frames:
                         raise UnitError(f"{self.path}: {where} has frame_number {shown(number)}. {ADVICE}")
                     found.setdefault(number, row)
         numbers = sorted(found)

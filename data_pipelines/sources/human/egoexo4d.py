@@ -84,9 +84,9 @@ class EgoExo4dSource:
             if not len(numbers):
                 yield LeftOut(NONE)
                 return
-            if numbers[-1] >= video.most_frames:
+            if numbers[-1] >= video.max_frames:
                 raise UnitError(
-                    f"{self._pose(take)}: frame {numbers[-1]}, but {path} has {video.most_frames} at most. {ADVICE}"
+                    f"{self._pose(take)}: frame {numbers[-1]}, but {path} has {video.max_frames} at most. {ADVICE}"
                 )
             rows = np.full((int(numbers[-1]) + 1, 4), np.nan)
             rows[numbers] = positions

@@ -29,8 +29,8 @@ OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 ENDS = 65536
 """Bytes at each end of a file that stand for its contents: the last hold the place of every record."""
 
-OPEN_READERS = 128
-"""Files that stay open between reads."""
+MAX_OPEN_FILES = 128
+"""Files that are kept open between reads."""
 
 
 def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
@@ -69,7 +69,7 @@ def _reader(path: Path):
     return _opened(path, (status.st_size, status.st_mtime_ns))
 
 
-@functools.lru_cache(OPEN_READERS)
+@functools.lru_cache(MAX_OPEN_FILES)
 def _opened(path: Path, mark: tuple[int, int]):
     """One reader per version of a file."""
     from array_record.python import array_record_module

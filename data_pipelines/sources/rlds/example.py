@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 Feature = np.ndarray | Sequence[bytes]
 
-MOST_FEATURES = 10_000
-"""Of a record: a feature of a few bytes takes hundreds in memory."""
+MAX_FEATURES = 10_000
+"""Features of a record: one of a few bytes in the file takes hundreds in memory."""
 
 BATCH = 2**16
 """Bytes of varints that are decoded at once, for which fifty times as much is needed."""
@@ -95,8 +95,8 @@ def parse_example(
                         value = (a, b)
                 if wanted is None or key in wanted:
                     found[key.decode()] = _parse_feature(data, *value, lazy)
-                    if len(found) > MOST_FEATURES:
-                        raise ValueError(f"more than {MOST_FEATURES:,} features")
+                    if len(found) > MAX_FEATURES:
+                        raise ValueError(f"more than {MAX_FEATURES:,} features")
     except (IndexError, ValueError, struct.error) as error:
         raise DataError(f"the record is not a tf.train.Example ({error})") from error
     return found

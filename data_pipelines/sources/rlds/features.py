@@ -15,10 +15,10 @@ from typing import Any
 
 from data_pipelines.names import shown
 
-MOST_FIELDS = 4096
-DEEPEST = 32
-LONGEST_KEY = 512
-MOST_NUMBERS = 2**28
+MAX_FIELDS = 4096
+MAX_DEPTH = 32
+MAX_KEY_LENGTH = 512
+MAX_NUMBERS = 2**28
 """Values of one field in one step: 1 GiB of float32."""
 
 NUMBERS = ("bool", "float16", "float32", "float64") + tuple(
@@ -63,20 +63,20 @@ def parse_features(schema: Any) -> dict[str, FlatFeature]:
     found: dict[str, FlatFeature] = {}
     for key, feature in _fields(schema, "", 0):
         found[key] = feature
-        if len(found) > MOST_FIELDS:
-            raise ValueError(f"more than {MOST_FIELDS} fields")
+        if len(found) > MAX_FIELDS:
+            raise ValueError(f"more than {MAX_FIELDS} fields")
     return found
 
 
 def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[tuple[str, FlatFeature]]:
     """Of `node`; `listed`: it lies in a list, as of the steps of an episode."""
-    if depth > DEEPEST:
-        raise ValueError(f"{_field(key)}: fields are nested more than {DEEPEST} deep")
+    if depth > MAX_DEPTH:
+        raise ValueError(f"{_field(key)}: fields are nested more than {MAX_DEPTH} deep")
     form, content = _content(node, key)
     if form == "featuresDict":
         children = content if "features" not in content else _mapping(content["features"], key)
         for name, child in children.items():
-            if not name or not name.isprintable() or len(key) + len(name) > LONGEST_KEY:
+            if not name or not name.isprintable() or len(key) + len(name) > MAX_KEY_LENGTH:
                 raise ValueError(f"{_field(key)}: a field cannot be called {shown(name)}")
             yield from _fields(child, f"{key}/{name}" if key else name, depth + 1, listed)
     elif form == "sequence":
@@ -84,7 +84,7 @@ def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[t
         yield from ((k, _in_lists(feature)) for k, feature in inner) if listed else inner
     elif form == "translation":
         for language in _list(content.get("languages", []), key):
-            yield f"{key}/{str(language)[:LONGEST_KEY]}", FlatFeature(image=False, size=0)
+            yield f"{key}/{str(language)[:MAX_KEY_LENGTH]}", FlatFeature(image=False, size=0)
     elif form in ("image", "video"):
         shape = _shape(content, key) or (None, None, 3)
         image = FlatFeature(True, 0, shape[-3:], _dtype(content) or "uint8")
@@ -161,7 +161,7 @@ def _shape(content: Mapping[str, Any], key: str) -> tuple[int | None, ...]:
     for size in _list(shape, key):
         if isinstance(size, str) and len(size) <= 12 and size.isascii() and size.removeprefix("-").isdecimal():
             size = int(size)  # the JSON of a message has 64-bit numbers as strings
-        if size is not None and (type(size) is not int or not -1 <= size <= MOST_NUMBERS):
+        if size is not None and (type(size) is not int or not -1 <= size <= MAX_NUMBERS):
             raise ValueError(f"{_field(key)}: {shown(size)} cannot be one of its sizes")
         sizes.append(None if size == -1 else size)
     if len(sizes) > 8:
@@ -185,6 +185,6 @@ def _numbers(shape: tuple[int | None, ...], dtype: str, encoding: str, key: str)
     if dtype not in NUMBERS or None in shape:
         return FlatFeature(False, 0, shape, dtype if dtype in NUMBERS else "string")
     size = math.prod(shape)
-    if size > MOST_NUMBERS:
+    if size > MAX_NUMBERS:
         raise ValueError(f"{_field(key)}: {list(shape)} makes {size:,} numbers in one step")
     return FlatFeature(False, 0 if encoding else size, shape, dtype, encoding)

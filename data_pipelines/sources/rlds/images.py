@@ -14,8 +14,8 @@ from PIL import Image, UnidentifiedImageError
 
 JPEG_MAGIC, PNG_MAGIC = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
-MOST_PIXELS = 2**25
-"""Of an image that is decoded, more than 8K video has; a few bytes can claim billions."""
+MAX_PIXELS = 2**25
+"""Pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can claim billions."""
 
 
 def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
@@ -24,7 +24,7 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     The fast DCT is what TensorFlow's decoder uses by default, so pixels equal those that
     RLDS pipelines built on TensorFlow see. With `at_least`, a JPEG image may come smaller, as its
     coefficients allow, but no side shorter than that: what is resized anyway costs half as much.
-    Raises ValueError if the bytes are no image, one of more than MOST_PIXELS, or one of depths.
+    Raises ValueError if the bytes are no image, one of more than MAX_PIXELS, or one of depths.
     """
     if data.startswith(JPEG_MAGIC):
         _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
@@ -43,10 +43,10 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
 
 
 def _check_pixels(data: bytes, height: int, width: int) -> None:
-    if height * width > MOST_PIXELS:
+    if height * width > MAX_PIXELS:
         raise ValueError(
             f"{len(data)} bytes of an image too large to be a frame "
-            f"({height * width:,} pixels, more than {MOST_PIXELS:,})"
+            f"({height * width:,} pixels, more than {MAX_PIXELS:,})"
         )
 
 

@@ -45,8 +45,8 @@ FAILURES = frozenset(
 LASTING = (PermissionError, IsADirectoryError, NotADirectoryError)
 """Failures that no waiting mends."""
 
-OPEN_FILES = 128
-"""Files that `OpenFiles` holds by default: half of what the strictest system allows a process."""
+MAX_OPEN_FILES = 128
+"""Files that `OpenFiles` keeps open by default: half of the smallest usual limit of open files per process."""
 
 
 class Ranges(Protocol):
@@ -112,17 +112,17 @@ def open_ranges(location: Location) -> Iterator[Ranges]:
         file.close()
 
 
-def read_start(location: Location, most: int) -> bytes:
-    """Up to `most` bytes from a file's beginning on.
+def read_head(location: Location, max_bytes: int) -> bytes:
+    """The first bytes of a file, up to `max_bytes`.
 
     Raises FileNotFoundError if there is none, UnreachableError where the disk or the store fails.
     """
     if is_remote(location):
-        return _RemoteFile(location).read(0, most)
+        return _RemoteFile(location).read(0, max_bytes)
 
     def read() -> bytes:
         with open(location, "rb") as file:
-            return file.read(most)
+            return file.read(max_bytes)
 
     return retried(location, read)
 
@@ -134,7 +134,7 @@ class OpenFiles:
     way to another is closed when the last thread has read from it. Pickles as an empty one.
     """
 
-    def __init__(self, limit: int = OPEN_FILES):
+    def __init__(self, limit: int = MAX_OPEN_FILES):
         self._limit = limit
         self._open = functools.lru_cache(limit)(DiskFile)
 

@@ -26,8 +26,8 @@ INFO, FEATURES = "dataset_info.json", "features.json"
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 """How tfds calls shards where dataset_info.json does not say."""
 
-MOST_SHARDS = 2**15
-"""Of one split."""
+MAX_SHARDS = 2**15
+"""Shards of one split."""
 
 ADVICE = "Restore it as tfds wrote it."
 
@@ -187,8 +187,8 @@ def _split(values: Any) -> SplitInfo:
     if not isinstance(template, str) or len(template) > 256:
         raise ValueError(f"split {name!r}: filepathTemplate is {shown(template)}")
     lengths = _list(values.get("shardLengths", values.get("shard_lengths", [])), f"shardLengths of {name!r}")
-    if len(lengths) > MOST_SHARDS:
-        raise ValueError(f"split {name!r}: {len(lengths):,} shards, more than {MOST_SHARDS:,}")
+    if len(lengths) > MAX_SHARDS:
+        raise ValueError(f"split {name!r}: {len(lengths):,} shards, more than {MAX_SHARDS:,}")
     size = _count(values.get("numBytes", values.get("num_bytes", 0)), f"numBytes of {name!r}")
     return SplitInfo(name, tuple(_count(n, f"shardLengths of {name!r}") for n in lengths), size, template)
 

@@ -8,7 +8,7 @@ import pytest
 from pyarrow import parquet
 
 from data_pipelines.sources import parquet_pages
-from data_pipelines.sources.parquet_pages import MOST_UNPACKED, check_pages
+from data_pipelines.sources.parquet_pages import MAX_UNCOMPRESSED, check_pages
 
 
 def first_page(path) -> int:
@@ -58,13 +58,13 @@ def test_a_page_that_lies_about_its_size_is_refused(table):
     header = b"\x15\x00\x15\xfe\xff\xff\xff\x0f\x15\x02\x00"  # of kind 0, 2**31 - 1 bytes unpacked, one packed
     data[start : start + len(header)] = header
     table.write_bytes(data)
-    with pytest.raises(ValueError, match=f"{MOST_UNPACKED} are the most"):
+    with pytest.raises(ValueError, match=f"{MAX_UNCOMPRESSED} are the most"):
         check(table)
 
 
 def test_a_page_of_many_images_is_as_large_as_they_are(tmp_path, monkeypatch):
     """Writers end a page after a thousand rows, whatever is in them."""
-    monkeypatch.setattr(parquet_pages, "MOST_UNPACKED", 2**15)
+    monkeypatch.setattr(parquet_pages, "MAX_UNCOMPRESSED", 2**15)
     random = np.random.default_rng(0)
     parquet.write_table(arrow.table({"image": [random.bytes(2000) for _ in range(100)]}), tmp_path / "images.parquet")
     check(tmp_path / "images.parquet")

@@ -24,7 +24,7 @@ from data_pipelines.suite import generate
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.environment import Environment
-from data_pipelines.suite.generate import FEWEST, episode_count, fingerprint, generate_suite
+from data_pipelines.suite.generate import MIN_EPISODES, episode_count, fingerprint, generate_suite
 from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.tokens.store import TokenStore
@@ -58,17 +58,17 @@ def test_tfds_decodes_exactly_what_was_simulated(suite, name):
     directory = suite / name / "1.0.0"
     builder = tfds.builder_from_directory(str(directory))
     assert builder.name == name
-    assert {k: v.num_examples for k, v in builder.info.splits.items()} == {"train": FEWEST, "val": 3}
+    assert {k: v.num_examples for k, v in builder.info.splits.items()} == {"train": MIN_EPISODES, "val": 3}
     assert list(builder.info.metadata["positions"]) == list(spec.points)
 
-    seeds = np.concatenate([episode_seeds(spec, FEWEST, 0), episode_seeds(spec, 3, 0, "val")])
+    seeds = np.concatenate([episode_seeds(spec, MIN_EPISODES, 0), episode_seeds(spec, 3, 0, "val")])
     rollout = simulate(spec, seeds)
     for split, i in (("train", 3), ("val", 1)):
         shards = [index_shard(directory / f) for f in builder.info.splits[split].filenames]
         records = [read_record(s.path, o, n) for s in shards for o, n in zip(s.offsets, s.lengths, strict=True)]
         assert sum(map(len, records)) == builder.info.splits[split].num_bytes
         example = builder.info.features.deserialize_example_np(records[i])
-        check_episode(spec, example, rollout, i if split == "train" else FEWEST + i)
+        check_episode(spec, example, rollout, i if split == "train" else MIN_EPISODES + i)
 
 
 def check_episode(spec, example, rollout, i):
@@ -117,10 +117,10 @@ def test_the_validation_split_is_what_is_held_out(suite):
     spec = get_spec("pusher_mint")
     source = RldsDataset(suite / spec.name, spec.split)
     mask = held_out_episodes(spec, source.runs, 0.5, 1, 1, 0.25)
-    assert mask.tolist() == [False] * FEWEST + [True] * 3
+    assert mask.tolist() == [False] * MIN_EPISODES + [True] * 3
     seeds = [int(source.record(i)["episode_metadata/seed"][0]) for i in range(len(source))]
     robot = next(s for s in EMBODIMENTS if s.name == spec.name)
-    assert seeds[FEWEST:] == episode_seeds(robot, 3, 0, "val").tolist()
+    assert seeds[MIN_EPISODES:] == episode_seeds(robot, 3, 0, "val").tolist()
     with pytest.raises(ConfigError, match="no split 'test'.*splits there: train, val"):
         RldsDataset(suite / spec.name, "train+test")
 
@@ -134,7 +134,7 @@ def test_the_token_store_and_the_frame_loader_hold_out_the_validation_split(suit
 
     spec = get_spec("pusher_mint")
     manifest = tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path, min_val=1, max_val=1)
-    assert (len(manifest.train.episodes), len(manifest.val.episodes)) == (FEWEST, 3)
+    assert (len(manifest.train.episodes), len(manifest.val.episodes)) == (MIN_EPISODES, 3)
 
     source = RldsDataset(suite / spec.name, "val")
     recorded = np.concatenate([source.episode(i, spec.image_key, ()).images for i in range(3)])
@@ -258,13 +258,13 @@ def test_subsets_are_of_the_training_split_alone(suite, tmp_path):
     tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path)
     store = TokenStore(tmp_path)
     everything, held = train_windows(store, spec.name, 4), val_windows(store, spec.name, 4, 3)
-    assert len(everything.episodes) == FEWEST and len(held.episodes) == 3
-    few, more = (set(train_windows(store, spec.name, 4, n).episodes.tolist()) for n in (3, FEWEST - 1))
-    assert (len(few), len(more)) == (3, FEWEST - 1) and few < more
+    assert len(everything.episodes) == MIN_EPISODES and len(held.episodes) == 3
+    few, more = (set(train_windows(store, spec.name, 4, n).episodes.tolist()) for n in (3, MIN_EPISODES - 1))
+    assert (len(few), len(more)) == (3, MIN_EPISODES - 1) and few < more
 
 
 def test_the_fingerprint_follows_everything_the_bytes_depend_on():
-    large, small = (next(s for s in EMBODIMENTS if s.episodes == n) for n in (500, FEWEST))
+    large, small = (next(s for s in EMBODIMENTS if s.episodes == n) for n in (500, MIN_EPISODES))
     marks = [fingerprint(large, 1.0, 0), fingerprint(small, 1.0, 0), fingerprint(large, 0.5, 0)]
     marks += [fingerprint(large, 1.0, 1), fingerprint(large, 1.0, 0, validation=5)]
     assert len(set(marks)) == 5
@@ -275,7 +275,7 @@ def test_the_fingerprint_follows_everything_the_bytes_depend_on():
 def test_sizes_go_evenly_in_the_logarithm_from_the_fewest_to_the_most():
     small, large = min(EMBODIMENTS, key=lambda e: e.episodes), max(EMBODIMENTS, key=lambda e: e.episodes)
     assert (episode_count(small, 4.0, 128), episode_count(large, 4.0, 128)) == (128, 2000)
-    assert (episode_count(small, 1.0), episode_count(large, 1.0)) == (FEWEST, 500)
+    assert (episode_count(small, 1.0), episode_count(large, 1.0)) == (MIN_EPISODES, 500)
     middle = min(EMBODIMENTS, key=lambda e: abs(e.episodes - 63))  # half-way, in the logarithm
     assert episode_count(middle, 4.0, 128) == pytest.approx(math.sqrt(128 * 2000), rel=0.05)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.embodiments import EMBODIMENTS, NEW, TRAINED, siblings, strangers
-from data_pipelines.suite.generate import FEWEST, MOST, episode_count
+from data_pipelines.suite.generate import MAX_EPISODES, MIN_EPISODES, episode_count
 from data_pipelines.suite.rollout import episode_lengths, episode_seeds
 from hma_jax.config import ConfigError
 
@@ -49,12 +49,12 @@ def test_the_table_is_as_heterogeneous_as_promised():
 
 
 def test_sizes_spread_over_decades_and_the_smallest_stay_small():
-    for scale, largest in ((1.0, MOST), (8.0, 8 * MOST)):
+    for scale, largest in ((1.0, MAX_EPISODES), (8.0, 8 * MAX_EPISODES)):
         counts = [episode_count(s, scale) for s in EMBODIMENTS]
-        assert (min(counts), max(counts)) == (FEWEST, largest)
+        assert (min(counts), max(counts)) == (MIN_EPISODES, largest)
         below = [sum(c < 10**k for c in counts) for k in (1, 2, 3)]
         assert below[0] >= 5 and below[1] - below[0] >= 10 and below[2] - below[1] >= 10
-    assert {episode_count(s, 1e-3) for s in EMBODIMENTS} == {FEWEST}
+    assert {episode_count(s, 1e-3) for s in EMBODIMENTS} == {MIN_EPISODES}
     order = sorted(EMBODIMENTS, key=lambda s: s.episodes)
     assert [episode_count(s, 8.0) for s in order] == sorted(episode_count(s, 8.0) for s in order)
 

@@ -14,8 +14,8 @@ import pytest
 from data_pipelines import json_file
 from data_pipelines.errors import DataError
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.sources.rlds.features import DEEPEST, MOST_FIELDS, parse_features
-from data_pipelines.sources.rlds.schema import MOST_SHARDS, read_features, read_info, read_metadata
+from data_pipelines.sources.rlds.features import MAX_DEPTH, MAX_FIELDS, parse_features
+from data_pipelines.sources.rlds.schema import MAX_SHARDS, read_features, read_info, read_metadata
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
 
 NOT_RECOGNISED = {"pythonClassName": "somebody.features.Own", "text": {}}
@@ -205,8 +205,8 @@ def nested(levels: int):
 
 
 REFUSED_SCHEMAS = {
-    "deep": nested(DEEPEST + 1),
-    "many": group({f"f{n}": NOT_RECOGNISED for n in range(MOST_FIELDS + 1)}),
+    "deep": nested(MAX_DEPTH + 1),
+    "many": group({f"f{n}": NOT_RECOGNISED for n in range(MAX_FIELDS + 1)}),
     "huge": group({"a": tensor(["65536", "65536"])}),
     "beyond": group({"a": tensor([str(2**70)])}),
     "negative": group({"a": tensor(["-2"])}),
@@ -238,10 +238,10 @@ def test_json_that_no_parser_survives_names_its_file(tmp_path, file, text):
 
 def test_json_file_has_bounds(tmp_path, monkeypatch):
     directory = write_rlds(tmp_path, make_spec(), [3])
-    monkeypatch.setattr(json_file, "MOST_VALUES", 5)
+    monkeypatch.setattr(json_file, "MAX_VALUES", 5)
     with pytest.raises(DataError, match=r"dataset_info.json has more than 5 values"):
         read_info(directory)
-    monkeypatch.setattr(json_file, "MOST_BYTES", 99)
+    monkeypatch.setattr(json_file, "MAX_BYTES", 99)
     with pytest.raises(DataError, match=r"dataset_info.json has more than 99 bytes"):
         read_info(directory)
 
@@ -276,7 +276,7 @@ def test_template_makes_plain_names_of_shards_only(tmp_path, template):
         read_metadata(directory, "train")
 
 
-@pytest.mark.parametrize("lengths", [["-1"], ["x"], [1.5], [2**63], "7", ["9" * 30], ["0"] * (MOST_SHARDS + 1)])
+@pytest.mark.parametrize("lengths", [["-1"], ["x"], [1.5], [2**63], "7", ["9" * 30], ["0"] * (MAX_SHARDS + 1)])
 def test_shard_lengths_are_counts(tmp_path, lengths):
     directory = write_rlds(tmp_path, make_spec(), [3])
     change_info(directory, lengths=lengths)

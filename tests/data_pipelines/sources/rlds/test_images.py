@@ -72,7 +72,7 @@ def test_image_of_too_many_pixels_is_refused_before_it_is_decoded(kind, monkeypa
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(data, kind)
     encoded = data.getvalue()
     assert decode_image(encoded).shape == (8, 8, 3)
-    monkeypatch.setattr(images, "MOST_PIXELS", 63)
+    monkeypatch.setattr(images, "MAX_PIXELS", 63)
     with pytest.raises(ValueError, match=r"too large to be a frame \(64 pixels, more than 63\)"):
         decode_image(encoded)
     with pytest.raises(ValueError, match="too large to be a frame"):
