@@ -73,11 +73,12 @@ def test_siblings_share_dynamics_in_every_family():
         name: [round(100 * float(row[name])) for row in rows.values()] for name in ("siblings", "strangers", "shuffled")
     }
     page = " ".join((Path(__file__).parents[2] / "docs" / "suite.md").read_text().split())
-    assert f"with {min(errors['siblings'])} to {max(errors['siblings'])} % of the motion" in page
-    assert f"equally many action values with {min(errors['strangers'])} % or more" in page
-    assert f"their actions shuffled with {min(errors['shuffled'])} % or more" in page
+    assert f"is {min(errors['siblings'])} to {max(errors['siblings'])} % if fitted on the four siblings" in page
+    said = f"{min(errors['strangers'])} % or more if fitted on four robots of another family with equally many action values"
+    assert said in page
+    assert f"{min(errors['shuffled'])} % or more if fitted on the siblings with shuffled actions" in page
     shares = [round(100 * row.share) for row in read_table().values()]
-    assert f"decide is {min(shares)} to {max(shares)} % of the change of its pixels" in page
+    assert f"actions explain {min(shares)} to {max(shares)} % of the change of its pixels" in page
 
 
 def test_a_prediction_from_siblings_uses_the_actions():
