@@ -22,8 +22,8 @@ from data_pipelines.convert.episode import Conversion, encode
 from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.claims import claim
 from data_pipelines.publishing.files import publish, sync
+from data_pipelines.publishing.fingerprint import FINGERPRINT, read_metadata, shard_lengths
 from data_pipelines.publishing.journal import Journal
-from data_pipelines.publishing.marks import FINGERPRINT, read_metadata, shard_lengths
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
@@ -90,7 +90,7 @@ def convert(
         f"--name {name!r} cannot be a dataset's name: use lower-case letters, digits and _ only",
     )
     final = Path(out) / name / VERSION
-    mark = stable_hash(
+    fingerprint = stable_hash(
         {
             "converter": CONVERTER,
             "name": name,
@@ -99,7 +99,7 @@ def convert(
         }
     )
     if final.exists():
-        return _finished(final, mark, source, name)
+        return _finished(final, fingerprint, source, name)
     with ExitStack() as stack:
         try:
             stack.enter_context(claim(final.with_name(f".{VERSION}")))
@@ -108,11 +108,11 @@ def convert(
                 f"another conversion is writing {final.parent} ({held.who}); wait for it or stop it", held.holder
             ) from None
         if final.exists():  # made by another process meanwhile
-            return _finished(final, mark, source, name)
-        partial = final.with_name(f".{VERSION}.{mark[:16]}.partial")
+            return _finished(final, fingerprint, source, name)
+        partial = final.with_name(f".{VERSION}.{fingerprint[:16]}.partial")
         partial.mkdir(exist_ok=True)
         shards = _write_shards(source, partial, skip_damaged, shard_bytes, progress)
-        return _finish(source, partial, final, name, shards, {**origin, FINGERPRINT: mark})
+        return _finish(source, partial, final, name, shards, {**origin, FINGERPRINT: fingerprint})
 
 
 def _write_shards(
@@ -186,11 +186,11 @@ def _finish(
     return Conversion(final, suggest_spec(source, name), episodes, len(kept), left_out)
 
 
-def _finished(final: Path, mark: str, source: Source, name: str) -> Conversion:
+def _finished(final: Path, fingerprint: str, source: Source, name: str) -> Conversion:
     """What is there already, if it was made of the same source in the same way."""
     metadata, lengths = read_metadata(final), shard_lengths(final)
     require(
-        metadata.get(FINGERPRINT) == mark and bool(lengths),
+        metadata.get(FINGERPRINT) == fingerprint and bool(lengths),
         f"{final} exists already and was not made of this source with these settings; choose another --name "
         "or --out, or remove it",
     )

@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 from data_pipelines.errors import MAX_EXAMPLES, DataError
 from data_pipelines.publishing.claims import Claim, claim
-from data_pipelines.publishing.marks import FINGERPRINT, is_complete, read_metadata, shard_lengths
+from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
 from data_pipelines.simulators.embodiments import select
 from data_pipelines.simulators.packages import gl_backend, package_versions, require_packages
 from data_pipelines.simulators.record import IMAGE_KEY
@@ -116,9 +116,9 @@ def generate_sim(
         raise ConfigError(f"cannot make the directory {root}: {error.strerror}") from error
     require(os.access(root, os.W_OK), f"cannot write to {root}: no permission; choose another directory")
 
-    marks = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
+    fingerprints = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
     with ExitStack() as claims:
-        run = _Run(root, marks, episodes, size, seed, len(specs) * episodes, progress, claims)
+        run = _Run(root, fingerprints, episodes, size, seed, len(specs) * episodes, progress, claims)
         jobs = [job for spec in specs for job in run.plan(spec)]
         failures = run.work(jobs, workers)
     if failures:
@@ -133,8 +133,10 @@ def generate_sim(
 class _Run:
     """One call of `generate_sim`: what is there, and the processes under way."""
 
-    def __init__(self, root: Path, marks: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack):
-        self.root, self.marks, self.episodes, self.size, self.seed = root, marks, episodes, size, seed
+    def __init__(
+        self, root: Path, fingerprints: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack
+    ):
+        self.root, self.fingerprints, self.episodes, self.size, self.seed = root, fingerprints, episodes, size, seed
         self.done, self.total, self.progress = 0, total, progress
         self.lock, self.finishing = threading.Lock(), threading.Lock()
         self.children: set[subprocess.Popen] = set()
@@ -143,14 +145,14 @@ class _Run:
 
     def staging(self, name: str) -> Path:
         """Where the episodes of a dataset wait for each other."""
-        return self.root / name / f".{VERSION}.episodes.{self.marks[name]}"
+        return self.root / name / f".{VERSION}.episodes.{self.fingerprints[name]}"
 
     def plan(self, spec: SimSpec) -> list[Job]:
         """The jobs that a dataset lacks; it is put together if nothing but that is left to do."""
         name = spec.name
-        if not is_complete(self.root / name / VERSION, self.marks[name]):
+        if not is_complete(self.root / name / VERSION, self.fingerprints[name]):
             self.claims[name] = self.claim(name)  # looked at again: another process may have made it by then
-        if is_complete(self.root / name / VERSION, self.marks[name]):
+        if is_complete(self.root / name / VERSION, self.fingerprints[name]):
             self.count(name, self.episodes)
             return []
         staging = self.staging(name)
@@ -236,7 +238,7 @@ class _Run:
             self.staging(spec.name),
             episodes=self.episodes,
             size=self.size,
-            metadata={FINGERPRINT: self.marks[spec.name], "generator": GENERATOR, "seed": self.seed},
+            metadata={FINGERPRINT: self.fingerprints[spec.name], "generator": GENERATOR, "seed": self.seed},
         )
 
     def count(self, name: str, episodes: int) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from data_pipelines.publishing.claims import claim
 from data_pipelines.publishing.files import publish
-from data_pipelines.publishing.marks import FINGERPRINT, is_complete
+from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete
 from data_pipelines.sources.rlds.writer import VERSION
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.spec import EmbodimentSpec
@@ -153,15 +153,15 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
 def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewest: int) -> None:
     """One dataset, unless another process makes it meanwhile."""
     (spec,) = select([name])
-    final, mark = root / name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
+    final, expected = root / name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
     with claim(final.with_name(f".{VERSION}"), wait=True) as held:
-        if is_complete(final, mark):
+        if is_complete(final, expected):
             return
         write_dataset(
             spec,
             held.scratch,
             episodes={"train": episode_count(spec, scale, fewest), "val": validation},
             seed=seed,
-            metadata={FINGERPRINT: mark, "generator": GENERATOR, "seed": seed, "family": spec.family},
+            metadata={FINGERPRINT: expected, "generator": GENERATOR, "seed": seed, "family": spec.family},
         )
         publish(held.scratch, final)

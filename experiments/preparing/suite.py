@@ -74,12 +74,12 @@ def suite_is_there(study: Study, workspace: Workspace) -> bool:
 def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | None:
     """How the inputs of a dataset that is there differ from `suite`; [] if only the simulator does; None if it
     is as it should be, is not there, or lacks shards and is to be made in any case."""
-    from data_pipelines.publishing.marks import FINGERPRINT, is_complete, read_metadata, shard_lengths
+    from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
     from data_pipelines.suite.generate import episode_count, fingerprint, select
 
     (spec,) = select([name])
-    mark = fingerprint(spec, suite.scale, suite.seed, suite.validation, suite.fewest)
-    if not directory.exists() or is_complete(directory, mark):
+    expected = fingerprint(spec, suite.scale, suite.seed, suite.validation, suite.fewest)
+    if not directory.exists() or is_complete(directory, expected):
         return None
     metadata = read_metadata(directory)
     made_as, seed = metadata.get(FINGERPRINT), metadata.get("seed")

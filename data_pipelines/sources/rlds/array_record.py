@@ -70,11 +70,11 @@ def _reader(path: Path):
 
 
 @functools.lru_cache(MAX_OPEN_FILES)
-def _opened(path: Path, mark: tuple[int, int]):
+def _opened(path: Path, stamp: tuple[int, int]):
     """One reader per version of a file."""
     from array_record.python import array_record_module
 
-    del mark
+    del stamp
     return array_record_module.ArrayRecordReader(str(path), options=OPTIONS)
 
 

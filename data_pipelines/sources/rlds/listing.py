@@ -1,6 +1,6 @@
-"""The files of a directory with their sizes and versions, without opening one.
+"""The files of a directory with their sizes and version stamps, without opening any.
 
-Owns what a version is: on a disk the time of the last change, in a store whatever it calls so.
+Owns what stands for a version: the modification time on a disk, an ETag or the like in an object store.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from data_pipelines.sources.rlds.location import is_remote, retried
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
-MARKS = ("ETag", "etag", "md5Hash", "crc32c", "blob_id", "generation", "version_id", "content_md5")
-TIMES = ("LastModified", "last_modified", "updated", "mtime", "modified", "created")
+VERSION_FIELDS = ("ETag", "etag", "md5Hash", "crc32c", "blob_id", "generation", "version_id", "content_md5")
+TIME_FIELDS = ("LastModified", "last_modified", "updated", "mtime", "modified", "created")
 
 
 def list_files(directory: Location) -> dict[str, tuple[int, str]]:
@@ -43,7 +43,7 @@ def _list_directory(directory: Path) -> dict[str, tuple[int, str]]:
 
 
 def _stamp(facts: Mapping) -> str:
-    for kind in (MARKS, TIMES):
+    for kind in (VERSION_FIELDS, TIME_FIELDS):
         for name in kind:
             if facts.get(name):
                 return f"{name} {facts[name]}"

@@ -172,7 +172,7 @@ class DiskFile(Descriptor):
             super().__init__(retried(path, lambda: os.open(path, os.O_RDONLY)))
         except FileNotFoundError:
             raise missing(path) from None
-        self._path, self._mark = path, _mark(self._fd)
+        self._path, self._stamp = path, _stamp(self._fd)
         self._finalizer = weakref.finalize(self, os.close, self._fd)
         self._finalizer.atexit = False  # threads may still read while a process ends
 
@@ -192,7 +192,7 @@ class DiskFile(Descriptor):
     def _read_anew(self, offset: int, length: int) -> bytes:
         fd = os.open(self._path, os.O_RDONLY)
         try:
-            if _mark(fd) != self._mark:
+            if _stamp(fd) != self._stamp:
                 message = f"{self._path}: the file was replaced while it was read. Run the same command again."
                 raise DataError(message)
             data = os.pread(fd, length, offset)
@@ -202,7 +202,7 @@ class DiskFile(Descriptor):
             os.close(fd)
 
 
-def _mark(fd: int) -> tuple[int, int]:
+def _stamp(fd: int) -> tuple[int, int]:
     status = os.fstat(fd)
     return status.st_size, status.st_mtime_ns
 

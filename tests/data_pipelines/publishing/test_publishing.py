@@ -11,8 +11,8 @@ import pytest
 from data_pipelines.publishing import files
 from data_pipelines.publishing.claims import claim, living_claim
 from data_pipelines.publishing.files import publish
+from data_pipelines.publishing.fingerprint import is_complete
 from data_pipelines.publishing.journal import Journal
-from data_pipelines.publishing.marks import is_complete
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
 from tests.full_disk import full_disk

@@ -1,4 +1,4 @@
-"""The fingerprint inside an RLDS directory that we made, and whether it is all there."""
+"""The fingerprint that our writers store in an RLDS directory, and the check whether the directory is complete."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 FINGERPRINT = "fingerprint"
-"""Its key in metadata.json, where every writer puts it."""
+"""Its key in metadata.json."""
 
 
 def read_metadata(directory: Path) -> dict[str, Any]:
-    """What the writer said of the dataset; empty if it said nothing that can be read."""
+    """The contents of metadata.json; empty if it is missing or cannot be read."""
     try:
         values = json.loads((directory / "metadata.json").read_text())
     except (OSError, ValueError):
@@ -20,7 +20,7 @@ def read_metadata(directory: Path) -> dict[str, Any]:
 
 
 def shard_lengths(directory: Path, split: str | None = None) -> list[int]:
-    """Records of every shard, of one split or of all, as dataset_info.json says; empty if it cannot be read."""
+    """Records in each shard of one split, or of all, from dataset_info.json; empty if it cannot be read."""
     try:
         splits = json.loads((directory / "dataset_info.json").read_text())["splits"]
         return [int(n) for s in splits if split in (None, s["name"]) for n in s["shardLengths"]]
@@ -28,8 +28,8 @@ def shard_lengths(directory: Path, split: str | None = None) -> list[int]:
         return []
 
 
-def is_complete(directory: Path, mark: str) -> bool:
+def is_complete(directory: Path, fingerprint: str) -> bool:
     """Whether `directory` holds a dataset with this fingerprint and all of its shards."""
     shards = len(shard_lengths(directory))
     found = len(list(directory.glob("*.tfrecord-*")))
-    return read_metadata(directory).get(FINGERPRINT) == mark and found == shards > 0
+    return read_metadata(directory).get(FINGERPRINT) == fingerprint and found == shards > 0
