@@ -20,10 +20,10 @@ from typing import Any
 
 from data_pipelines.convert.episode import Conversion, encode
 from data_pipelines.errors import DataError, without_advice
-from data_pipelines.publishing.claims import claim
 from data_pipelines.publishing.files import publish, sync
 from data_pipelines.publishing.fingerprint import FINGERPRINT, read_metadata, shard_lengths
 from data_pipelines.publishing.journal import Journal
+from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
@@ -102,7 +102,7 @@ def convert(
         return _finished(final, fingerprint, source, name)
     with ExitStack() as stack:
         try:
-            stack.enter_context(claim(final.with_name(f".{VERSION}")))
+            stack.enter_context(lock_output(final.with_name(f".{VERSION}")))
         except Held as held:
             raise Held(
                 f"another conversion is writing {final.parent} ({held.who}); wait for it or stop it", held.holder

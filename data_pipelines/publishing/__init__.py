@@ -1,14 +1,16 @@
-"""How anything that takes long to make gets to its place: whole, once, and in any number of attempts.
+"""Atomic, resumable creation of outputs that take long to make: datasets, token stores, trials.
 
 Owns the one scheme that tokens, conversions, the suite and the simulators share; knows nothing of what is made.
 
-* `claims`: who makes a thing. A lock file beside it, which ends with its process; others wait, or do
-  something else. Whoever claims a thing removes what dead processes left of it, and nobody else's.
-* `files`: written aside, forced to the disk, renamed into place. A reader sees all of a thing or nothing.
-* `marks`: a fingerprint of everything the bytes depend on, stored inside; what is there and has it is kept.
-* `journal`: what is finished of a thing that one process makes step by step, so that the next goes on there.
+* `output_lock`: one process at a time makes an output. The lock file lies beside it and ends with its process;
+  others wait, or do something else. Who holds the lock removes the scratch directories that dead holders left.
+* `files`: an output is written to a temporary directory, synced, and renamed into place. Readers see all of it or
+  nothing.
+* `fingerprint`: a hash of everything the bytes depend on, stored in the output. An output that is complete and has
+  the expected fingerprint is kept.
+* `journal`: which steps of an output are finished, so that a restarted process continues after the last of them.
 
-What a claim promises on which file system is said in `hma_jax.runtime.locks`. Where it fails, on a shared disk
-without locks whose lease ran out, two processes make the same thing: both write equal bytes to directories of
-their own and rename them, so that nothing but time is lost.
+`hma_jax.runtime.locks` says what a lock guarantees on which file system. Where it fails, on a shared disk without
+locks after the lease ran out, two processes make the same output: both write equal bytes to scratch directories of
+their own and rename them, so that only time is lost.
 """

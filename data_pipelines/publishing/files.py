@@ -1,4 +1,4 @@
-"""Directories that are never seen half written, nor lost with the power once they are seen."""
+"""Publishing of directories: readers never see one half written, and a published one survives a power failure."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def sync_tree(directory: Path) -> None:
 
 
 def publish(made: Path, final: Path) -> None:
-    """Puts the finished directory `made` in the place of `final`, on the same disk.
+    """Moves the finished directory `made` to `final`, on the same disk, and removes what was there.
 
-    What was there is removed. The caller holds the claim of `final`. Raises OSError.
+    The caller holds the lock of `final`. Raises OSError.
     """
     sync_tree(made)
     remove(final)
@@ -29,7 +29,7 @@ def publish(made: Path, final: Path) -> None:
 
 
 def remove(directory: Path) -> None:
-    """Removes a directory, if it is there: out of sight at once, then file by file."""
+    """Removes a directory, if it exists: renames it first, so that no reader sees it half removed."""
     gone = directory.with_name(f".{directory.name.lstrip('.')}.removed")
     shutil.rmtree(gone, ignore_errors=True)  # of a process that died here
     if directory.exists():

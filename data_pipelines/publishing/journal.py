@@ -1,4 +1,4 @@
-"""What is finished of a thing that is made step by step: one line of JSON for every step."""
+"""Which steps of an output are finished: one line of JSON for each."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 
 
 class Journal:
-    """A file that one process at a time appends to, under a claim. A line that is there survives a crash."""
+    """A file that one process at a time appends to, under the output's lock. A written line survives a crash."""
 
     def __init__(self, path: Path):
         self.path = path
 
     def read(self) -> list[dict[str, Any]]:
-        """All lines. One that a crash cut off is removed."""
+        """All lines. An incomplete last line, which a crash left, is removed."""
         if not self.path.exists():
             return []
         *whole, cut = self.path.read_bytes().split(b"\n")

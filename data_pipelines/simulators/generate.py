@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from data_pipelines.errors import MAX_EXAMPLES, DataError
-from data_pipelines.publishing.claims import Claim, claim
 from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
+from data_pipelines.publishing.output_lock import OutputLock, lock_output
 from data_pipelines.simulators.embodiments import select
 from data_pipelines.simulators.packages import gl_backend, package_versions, require_packages
 from data_pipelines.simulators.record import IMAGE_KEY
@@ -117,8 +117,8 @@ def generate_sim(
     require(os.access(root, os.W_OK), f"cannot write to {root}: no permission; choose another directory")
 
     fingerprints = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
-    with ExitStack() as claims:
-        run = _Run(root, fingerprints, episodes, size, seed, len(specs) * episodes, progress, claims)
+    with ExitStack() as locks:
+        run = _Run(root, fingerprints, episodes, size, seed, len(specs) * episodes, progress, locks)
         jobs = [job for spec in specs for job in run.plan(spec)]
         failures = run.work(jobs, workers)
     if failures:
@@ -141,7 +141,7 @@ class _Run:
         self.lock, self.finishing = threading.Lock(), threading.Lock()
         self.children: set[subprocess.Popen] = set()
         self.stopped = False
-        self.stack, self.claims = stack, dict[str, Claim]()
+        self.stack, self.output_locks = stack, dict[str, OutputLock]()
 
     def staging(self, name: str) -> Path:
         """Where the episodes of a dataset wait for each other."""
@@ -151,7 +151,7 @@ class _Run:
         """The jobs that a dataset lacks; it is put together if nothing but that is left to do."""
         name = spec.name
         if not is_complete(self.root / name / VERSION, self.fingerprints[name]):
-            self.claims[name] = self.claim(name)  # looked at again: another process may have made it by then
+            self.output_locks[name] = self.acquire(name)  # looked at again: another process may have made it by then
         if is_complete(self.root / name / VERSION, self.fingerprints[name]):
             self.count(name, self.episodes)
             return []
@@ -164,11 +164,11 @@ class _Run:
         chunks = [missing[i : i + JOB_EPISODES] for i in range(0, len(missing), JOB_EPISODES)]
         return [Job(name, tuple(chunk), self.seed, self.size, str(staging)) for chunk in chunks]
 
-    def claim(self, name: str) -> Claim:
+    def acquire(self, name: str) -> OutputLock:
         """Held until the whole run ends. Raises Held."""
         home = self.root / name
         try:
-            return self.stack.enter_context(claim(home / f".{VERSION}"))
+            return self.stack.enter_context(lock_output(home / f".{VERSION}"))
         except Held as held:
             raise Held(
                 f"{home}: {held.who} is making this dataset; wait for it, stop it, or name other datasets",
@@ -234,7 +234,7 @@ class _Run:
         write_dataset(
             spec,
             self.root / spec.name,
-            self.claims[spec.name],
+            self.output_locks[spec.name],
             self.staging(spec.name),
             episodes=self.episodes,
             size=self.size,

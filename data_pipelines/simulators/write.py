@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.claims import Claim
 from data_pipelines.publishing.files import publish
+from data_pipelines.publishing.output_lock import OutputLock
 from data_pipelines.simulators.record import build_features
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.simulators.worker import facts_path, record_path
@@ -29,13 +29,13 @@ STATS = "stats.json"
 
 
 def write_dataset(
-    spec: SimSpec, home: Path, claim: Claim, staging: Path, *, episodes: int, size: int, metadata: dict
+    spec: SimSpec, home: Path, lock: OutputLock, staging: Path, *, episodes: int, size: int, metadata: dict
 ) -> Path:
     """`<home>/<version>/` from the episodes in `staging`, which are then removed.
 
-    `claim` is that of the dataset in `home`: staging directories of other settings are nobody's then.
+    `lock` is that of the dataset in `home`: who holds it may remove the staging directories of other settings.
     """
-    scratch, final = claim.scratch, home / VERSION
+    scratch, final = lock.scratch, home / VERSION
     facts = [json.loads(facts_path(staging, i).read_text()) for i in range(episodes)]
     frames = sum(f["frames"] for f in facts)
     shards = max(1, min(episodes, round(frames / SHARD_FRAMES)))

@@ -15,9 +15,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 
-from data_pipelines.publishing.claims import claim
 from data_pipelines.publishing.files import publish
 from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete
+from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.sources.rlds.writer import VERSION
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.spec import EmbodimentSpec
@@ -154,14 +154,14 @@ def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewes
     """One dataset, unless another process makes it meanwhile."""
     (spec,) = select([name])
     final, expected = root / name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
-    with claim(final.with_name(f".{VERSION}"), wait=True) as held:
+    with lock_output(final.with_name(f".{VERSION}"), wait=True) as lock:
         if is_complete(final, expected):
             return
         write_dataset(
             spec,
-            held.scratch,
+            lock.scratch,
             episodes={"train": episode_count(spec, scale, fewest), "val": validation},
             seed=seed,
             metadata={FINGERPRINT: expected, "generator": GENERATOR, "seed": seed, "family": spec.family},
         )
-        publish(held.scratch, final)
+        publish(lock.scratch, final)

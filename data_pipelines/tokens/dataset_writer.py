@@ -3,11 +3,11 @@
 Owns the work directory, what is kept after a crash, and publishing. Who makes which part is in
 `part_maker`; what goes into it is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
 
-Parts gather in `<store>/.<name>.<hash of the plan>`, where no reader looks and no job with
-another plan. Every process takes the next part that is neither there nor claimed by another one
-(`<work directory>.claims`, see `publishing`), so that processes may come, go and be killed at any
-time: the part of a dead one is free again. When the last is there, whoever claims the publishing
-adds the manifest and renames the directory to `<store>/<name>`.
+Parts gather in the work directory `<store>/.<name>.<hash of the plan>`, which neither readers nor jobs with another
+plan use. Every process takes the next part that is neither finished nor locked by another process (lock files are in
+`<work directory>.claims`, see `publishing`), so that processes may start, end and be killed at any time: a dead
+process holds no lock. When the last part is finished, the process that gets the lock for publishing adds the manifest
+and renames the directory to `<store>/<name>`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from data_pipelines.errors import DataError, without_advice
-from data_pipelines.publishing.claims import claim, living_claim, waiting_times
 from data_pipelines.publishing.files import remove, sync
+from data_pipelines.publishing.output_lock import backoff, find_held_lock, lock_output
 from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import merge_all
 from data_pipelines.tokens.part_files import Part, PartFacts, read_part
-from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, claims_of
+from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, locks_of
 from data_pipelines.tokens.row_sample import merge_samples
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, stable_hash
@@ -70,7 +70,7 @@ def write_dataset(
         if overwrite:
             _remove_others(root, plan, parts)
         maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
-        pauses = waiting_times()
+        pauses = backoff()
         while True:
             try:
                 manifest = _attempt(maker, make, progress)
@@ -102,12 +102,12 @@ def differences(store_root: str | Path, plan: Manifest) -> list[str]:
 
 def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
     """Ranges of consecutive items of about `part_size` together."""
-    ends, held = [], 0
+    ends, filled = [], 0
     for i, size in enumerate(sizes):
-        held += int(size)
-        if held >= part_size:
+        filled += int(size)
+        if filled >= part_size:
             ends.append(i + 1)
-            held = 0
+            filled = 0
     if not ends or ends[-1] < len(sizes):
         ends.append(len(sizes))
     firsts = [0, *ends[:-1]]
@@ -137,7 +137,7 @@ def _publish(maker: PartMaker) -> None:
     work, final, plan = maker.work, maker.final, maker.plan
     maker.check_losses()
     try:
-        with claim(claims_of(work) / "publish") as held:
+        with lock_output(locks_of(work) / "publish") as lock:
             facts = []
             for part in maker.parts:
                 known = read_part(work, part)
@@ -149,7 +149,7 @@ def _publish(maker: PartMaker) -> None:
             if not manifest.train.episodes:
                 last = f" The last left out: {without_advice(manifest.skipped[-1].reason)}" if manifest.skipped else ""
                 raise DataError(f"{plan.spec.name}: no usable episode is left to train on.{last}")
-            manifest.save(work, held.scratch)
+            manifest.save(work, lock.scratch)
             sync(work)
             try:
                 os.rename(work, final)
@@ -218,7 +218,7 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
     unfinished = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{12}}")
     others = [p for p in sorted(root.glob(f".{name}.*")) if unfinished.fullmatch(p.name) and p != work]
     for other in others:
-        if held := living_claim(claims_of(other)):
+        if held := find_held_lock(locks_of(other)):
             raise Held(
                 f"{final}: {held.who} is making this dataset in another way; wait for it or stop it", held.holder
             )
@@ -234,5 +234,5 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
 
 
 def _remove_work(work: Path) -> None:
-    for directory in (claims_of(work), work):
+    for directory in (locks_of(work), work):
         shutil.rmtree(directory, ignore_errors=True)

@@ -1,7 +1,7 @@
-"""The parts of a dataset that is being made: which are there, which are free, and who makes them.
+"""The parts of a dataset that is being made: which are finished, which are free, and who makes them.
 
-Owns the claims of parts and the count of lost episodes over all processes. Each process takes the next
-part that is neither there nor claimed; that of a dead process is free again.
+Owns the locks of parts and the count of lost episodes over all processes. Each process takes the next
+part that is neither finished nor locked; the part of a dead process is free again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 from data_pipelines.errors import DataError, without_advice
-from data_pipelines.publishing.claims import Claim, claim
+from data_pipelines.publishing.output_lock import OutputLock, lock_output
 from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, Manifest
 from data_pipelines.tokens.part_files import FACTS, Part, PartItem, read_part, write_part
 from hma_jax.runtime.locks import Held
@@ -24,8 +24,8 @@ Make = Callable[[Part], Iterable[PartItem]]
 """Gives what a part is made of, in order; equal parts give equal items."""
 
 
-def claims_of(work: Path) -> Path:
-    """Where parts, and the publishing, are claimed, and written before they get to their place."""
+def locks_of(work: Path) -> Path:
+    """The directory of the lock files of parts and of publishing, and of their scratch directories."""
     return work.with_name(f"{work.name}.claims")
 
 
@@ -65,15 +65,15 @@ class PartMaker:
             if self.final.exists():
                 return
             try:
-                with claim(claims_of(self.work) / f"{part.number:05d}") as held:
-                    if not self._there(part):  # made between the look and the claim
-                        self._make(part, make, held, report)
+                with lock_output(locks_of(self.work) / f"{part.number:05d}") as lock:
+                    if not self._there(part):  # another process may have finished it before the lock was taken
+                        self._make(part, make, lock, report)
             except Held:
                 others.append(part)
             others = [part for part in others if not self._there(part)]
             self.check_losses()
 
-    def _make(self, part: Part, make: Make, held: Claim, report: Callable[[int], None]) -> None:
+    def _make(self, part: Part, make: Make, lock: OutputLock, report: Callable[[int], None]) -> None:
         before = self._episodes_there()
 
         def counted() -> Iterator[PartItem]:
@@ -87,9 +87,9 @@ class PartMaker:
 
         keep = {"none": set(), "val": {"val"}, "all": set(SPLITS)}[self.plan.settings.keep_frames]
         try:
-            facts = write_part(self.work, part, counted(), held.scratch, self.plan.spec.action_dim, keep)
+            facts = write_part(self.work, part, counted(), lock.scratch, self.plan.spec.action_dim, keep)
         except FileNotFoundError:
-            if not held.lost():
+            if not lock.lost():
                 raise
             return  # this process had been stopped for so long that another host took the part over
         self._done[part.number] = facts.lost

@@ -88,12 +88,12 @@ def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | N
 
 def _freeze(setting: Setting) -> None:
     """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
-    from data_pipelines.publishing.claims import waiting_times
+    from data_pipelines.publishing.output_lock import backoff
     from experiments.preparing.tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
     study, workspace, said = setting.study, setting.workspace, False
-    for pause in waiting_times():
+    for pause in backoff():
         try:
             with workspace.locked():
                 if setting.tokenizer is not None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from data_pipelines.publishing.claims import waiting_times
+from data_pipelines.publishing.output_lock import backoff
 from experiments.progress import console, say
 from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def draw(workspace: Workspace, record: Record) -> None:
     """CSV, figures and page from whatever trials are finished, by one process at a time: others wait."""
-    for pause in waiting_times():
+    for pause in backoff():
         try:
             with workspace.locked(".report.lock"):
                 _draw(workspace, record)

@@ -1,7 +1,7 @@
 """One attempt at a trial: what it leaves in the trial's directory, and what that says of the trial.
 
-The same wherever the attempt runs. Its process holds the trial's claim, a lock with a lease
-(`data_pipelines.publishing.claims`), for as long as it lives; whoever finds the claim free may try again.
+The same wherever the attempt runs. Its process holds the trial's lock, which has a lease
+(`data_pipelines.publishing.output_lock`), for as long as it lives; whoever finds the lock free may try again.
 A trial's directory holds, besides what `experiments.running.run_trial` lists,
 
     trial.lock      while an attempt is alive
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.publishing.claims import Claim, claim, living_claim
+from data_pipelines.publishing.output_lock import OutputLock, find_held_lock, lock_output
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
@@ -56,15 +56,15 @@ class Ended:
 
 
 @contextmanager
-def attempt(directory: Path) -> Iterator[Claim]:
-    """Held by the process of an attempt: the trial's claim. Waits for one that another process holds.
+def attempt(directory: Path) -> Iterator[OutputLock]:
+    """The trial's lock, held while the process of an attempt runs. Waits while another process holds it.
 
     A process that died on another machine holds it until its lease is over (`hma_jax.runtime.locks.EXPIRES`).
     """
-    with claim(directory / "trial", wait=True) as held:
+    with lock_output(directory / "trial", wait=True) as lock:
         who = {"host": socket.gethostname(), "process": os.getpid(), "token": secrets.token_hex(4)}
         write_file(directory / STARTED, json.dumps(who | _engine_job()))
-        yield held
+        yield lock
 
 
 def _engine_job() -> dict[str, str]:
@@ -75,8 +75,8 @@ def _engine_job() -> dict[str, str]:
 
 
 def is_alive(directory: Path) -> bool:
-    """Whether a living process holds the trial's claim."""
-    return living_claim(directory) is not None
+    """Whether a running process holds the trial's lock."""
+    return find_held_lock(directory) is not None
 
 
 def read_start(directory: Path) -> dict[str, Any] | None:

@@ -201,7 +201,7 @@ class _Run:
         return again
 
     def _look_elsewhere(self) -> None:
-        """What an earlier runner started and left: once its claim is free, it has ended or is ours to try."""
+        """What an earlier runner started and left: once its lock is free, it has ended or is ours to try."""
         if time.monotonic() - self.looked < LOOK_EVERY:
             return
         self.looked = time.monotonic()

@@ -29,10 +29,10 @@ def main(directory: Path) -> int:
     written; STOPPED or INTERRUPTED: the next attempt goes on from here."""
     enter_child()  # before anything imports JAX
     try:
-        with terminated_like_interrupted(), attempt(directory) as held:
+        with terminated_like_interrupted(), attempt(directory) as lock:
             if (directory / RESULT).exists():  # another attempt finished while this one waited
                 return Exit.DONE
-            return _run(directory, held.lost)
+            return _run(directory, lock.lost)
     except KeyboardInterrupt as request:
         return exit_of_interrupt(request)
     except OSError:  # before there was anything to record it with

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from data_pipelines.publishing.claims import claim
+from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.tokens import part_maker
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli.main import main
@@ -74,7 +74,7 @@ def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does
     monkeypatch.undo()
     (work,) = (tmp_path / "tokens").glob(f".{ARM.name}.????????????")
     part, holder = ExitStack(), ExitStack()
-    part.enter_context(claim(work.with_name(f"{work.name}.claims") / "00000"))
+    part.enter_context(lock_output(work.with_name(f"{work.name}.claims") / "00000"))
     holder.enter_context(Workspace(tmp_path).locked())
     with ThreadPoolExecutor(1) as pool:
         joined = pool.submit(main, arguments)

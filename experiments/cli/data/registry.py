@@ -257,11 +257,11 @@ def _in_words(spec: DatasetSpec) -> str:
 
 def _write_entry(path: Path, suggestion: Suggestion) -> None:
     """Adds the entry to a TOML file, in place of one of the same name. Says what that said otherwise."""
-    from data_pipelines.publishing.claims import claim
+    from data_pipelines.publishing.output_lock import lock_output
     from data_pipelines.registry.toml_file import load_entries, put_entry
 
     spec = suggestion.spec()
-    with claim(path, wait=True):  # another process may add its own at the same moment
+    with lock_output(path, wait=True):  # another process may add its own at the same moment
         old = [entry for entry in load_entries(path) if entry.name == spec.name] if path.exists() else []
         write_file(path, put_entry(path.read_text(encoding="utf-8") if path.exists() else "", spec, str(path)))
     wrote(path)

@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.publishing import files
-from data_pipelines.publishing.claims import claim, living_claim
 from data_pipelines.publishing.files import publish
 from data_pipelines.publishing.fingerprint import is_complete
 from data_pipelines.publishing.journal import Journal
+from data_pipelines.publishing.output_lock import find_held_lock, lock_output
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
 from tests.full_disk import full_disk
 
 
 def hold(place: Path, ready) -> None:
-    with claim(place) as held:
-        (held.scratch / "half").touch()
+    with lock_output(place) as lock:
+        (lock.scratch / "half").touch()
         ready.set()
         time.sleep(60)
 
@@ -31,16 +31,16 @@ def test_scratch_of_the_living_is_kept_and_that_of_the_dead_removed(tmp_path):
     process = context.Process(target=hold, args=(tmp_path / "thing", ready))
     process.start()
     assert ready.wait(60)
-    with pytest.raises(Held, match=f"process {process.pid}"), claim(tmp_path / "thing"):
+    with pytest.raises(Held, match=f"process {process.pid}"), lock_output(tmp_path / "thing"):
         pass
-    with claim(tmp_path / "other"):  # of something else: nobody's business
+    with lock_output(tmp_path / "other"):  # of something else: nobody's business
         assert len(list(tmp_path.glob("thing.scratch.*/half"))) == 1
-    assert living_claim(tmp_path).holder.process == process.pid
+    assert find_held_lock(tmp_path).holder.process == process.pid
     process.kill()
     process.join()
-    assert living_claim(tmp_path) is None
-    with claim(tmp_path / "thing") as held:
-        mine = held.scratch
+    assert find_held_lock(tmp_path) is None
+    with lock_output(tmp_path / "thing") as lock:
+        mine = lock.scratch
         assert [p for p in tmp_path.iterdir() if p.is_dir()] == [mine]
     assert not list(tmp_path.iterdir())
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.publishing.claims import claim
+from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.simulators import generate, packages, read_start, select
 from data_pipelines.simulators.episode import StartState
 from data_pipelines.simulators.record import encode_episode
@@ -33,7 +33,7 @@ def home(tmp_path):
     staging.mkdir(parents=True)
     for i in range(EPISODES):
         write_episode(staging, i)
-    with claim(staging.with_name(".1.0.0")) as held:
+    with lock_output(staging.with_name(".1.0.0")) as held:
         write_dataset(
             SPEC, staging.parent, held, staging, episodes=EPISODES, size=SIZE, metadata={"fingerprint": "mark"}
         )
@@ -228,7 +228,7 @@ def test_a_dataset_that_another_process_makes_is_named_and_left_alone(tmp_path, 
     theirs = tmp_path / "pusht" / ".1.0.0.episodes.theirs"
     theirs.mkdir(parents=True)
     refused = pytest.raises(ConfigError, match="pusht: process .* is making this dataset")
-    with claim(tmp_path / "pusht" / ".1.0.0"), refused:
+    with lock_output(tmp_path / "pusht" / ".1.0.0"), refused:
         run(tmp_path)
     assert theirs.is_dir() and fake.made == []
     run(tmp_path)  # nobody's now

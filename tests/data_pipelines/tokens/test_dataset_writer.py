@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
-from data_pipelines.publishing.claims import claim
+from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.tokens.dataset_writer import cut_parts
 from data_pipelines.tokens.moments import Moments, merge_all, moments_path
 from data_pipelines.tokens.store import TokenStore
@@ -85,7 +85,7 @@ def begin(rlds: Path, store: Path, **options) -> Path:
     return work_directory(store)
 
 
-def claims_of(work: Path) -> Path:
+def locks_of(work: Path) -> Path:
     return work.with_name(f"{work.name}.claims")
 
 
@@ -122,7 +122,7 @@ def test_publishing_is_cleaned_up_after(rlds, undisturbed, tmp_path):
     work = begin(rlds, tmp_path)
     run(rlds, tmp_path)
     (work / "parts").mkdir(parents=True)
-    rest = claims_of(work) / "00000.scratch.12345678"
+    rest = locks_of(work) / "00000.scratch.12345678"
     rest.mkdir(parents=True)
     (rest / "rest").touch()
     assert run(rlds, tmp_path) is not None
@@ -143,7 +143,7 @@ def test_a_part_that_another_process_makes_is_left_to_it_and_waited_for(rlds, un
     work = begin(rlds, tmp_path)
     (number, *_) = [i for i in range(len(undisturbed)) if not (work / f"parts/{i:05d}.json").exists()]
     with ThreadPoolExecutor(1) as pool:
-        with claim(claims_of(work) / f"{number:05d}"):
+        with lock_output(locks_of(work) / f"{number:05d}"):
             assert run(rlds, tmp_path, wait=False) is None
             parts = {p.name for p in (work / "parts").iterdir()}
             assert f"{number:05d}.json" not in parts and len(parts) >= 8
@@ -167,7 +167,7 @@ def test_the_part_of_a_dead_process_is_made_again_and_what_it_left_removed(rlds,
 def test_the_part_of_another_host_is_left_to_it_until_its_lease_expires(rlds, undisturbed, tmp_path):
     """Where the file system does not show the locks of other hosts."""
     work = begin(rlds, tmp_path)
-    lock = claims_of(work) / "00007.lock"
+    lock = locks_of(work) / "00007.lock"
     lock.parent.mkdir(exist_ok=True)
     other = {"process": 7, "host": "other", "since": "then", "machine": "other", "token": "x"}
     lock.write_text(json.dumps(other))
@@ -179,7 +179,7 @@ def test_the_part_of_another_host_is_left_to_it_until_its_lease_expires(rlds, un
 
 
 def test_a_process_whose_part_was_taken_over_goes_on(rlds, undisturbed, tmp_path):
-    """It was stopped for longer than its lease; another host has removed its directory and claimed the part."""
+    """It was stopped for longer than its lease; another host has removed its directory and locked the part."""
     taken = []
 
     def take_over(done: int, total: int) -> None:
@@ -211,7 +211,7 @@ def test_jobs_of_different_settings_do_not_mix(rlds, tmp_path):
 def test_overwriting_removes_what_was_made_otherwise(rlds, undisturbed, tmp_path):
     work = begin(rlds, tmp_path, keep_frames="none")
     run(rlds, tmp_path, keep_frames="all")
-    with claim(claims_of(work) / "00007"):  # by a process that is alive
+    with lock_output(locks_of(work) / "00007"):  # by a process that is alive
         with pytest.raises(ConfigError, match="toy: process .* is making this dataset in another way"):
             run(rlds, tmp_path, overwrite=True)
         assert work.is_dir()

@@ -1,0 +1,89 @@
+"""The lock under which one process makes an output, and a scratch directory to make it in.
+
+The lock of `<dir>/<name>` is the file `<dir>/<name>.lock`, with a lease for machines that do not see our locks.
+Its scratch directory is `<dir>/<name>.scratch.<random>`, on the same disk as the output.
+"""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cached_property
+from pathlib import Path
+
+from hma_jax.runtime.locks import Held, Lock, exclusive
+
+MIN_WAIT, MAX_WAIT = 0.1, 5.0
+"""Seconds between two checks whether another process has finished; each wait is 1.5 times the one before."""
+
+
+class OutputLock:
+    """The lock of an output, while it is held."""
+
+    def __init__(self, output: Path, lock: Lock):
+        self._output, self._lock = output, lock
+
+    @cached_property
+    def scratch(self) -> Path:
+        """An empty directory. It is removed, if it still exists, when the lock is released."""
+        directory = self._output.with_name(f"{self._output.name}.scratch.{secrets.token_hex(4)}")
+        directory.mkdir()
+        return directory
+
+    def lost(self) -> bool:
+        """Whether another process has taken the lock over, which then removed our scratch directory."""
+        return self._lock.lost()
+
+
+@contextmanager
+def lock_output(output: Path, *, wait: bool = False) -> Iterator[OutputLock]:
+    """Holds the lock of `output`, whose parent directory is made if it is missing.
+
+    Removes the scratch directories that dead holders left. While another process holds the lock: raises Held, which
+    names it, or with `wait` waits until it is released. By then `output` may exist: check again. Raises OSError.
+    """
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        pauses = backoff()
+        while True:
+            try:
+                lock = stack.enter_context(exclusive(lock_file(output), lease=True, remove=True))
+                break
+            except Held:
+                if not wait:
+                    raise
+                time.sleep(next(pauses))
+        for stale in output.parent.glob(f"{output.name}.scratch.*"):
+            shutil.rmtree(stale, ignore_errors=True)
+        held = OutputLock(output, lock)
+        try:
+            yield held
+        finally:
+            if "scratch" in vars(held):
+                shutil.rmtree(held.scratch, ignore_errors=True)
+
+
+def lock_file(output: Path) -> Path:
+    return output.with_name(f"{output.name}.lock")
+
+
+def find_held_lock(directory: Path) -> Held | None:
+    """A lock in `directory` that a running process holds, as the error that says so; None if there is none."""
+    for path in sorted(directory.glob("*.lock")):
+        try:
+            with exclusive(path, lease=True, remove=True):
+                pass
+        except Held as held:
+            return held
+    return None
+
+
+def backoff() -> Iterator[float]:
+    """Seconds to wait before each further check: exponential backoff, without an end."""
+    pause = MIN_WAIT
+    while True:
+        yield pause
+        pause = min(1.5 * pause, MAX_WAIT)
