@@ -272,13 +272,13 @@ def test_the_page_of_simulators_gives_the_nats_of_its_table():
     rows = read_csv(ROOT / "experiments" / "results" / "sim" / "results.csv")
     nats = {(r.sweep, r.x, r.role): r.mean for r in rows if (r.scope, r.metric) == (OVERALL, "cross_entropy")}
     page = " ".join((ROOT / "docs" / "simulators.md").read_text().split())
-    assert f"the reference has {nats['width', 64, 'point']:.3f}" in page
+    assert f"The reference has {nats['width', 64, 'point']:.3f} and" in page
     assert f"**the control {nats['width', 64, 'control']:.3f}, which is better**" in page
     few, more, all_there = (nats["trajectories", x, "point"] for x in (4, 8, 480))
     assert f"({few:.3f}, {more:.3f} and {all_there:.3f} nats" in page
     widths = ", ".join(f"{nats['width', x, 'point']:.3f}" for x in (24, 32, 64, 96))
-    assert f"({widths} at 24 to 96)" in page
-    assert f"from {nats['datasets', 5, 'point']:.3f} nats alone to {nats['datasets', 40, 'point']:.3f} among" in page
+    assert f"({widths} at widths 24, 32, 64 and 96)" in page
+    assert f"from {nats['datasets', 5, 'point']:.3f} nats alone to {nats['datasets', 40, 'point']:.3f} when" in page
 
 
 def test_what_the_table_of_claims_says_stands_on_the_pages_that_it_links():
