@@ -6,10 +6,10 @@ import difflib
 import functools
 from collections.abc import Iterable
 
+from data_pipelines.registry.beyond_openx import BEYOND_OPENX
 from data_pipelines.registry.openx import OPENX
 from data_pipelines.registry.openx_more import OPENX_MORE
 from data_pipelines.registry.openx_rest import OPENX_REST
-from data_pipelines.registry.others import OTHERS
 from data_pipelines.registry.own import OWN
 from data_pipelines.registry.spec import DatasetSpec
 from hma_jax.config import ConfigError
@@ -30,7 +30,7 @@ def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
     groups = {
         "own and samples": OWN,
         "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,
-        "other datasets of the paper": OTHERS,
+        "other datasets of the paper": BEYOND_OPENX,
         "embedded suite (simulated)": _suite(),
         "simulator suite (extra sim)": _simulators(),
     }
@@ -70,7 +70,9 @@ def _table() -> dict[str, DatasetSpec]:
 
 @functools.cache
 def _built_in() -> dict[str, DatasetSpec]:
-    return {spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OPENX_REST, *OTHERS, *_suite(), *_simulators())}
+    return {
+        spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OPENX_REST, *BEYOND_OPENX, *_suite(), *_simulators())
+    }
 
 
 @functools.cache

@@ -17,9 +17,9 @@ from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.counterfactual import CounterfactualFrames
 from data_pipelines.windows.cut import make_cut
-from data_pipelines.windows.others import OtherWindows
-from data_pipelines.windows.truth import OtherTruth
+from data_pipelines.windows.other_actions import OtherWindows
 from data_pipelines.windows.windows import require_windows, val_windows
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
@@ -158,8 +158,8 @@ def eval_batches(
     datasets: Sequence[str] | None = None,
     *,
     first: int | None = None,
-    others: int = 0,
-    truth: OtherTruth | None = None,
+    other_actions: int = 0,
+    counterfactual: CounterfactualFrames | None = None,
 ) -> Iterator[dict]:
     """Batches of the frozen windows (of each dataset the `first` ones, or all), dataset by dataset.
 
@@ -172,11 +172,11 @@ def eval_batches(
     training actions of the dataset, whichever of them a model was trained on: what random actions are drawn
     from. Where the manifest has short windows, `real` bool [B, T] says which frames are no padding.
 
-    With `others`, so many action sequences of other episodes of each window's robot (`others`): `other_actions` float32
-    [B, others, T, U], and `other_valid` bool [B, others], False where there are fewer. With `truth`, made for these
-    windows, what would have been seen under the first of them: `other_images` uint8 [B, T, H, W, 3], the recorded
-    ones up to the prompt, and `other_seen` bool [B], False for robots that nobody simulates and for windows that no
-    other episode's actions cover.
+    `other_actions` adds action sequences of other episodes of each window's robot, that many per window (see
+    `OtherWindows`): `other_actions` float32 [B, other_actions, T, U], and `other_valid` bool [B, other_actions], False
+    where there are fewer. `counterfactual`, made for these windows, adds the frames that the first of them leads to:
+    `other_images` uint8 [B, T, H, W, 3], the recorded ones up to the prompt, and `other_seen` bool [B], False for
+    robots that nobody simulates and for windows that no other episode's actions cover.
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
     dataset is not in the manifest or in `table`.
@@ -198,11 +198,11 @@ def eval_batches(
         )
     store.check_table(table, wanted, manifest.rate)
     require(
-        truth is None or truth.manifest == manifest.hash(),
+        counterfactual is None or counterfactual.manifest == manifest.hash(),
         "the frames under other actions were made for other windows than those frozen here; prepare the study again",
     )
     windows = [(name, *window) for name in wanted for window in frozen[name].windows[:first]]
-    return _batches(_Rows(store, table, manifest, wanted, others, truth), batch, windows)
+    return _batches(_Rows(store, table, manifest, wanted, other_actions, counterfactual), batch, windows)
 
 
 def _batches(rows_of: _Rows, batch: int, windows: Sequence[tuple[str, int, int]]) -> Iterator[dict]:
@@ -228,14 +228,14 @@ class _Rows:
         table: EmbodimentTable,
         manifest: EvalManifest,
         names: Sequence[str],
-        others: int,
-        truth: OtherTruth | None,
+        other_actions: int,
+        counterfactual: CounterfactualFrames | None,
     ):
         self._store, self._table, self._names = store, table, tuple(names)
         self._cuts = {name: make_cut(store, name, manifest.frames, manifest.rate) for name in names}
         self._some_are_short = 0 < manifest.least < manifest.frames
-        self._count, self._truth = others, truth
-        self._others = OtherWindows(store, self._cuts, manifest.frames, manifest.rate, manifest.seed)
+        self._count, self._counterfactual = other_actions, counterfactual
+        self._other_windows = OtherWindows(store, self._cuts, manifest.frames, manifest.rate, manifest.seed)
         self._at = {(d.dataset, *window): i for d in manifest.datasets for i, window in enumerate(d.windows)}
         if names:
             self._statistics = store.embodiment_table(names, manifest.rate).statistics()
@@ -258,21 +258,21 @@ class _Rows:
         if self._some_are_short:
             row["real"] = cut.valid(item, start)
         if self._count:
-            row |= self._under_others(name, episode, start, width)
-        return row | self._seen(name, episode, start, row) if self._truth else row
+            row |= self._other_actions(name, episode, start, width)
+        return row | self._other_images(name, episode, start, row) if self._counterfactual else row
 
-    def _under_others(self, name: str, episode: int, start: int, width: int) -> dict:
-        chosen = self._others.choose(name, episode, start, self._count)
-        actions = self._others.actions(name, chosen, width)
+    def _other_actions(self, name: str, episode: int, start: int, width: int) -> dict:
+        chosen = self._other_windows.choose(name, episode, start, self._count)
+        actions = self._other_windows.actions(name, chosen, width)
         missing = self._count - len(chosen)
         return {
             "other_actions": np.pad(actions, [(0, missing), (0, 0), (0, 0)]),
             "other_valid": np.arange(self._count) < len(chosen),
         }
 
-    def _seen(self, name: str, episode: int, start: int, row: dict) -> dict:
-        images, frames = row["images"], self._truth.frames.get(name)
+    def _other_images(self, name: str, episode: int, start: int, row: dict) -> dict:
+        images, frames = row["images"], self._counterfactual.frames.get(name)
         if frames is None or not row["other_valid"][0]:
             return {"other_images": images, "other_seen": np.False_}
-        seen = np.concatenate([images[: self._truth.prompt], frames[self._at[name, episode, start]]])
+        seen = np.concatenate([images[: self._counterfactual.prompt], frames[self._at[name, episode, start]]])
         return {"other_images": seen, "other_seen": np.True_}

@@ -1,4 +1,4 @@
-"""The true frames of the suite's frozen windows under other episodes' actions (`data_pipelines.windows.truth`)."""
+"""Simulates the counterfactual frames of the suite's frozen windows (`data_pipelines.windows.counterfactual`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.cut import Cut
     from data_pipelines.windows.evalset import DatasetWindows
-    from data_pipelines.windows.others import OtherWindows
+    from data_pipelines.windows.other_actions import OtherWindows
 
 
 def make_counterfactual(study: Study, workspace: Workspace) -> None:
@@ -27,16 +27,16 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
     from data_pipelines.errors import DataError
     from data_pipelines.suite.generate import select
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.cut import make_cut
     from data_pipelines.windows.evalset import EvalManifest
-    from data_pipelines.windows.others import OtherWindows
-    from data_pipelines.windows.truth import OtherTruth
+    from data_pipelines.windows.other_actions import OtherWindows
 
     store, manifest = TokenStore(workspace.store), EvalManifest.load(workspace.manifest)
     prompt = study.eval.prompt_frames
     if workspace.counterfactual.exists():
         try:
-            there = OtherTruth.load(workspace.counterfactual)
+            there = CounterfactualFrames.load(workspace.counterfactual)
             if (there.manifest, there.prompt) == (manifest.hash(), prompt):
                 return
         except DataError:  # it follows from what is here: made again
@@ -50,7 +50,7 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
             (spec,) = select([dataset.dataset])
             frames[dataset.dataset] = _of_robot(spec, store, cuts[dataset.dataset], others, dataset, prompt, study)
             update(i + 1, len(chosen), dataset.dataset)
-    OtherTruth(manifest.hash(), prompt, frames).save(workspace.counterfactual)
+    CounterfactualFrames(manifest.hash(), prompt, frames).save(workspace.counterfactual)
 
 
 def _of_robot(

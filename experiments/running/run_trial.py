@@ -29,8 +29,8 @@ from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.evalset import EvalManifest
-    from data_pipelines.windows.truth import OtherTruth
     from hma_jax.evaluation.evaluate import Evaluation
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
@@ -51,21 +51,21 @@ class Materials:
     store: TokenStore
     tokenizer: Tokenizer
     manifest: EvalManifest
-    truth: OtherTruth | None = None  # what the frozen windows would be under other actions, where it is simulated
+    counterfactual: CounterfactualFrames | None = None  # of robots that are simulated
 
 
 def open_materials(workspace: Workspace) -> Materials:
     """Raises ConfigError or DataError for what is missing or damaged."""
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.evalset import EvalManifest
-    from data_pipelines.windows.truth import OtherTruth
     from hma_jax.tokenizers.io import load_tokenizer
 
     return Materials(
         TokenStore(workspace.store),
         load_tokenizer(workspace.tokenizer),
         EvalManifest.load(workspace.manifest),
-        OtherTruth.load(workspace.counterfactual) if workspace.counterfactual.exists() else None,
+        CounterfactualFrames.load(workspace.counterfactual) if workspace.counterfactual.exists() else None,
     )
 
 
@@ -180,10 +180,17 @@ def evaluate_on(
 
     manifest = materials.manifest
     config = config if predicts_frames(setting) else dataclasses.replace(config, other_actions=0)
-    truth = materials.truth if config.context == "generated" and config.other_actions else None
-    truth = truth if truth and truth.prompt == config.prompt_frames else None
+    counterfactual = materials.counterfactual if config.context == "generated" and config.other_actions else None
+    counterfactual = counterfactual if counterfactual and counterfactual.prompt == config.prompt_frames else None
     batches = eval_batches(
-        materials.store, table, manifest, config.batch, names, first=first, others=config.other_actions, truth=truth
+        materials.store,
+        table,
+        manifest,
+        config.batch,
+        names,
+        first=first,
+        other_actions=config.other_actions,
+        counterfactual=counterfactual,
     )
     windows = sum(len(d.windows[:first]) for d in manifest.datasets if d.dataset in names)
     progress("evaluating", 0, windows)

@@ -9,7 +9,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.windows.evalset import eval_batches
-from data_pipelines.windows.others import OtherWindows
+from data_pipelines.windows.other_actions import OtherWindows
 from experiments.override import override
 from experiments.preparing import counterfactual, windows
 from experiments.preparing.pipeline import prepare
@@ -34,9 +34,9 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
         assert tokens.shape == (2, model.frames, model.tokens, model.diffusion.token_channels)
     assert materials.tokenizer.decode(validation["tokens"][0]).shape == validation["images"][0].shape
 
-    truth, prompt = materials.truth, study.eval.prompt_frames
+    truth, prompt = materials.counterfactual, study.eval.prompt_frames
     assert truth.prompt == prompt and set(truth.frames) == set(materials.manifest.names)
-    (batch,) = eval_batches(store, table, materials.manifest, 4, others=3, truth=truth)
+    (batch,) = eval_batches(store, table, materials.manifest, 4, other_actions=3, counterfactual=truth)
     rows = np.flatnonzero(batch["valid"])
     assert batch["other_seen"][rows].all()
     np.testing.assert_array_equal(batch["other_images"][:, :prompt], batch["images"][:, :prompt])
@@ -46,7 +46,7 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     assert workspace.counterfactual.stat().st_mtime_ns == made  # it is there
     workspace.counterfactual.write_bytes(b"torn")
     counterfactual.make_counterfactual(study, workspace)
-    assert open_materials(workspace).truth.frames.keys() == truth.frames.keys()
+    assert open_materials(workspace).counterfactual.frames.keys() == truth.frames.keys()
     workspace.counterfactual.unlink()
     seed_of = counterfactual._seed_of
     monkeypatch.setattr(counterfactual, "_seed_of", lambda *args: seed_of(*args) + 1)
@@ -57,8 +57,8 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     monkeypatch.undo()
     monkeypatch.setattr(OtherWindows, "choose", lambda *args: [])  # as of episodes that are longer than all others
     counterfactual.make_counterfactual(study, workspace)
-    alone = open_materials(workspace).truth
-    (batch,) = eval_batches(store, table, materials.manifest, 4, others=3, truth=alone)
+    alone = open_materials(workspace).counterfactual
+    (batch,) = eval_batches(store, table, materials.manifest, 4, other_actions=3, counterfactual=alone)
     assert not batch["other_seen"].any()
 
 

@@ -1,7 +1,7 @@
-"""Other episodes' actions for a frozen window: what a model is shown in place of the true ones.
+"""Actions of other episodes for a frozen window, to be compared with its own.
 
-They come from the same robot and from other episodes than the window's own, held-out ones as far as there are
-enough, and cover every real frame of the window: each sequence is one that the robot was given, whole.
+They are of the same robot, from held-out episodes first and from training episodes if these are too few. Each is an
+uninterrupted sequence of one episode, as long as the window's real frames.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.cut import Cut
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES, WindowSet, train_windows, val_windows
 
-KEPT = 512
-"""Episodes whose actions are kept in memory."""
+CACHED_EPISODES = 512
+"""Episodes whose actions are cached in memory."""
 
 
-class Other(NamedTuple):
+class OtherWindow(NamedTuple):
     """A window of another episode: its split, its position there, and its start in stored frames."""
 
     split: str
@@ -30,38 +30,38 @@ class Other(NamedTuple):
 
 
 class OtherWindows:
-    """Chooses, by hash of the window's name alone, and reads the actions of what was chosen."""
+    """Chooses windows of other episodes by a hash of the frozen window's name, and reads their actions."""
 
     def __init__(self, store: TokenStore, cuts: dict[str, Cut], frames: int, rate: float | None, seed: int):
         self._store, self._cuts, self._frames, self._rate, self._seed = store, cuts, frames, rate, seed
         self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray]] = {}
         # Copied: a view would keep the whole record, which may hold hundreds of frames.
-        self._actions = lru_cache(KEPT)(lambda name, split, i: store.episode(name, split, i).actions.copy())
+        self._actions = lru_cache(CACHED_EPISODES)(lambda name, split, i: store.episode(name, split, i).actions.copy())
 
-    def choose(self, name: str, episode: int, start: int, count: int) -> list[Other]:
-        """Up to `count`, as many as there are, for the held-out window at `start` of `episode` (position in the store).
+    def choose(self, name: str, episode: int, start: int, count: int) -> list[OtherWindow]:
+        """Up to `count` windows for the held-out window at `start` of `episode` (position in the store).
 
-        One of every other held-out episode before a second one of any; then, where these are too few, of training
-        episodes. A longer list begins with the shorter one.
+        One of every other held-out episode comes before a second one of any; if these are too few, training episodes
+        follow. A longer list begins with the shorter one.
         """
         own = int(self._store.manifest(name).val.episodes[episode])
         steps = int(self._store.manifest(name).val.steps[episode])
         cut = self._cuts[name]
         real = int(cut.longest(steps - start * cut.frame_step))
         seed = stream_seed(self._seed, "other actions", name, own, start)
-        found: list[Other] = []
+        found: list[OtherWindow] = []
         for split in ("val", "train"):
             if len(found) < count:
                 found += self._of(name, split, real, seed, episode if split == "val" else -1, count - len(found))
         return found
 
-    def actions(self, name: str, others: Sequence[Other], width: int) -> np.ndarray:
+    def actions(self, name: str, others: Sequence[OtherWindow], width: int) -> np.ndarray:
         """float32 [n, T, U = width]: the chunks of each, as `Cut.actions` cuts them."""
         cut = self._cuts[name]
         chunks = [cut.chunks(self._actions(name, o.split, o.episode), o.start, width) for o in others]
         return np.stack(chunks) if chunks else np.zeros((0, self._frames, width), np.float32)
 
-    def _of(self, name: str, split: str, real: int, seed: int, own: int, count: int) -> list[Other]:
+    def _of(self, name: str, split: str, real: int, seed: int, own: int, count: int) -> list[OtherWindow]:
         """The first `count` windows of at least `real` frames that are not of episode `own`, in the order of choice."""
         windows, of_window = self._windows(name, split)
         at = np.flatnonzero((of_window >= real) & (windows.episode_idx != own))
@@ -70,7 +70,7 @@ class OtherWindows:
         first = np.searchsorted(episode[by_episode], episode[by_episode])  # where each one's episode begins
         rank = np.empty(len(at), np.int64)
         rank[by_episode] = np.arange(len(at)) - first
-        return [Other(split, *windows.locate(int(i))) for i in at[np.lexsort((h, rank))[:count]]]
+        return [OtherWindow(split, *windows.locate(int(i))) for i in at[np.lexsort((h, rank))[:count]]]
 
     def _windows(self, name: str, split: str) -> tuple[WindowSet, np.ndarray]:
         """The windows of a split, and the real frames of each."""

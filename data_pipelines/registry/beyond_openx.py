@@ -1,7 +1,7 @@
-"""What the paper's mixture adds to Open X-Embodiment: human videos and simulators.
+"""Datasets of the paper's mixture that are not in Open X-Embodiment: human videos and simulators.
 
-Nobody published these as RLDS, so the entries describe what a conversion writes (`hma data
-convert`): one camera, and one field `action`.
+Nobody published these as RLDS, so the entries describe what `hma data convert` writes: one camera, and one
+field `action`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from data_pipelines.registry.openx import openx
 
 CONVERTED = "layout: nobody published it as RLDS"
 
-OTHERS = (
+BEYOND_OPENX = (
     # DIFFERS: in the release imperial_wrist_dataset has no rate (native 10 Hz), because its table knows the
     # name imperialcollege_sawyer_wrist_cam only; and the termination flag is part of the action.
     openx("imperial_wrist_dataset", 10, {"action[:7]": 7}, "Sawyer: deltas in the hand's frame and gripper",

@@ -1,6 +1,6 @@
-"""What would have been seen under other actions: an optional column of the frozen windows, from a simulator.
+"""Counterfactual frames: what a camera would have shown under other actions, for frozen windows of simulated robots.
 
-Owns the file. Who can simulate fills it (`experiments.preparing.counterfactual`).
+Owns the file; `experiments.preparing.counterfactual` simulates the frames.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ META = "made_for"
 
 
 @dataclass(frozen=True)
-class OtherTruth:
-    """True frames of each window under the first of its `other_windows`' actions, from the prompt on."""
+class CounterfactualFrames:
+    """True frames of each frozen window under the actions of the first window that `OtherWindows` chooses for it."""
 
     manifest: str  # hash of the frozen windows
-    prompt: int  # frames; the last one's chunk is the first that differs
+    prompt: int  # frames that are as recorded; the chunk of the last of them is the first other one
     frames: Mapping[str, np.ndarray]  # of a dataset: uint8 [windows, T - prompt, H, W, 3], in their frozen order
 
     def save(self, path: Path) -> None:
-        """Whole or not at all, the same bytes for the same frames."""
+        """Writes the file atomically; equal frames give equal bytes."""
         meta = np.frombuffer(json.dumps({"manifest": self.manifest, "prompt": self.prompt}).encode(), np.uint8)
         write_arrays(path, {META: meta} | dict(self.frames))
 
     @classmethod
-    def load(cls, path: Path) -> OtherTruth:
+    def load(cls, path: Path) -> CounterfactualFrames:
         """Raises DataError if it is missing or damaged."""
         try:
             with np.load(path) as arrays:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.windows.counterfactual import CounterfactualFrames
 from data_pipelines.windows.cut import make_cut
 from data_pipelines.windows.evalset import eval_batches, freeze_manifest
-from data_pipelines.windows.others import OtherWindows
-from data_pipelines.windows.truth import OtherTruth
+from data_pipelines.windows.other_actions import OtherWindows
 from data_pipelines.windows.windows import WindowSet
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
@@ -19,7 +19,9 @@ def batches(store, count: int, prompt: int | None = None, **options):
     """(frozen windows, the one batch of all of them)."""
     frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=prompt)
     table = store.embodiment_table(store.names)
-    (batch,) = eval_batches(store, table, frozen, sum(len(d.windows) for d in frozen.datasets), others=count, **options)
+    (batch,) = eval_batches(
+        store, table, frozen, sum(len(d.windows) for d in frozen.datasets), other_actions=count, **options
+    )
     return frozen, batch
 
 
@@ -45,7 +47,7 @@ def test_a_window_has_the_same_ones_in_any_batch_and_a_longer_list_begins_with_t
     frozen, five = batches(store, 5)
     _, nine = batches(store, 9)
     np.testing.assert_array_equal(five["other_actions"], nine["other_actions"][:, :5])
-    for row, single in enumerate(eval_batches(store, store.embodiment_table(("toy",)), frozen, 1, others=5)):
+    for row, single in enumerate(eval_batches(store, store.embodiment_table(("toy",)), frozen, 1, other_actions=5)):
         np.testing.assert_array_equal(single["other_actions"][0], five["other_actions"][row])
     assert len(np.unique(five["other_actions"], axis=0)) > 1  # not the same for all windows
 
@@ -97,33 +99,33 @@ def test_they_cover_every_real_frame_of_a_short_window(tmp_path):
 # --- What would have been seen ----------------------------------------------------------------
 
 
-def truth_for(frozen, dataset: str = "toy") -> OtherTruth:
+def frames_for(frozen, dataset: str = "toy") -> CounterfactualFrames:
     (windows,) = [d.windows for d in frozen.datasets if d.dataset == dataset]
     frames = np.random.default_rng(0).integers(0, 255, (len(windows), 2, 8, 8, 3)).astype(np.uint8)
-    return OtherTruth(frozen.hash(), 2, {dataset: frames})
+    return CounterfactualFrames(frozen.hash(), 2, {dataset: frames})
 
 
 def test_frames_under_other_actions_follow_the_prompt(tmp_path):
     small_store(tmp_path, "arm")
     store = small_store(tmp_path, "toy")
     frozen = freeze_manifest(store, store.names, 4, 5, 0)
-    truth = truth_for(frozen)
-    truth.save(tmp_path / "t.npz")
+    counterfactual = frames_for(frozen)
+    counterfactual.save(tmp_path / "t.npz")
     before = (tmp_path / "t.npz").read_bytes()
-    truth.save(tmp_path / "t.npz")
+    counterfactual.save(tmp_path / "t.npz")
     assert (tmp_path / "t.npz").read_bytes() == before
-    _, batch = batches(store, 1, truth=OtherTruth.load(tmp_path / "t.npz"))
+    _, batch = batches(store, 1, counterfactual=CounterfactualFrames.load(tmp_path / "t.npz"))
     toy = np.asarray([name == "toy" for name in batch["dataset"]])
     assert batch["other_seen"].tolist() == toy.tolist()
     np.testing.assert_array_equal(batch["other_images"][:, :2], batch["images"][:, :2])
-    np.testing.assert_array_equal(batch["other_images"][toy, 2:], truth.frames["toy"])
+    np.testing.assert_array_equal(batch["other_images"][toy, 2:], counterfactual.frames["toy"])
 
 
 def test_nothing_is_seen_under_actions_that_there_are_not(tmp_path):
     """The held-out episode is longer than all others: none covers its window."""
     store = small_store(tmp_path, lengths=(3, 4), min_val=1)
     frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
-    _, batch = batches(store, 1, prompt=2, truth=truth_for(frozen))
+    _, batch = batches(store, 1, prompt=2, counterfactual=frames_for(frozen))
     assert not batch["other_valid"].any() and not batch["other_seen"].any()
     np.testing.assert_array_equal(batch["other_images"], batch["images"])
 
@@ -132,12 +134,12 @@ def test_frames_of_other_windows_or_damaged_ones_are_refused(tmp_path):
     store = small_store(tmp_path)
     frozen = freeze_manifest(store, store.names, 4, 5, 1)
     with pytest.raises(ConfigError, match="made for other windows than those frozen here"):
-        batches(store, 1, truth=truth_for(frozen))
-    truth_for(frozen).save(tmp_path / "t.npz")
+        batches(store, 1, counterfactual=frames_for(frozen))
+    frames_for(frozen).save(tmp_path / "t.npz")
     whole = (tmp_path / "t.npz").read_bytes()
     at = 30 + sum(np.frombuffer(whole[26:30], "<u2").tolist())  # where the first array begins, packed
     changed = whole[:at] + b"\xff" + whole[at + 1 :]
     for content in (b"", whole[:-30], changed):
         (tmp_path / "t.npz").write_bytes(content)
         with pytest.raises(DataError, match="t.npz: the frames under other actions cannot be read"):
-            OtherTruth.load(tmp_path / "t.npz")
+            CounterfactualFrames.load(tmp_path / "t.npz")
