@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.sampling.order import endless_shuffle, hash64, permute, random_below, stream_seed
-from data_pipelines.sampling.splits import held_out, smallest_hashes
+from data_pipelines.sampling.splits import held_out, smallest_hashes, subset
 
 
 @pytest.mark.parametrize("n", [*range(1, 40), 63, 64, 65, 1000, 60_000, 65_535, 65_536, 65_537, 10**6])
@@ -68,6 +68,8 @@ def test_order_does_not_change_between_releases():
     assert hash64(np.arange(2), 5).tolist() == [13168350753275463132, 7134611160154358618]
     assert endless_shuffle(np.arange(10), 10, 0).tolist() == [0, 2, 4, 6, 1, 7, 9, 3, 8, 5]
     assert endless_shuffle(np.arange(3), 100_000, 0).tolist() == [36333, 38480, 56565]
+    assert np.flatnonzero(held_out("arm", np.arange(100))).tolist() == [16, 52, 60, 64, 81]
+    assert smallest_hashes("arm", np.arange(100), 3, "subset/0").tolist() == [11, 29, 68]
 
 
 def test_random_below_is_even():
@@ -83,7 +85,7 @@ def test_held_out_depends_on_the_dataset_not_on_order():
 
 
 @pytest.mark.parametrize(
-    "episodes, expected", [(1, 0), (2, 1), (3, 1), (4, 1), (8, 2), (25, 2), (100, 5), (10_000, 200)]
+    "episodes, expected", [(1, 0), (2, 1), (3, 1), (4, 1), (8, 2), (25, 2), (55, 3), (100, 5), (10_000, 200)]
 )
 def test_held_out_number_is_bounded_and_leaves_three_in_four_for_training(episodes, expected):
     assert held_out("arm", np.arange(episodes)).sum() == expected
@@ -100,10 +102,21 @@ def test_subsets_are_nested():
     everything = np.arange(0, 2000, 3)
     previous: set[int] = set()
     for count in (1, 10, 100, 500):
-        chosen = set(smallest_hashes("arm", everything, count, "subset/0").tolist())
-        assert len(chosen) == count and previous <= chosen
+        positions = smallest_hashes("arm", everything, count, "subset/0").tolist()
+        chosen = set(positions)
+        assert len(chosen) == count and previous <= chosen and positions == sorted(positions)
         previous = chosen
     assert smallest_hashes("arm", everything, None, "x").tolist() == list(range(len(everything)))
+
+
+def test_a_subset_follows_names_whatever_else_could_have_been_drawn():
+    ids, present = hash64(np.arange(60), 1), np.arange(60)
+    drawn = subset("arm", ids, present >= 0, present, 10, "s").tolist()
+    assert len(drawn) == 10
+    fewer = (present % 3 == 0) | np.isin(present, drawn)
+    assert subset("arm", ids, fewer, present, 10, "s").tolist() == drawn
+    left = present[present != drawn[4]]
+    assert left[subset("arm", ids, fewer, left, 10, "s")].tolist() == [e for e in drawn if e != drawn[4]]
 
 
 def test_subset_follows_the_episode_not_its_position():
