@@ -138,7 +138,7 @@ def test_what_the_expert_can_do_is_as_the_page_says():
         )
     )  # fmt: skip
     assert f"reaches the mark in {worst} to 100 % of episodes" in page
-    assert f"two grippers it does in {most} and 100 %" in page and f"in {fewest} to {hard}." in page
+    assert f"two grippers in {most} and 100 %" in page and f"in {fewest} to {hard} %." in page
 
 
 ROBOTS = "pusher_sand", "arm_chalk"
