@@ -73,9 +73,9 @@ def make_frame_loader(
             reasons[spec.name] = f"it has no {split} episode"
             if split == "val":
                 bound = f"val_fraction={val_fraction:g}, min_val={min_val} and max_val={max_val} say how many are"
-                lost = f"the {all_held_out.sum():,} of its {len(all_held_out):,} that are held out are all lost"
+                skipped = f"the {all_held_out.sum():,} of its {len(all_held_out):,} that are held out were all skipped"
                 none = f"of {len(mask)} none is held out, for which there must be at least two"
-                reasons[spec.name] += f": {lost if all_held_out.any() else none}; {bound}"
+                reasons[spec.name] += f": {skipped if all_held_out.any() else none}; {bound}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)
         streams[spec.name] = _Stream(source, spec.image_key, episodes, order)

@@ -65,7 +65,7 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
     weighed = sets
     if config.weighed == "all" and config.max_trajectories is not None:
         weighed = {name: _windows(store, name, config, None) for name in names}
-    # Nothing can be drawn of a dataset whose trajectories under the cap were all lost, whatever else it has.
+    # Nothing can be drawn of a dataset whose trajectories under the cap were all skipped, whatever else it has.
     counts = {name: len(weighed[name]) if len(s) else 0 for name, s in sets.items()}
     return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.shortage() for n, s in sets.items()}))
 

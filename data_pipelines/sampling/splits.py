@@ -78,8 +78,8 @@ def subset(
 ) -> np.ndarray:
     """Positions in `present`, ascending, of the episodes among the `count` that are drawn.
 
-    Drawn from `members` (bool per entry of `ids`), whether they are `present` (numbers of episodes) or lost:
-    a lost one leaves a gap, which no other fills.
+    Drawn from `members` (bool per entry of `ids`), whether they are `present` (numbers of episodes) or were skipped:
+    a skipped episode that is drawn is not replaced by another.
     """
     numbers = np.flatnonzero(members)
     drawn = np.zeros(len(ids), bool)

@@ -94,10 +94,10 @@ class EpisodeSource(ABC):
     `location`: where it lies. `features`: the fields of a step by their flat key, `steps/...`.
     `runs`: the names of all its episodes, readable or not (see `identity`).
 
-    Damage: with corrupt="raise" every damaged part is an error. With "skip", what can be read is
-    listed, `skip` accepts unusable episodes, and all losses are counted in `skipped`; more than
-    `max_skipped` of them (below 1: more than this share of `runs`) raise DataError. A place that cannot be
-    read at all is no damage: it raises UnreachableError under both.
+    Damage: with corrupt="raise" every damaged part is an error. With "skip", the episodes that can be read are
+    listed, `skip` accepts unusable ones, and all that are left out are counted in `skipped`; more than
+    `max_skipped` of them (below 1: more than this share of `runs`) raise DataError. A location that cannot be
+    read at all is not damage: it raises UnreachableError under both policies.
     """
 
     name: str
@@ -113,7 +113,7 @@ class EpisodeSource(ABC):
         require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
         count_skippable(max_skipped, 0)
         self.corrupt, self._limit = corrupt, max_skipped
-        self.skipped: dict[str, int] = {}  # reason -> episodes lost
+        self.skipped: dict[str, int] = {}  # reason -> episodes
         self._counted: set[int] = set()  # episodes that `skip` has counted
 
     @property
@@ -230,15 +230,15 @@ class EpisodeSource(ABC):
             raise error
         if i not in self._counted:
             self._counted.add(i)
-            self.lose(str(error), 1)
+            self.count_skipped(str(error), 1)
 
-    def lose(self, reason: str, episodes: int) -> None:
-        """Counts episodes that are not there. Raises DataError if they are too many."""
+    def count_skipped(self, reason: str, episodes: int) -> None:
+        """Counts unusable or missing episodes. Raises DataError if they are too many."""
         self.skipped[reason] = self.skipped.get(reason, 0) + episodes
-        lost = sum(self.skipped.values())
-        if lost > self.max_skipped:
+        total = sum(self.skipped.values())
+        if total > self.max_skipped:
             raise DataError(
-                f"{self.name}: {lost} episodes are unusable, more than max_skipped={self.max_skipped}. "
+                f"{self.name}: {total} episodes are unusable, more than max_skipped={self.max_skipped}. "
                 f"The last: {without_advice(reason)} If the rest is worth it, raise the limit: "
                 "--set store.max_skipped=N."
             )

@@ -24,7 +24,7 @@ from pathlib import Path
 from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.files import remove, sync
 from data_pipelines.publishing.output_lock import backoff, find_held_lock, lock_output
-from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts
+from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, SkippedEpisodes, SplitFacts
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import merge_all
 from data_pipelines.tokens.part_files import Part, PartFacts, read_part
@@ -44,8 +44,8 @@ def write_dataset(
     parts: Sequence[Part],
     make: Make,
     *,
-    lost: Sequence[LostEpisodes] = (),
-    max_lost: int = 0,
+    skipped: Sequence[SkippedEpisodes] = (),
+    max_skipped: int = 0,
     overwrite: bool = False,
     wait: bool = True,
     progress: Progress | None = None,
@@ -53,15 +53,15 @@ def write_dataset(
     """Makes the missing parts of `<store_root>/<plan.spec.name>` that no other process makes, and publishes it.
 
     `plan`: the manifest without statistics and splits. `parts` cover the source in order, as
-    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or LostEpisodes
-    for one that cannot be used; equal parts must give equal items. `lost` are episodes that are
+    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or SkippedEpisodes
+    for one that cannot be used; equal parts must give equal items. `skipped` are episodes that are
     in no part. A dataset that is there, made from the same source in the same way, is kept; one
     made otherwise is refused or, with `overwrite`, removed.
 
     Parts that other processes are making are waited for, and made here if those die; without
     `wait` None is returned instead of the manifest. Raises ConfigError for another dataset in its
     place, or one that other processes are making there, and a directory that cannot be written;
-    DataError for more than `max_lost` lost episodes, those that other processes lost included, or no
+    DataError for more than `max_skipped` skipped episodes, those that other processes skipped included, or no
     training episode at all; and what `make` raises.
     """
     root = Path(store_root)
@@ -69,7 +69,7 @@ def write_dataset(
     try:
         if overwrite:
             _remove_others(root, plan, parts)
-        maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
+        maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(skipped), max_skipped)
         pauses = backoff()
         while True:
             try:
@@ -135,7 +135,7 @@ def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifes
 def _publish(maker: PartMaker) -> None:
     """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
     work, final, plan = maker.work, maker.final, maker.plan
-    maker.check_losses()
+    maker.check_skipped()
     try:
         with lock_output(locks_of(work) / "publish") as lock:
             facts = []
@@ -145,7 +145,7 @@ def _publish(maker: PartMaker) -> None:
                     maker.forget(part)
                     return
                 facts.append(known)
-            manifest = _merge(plan, facts, maker.lost)
+            manifest = _merge(plan, facts, maker.skipped)
             if not manifest.train.episodes:
                 last = f" The last left out: {without_advice(manifest.skipped[-1].reason)}" if manifest.skipped else ""
                 raise DataError(f"{plan.spec.name}: no usable episode is left to train on.{last}")
@@ -161,7 +161,7 @@ def _publish(maker: PartMaker) -> None:
         pass
 
 
-def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[LostEpisodes]) -> Manifest:
+def _merge(plan: Manifest, facts: Sequence[PartFacts], skipped: Sequence[SkippedEpisodes]) -> Manifest:
     moments = merge_all((f.moments for f in facts), plan.spec.action_dim)
     splits = {}
     for split in SPLITS:
@@ -180,7 +180,7 @@ def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[LostEpisod
         action_min=moments.low,
         action_max=moments.high,
         action_quantiles=merge_samples(f.sample for f in facts).quantiles(),
-        skipped=(*lost, *(loss for f in facts for loss in f.lost)),
+        skipped=(*skipped, *(more for f in facts for more in f.lost)),
         **splits,
     )
 
@@ -201,7 +201,7 @@ def _published(final: Path, plan: Manifest) -> Manifest | None:
 
 def _changes(there: Manifest, plan: Manifest) -> list[str]:
     inputs = ("spec", "tokenizer", "settings", "source", "recipe")
-    n, asked = len(there.train.episodes) + len(there.val.episodes) + there.lost, plan.settings
+    n, asked = len(there.train.episodes) + len(there.val.episodes) + there.skipped_count, plan.settings
     own = replace(asked, max_val_fraction=there.settings.max_val_fraction)
     if own.count_held_out(n) == asked.count_held_out(n):  # the limit differs, and changes nothing here
         plan = replace(plan, settings=own)

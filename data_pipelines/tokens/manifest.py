@@ -115,8 +115,8 @@ class SplitFacts:
 
 
 @dataclass(frozen=True)
-class LostEpisodes:
-    """Episodes that could not be used."""
+class SkippedEpisodes:
+    """Unusable episodes of one file, or a single one, and why they were left out."""
 
     reason: str
     file: str = ""  # name of the shard or file they lie in
@@ -140,7 +140,7 @@ class Manifest:
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
     action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
-    skipped: tuple[LostEpisodes, ...] = ()  # what was left out
+    skipped: tuple[SkippedEpisodes, ...] = ()  # what was left out
     runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
     recipe: int = 1  # RECIPE of the code that made it; 1 for stores that do not say
     format: int = FORMAT
@@ -163,9 +163,9 @@ class Manifest:
         return self.settings.frame_step
 
     @property
-    def lost(self) -> int:
+    def skipped_count(self) -> int:
         """Episodes left out."""
-        return sum(loss.episodes for loss in self.skipped)
+        return sum(entry.episodes for entry in self.skipped)
 
     def split(self, name: str) -> SplitFacts:
         require(name in SPLITS, f"split must be 'train' or 'val', got {name!r}")

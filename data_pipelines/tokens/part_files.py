@@ -26,7 +26,7 @@ from array_record.python import array_record_module
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
-from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, part_name
+from data_pipelines.tokens.manifest import SPLITS, SkippedEpisodes, part_name
 from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row, read_moments
 from data_pipelines.tokens.row_sample import RowSample, RowSampler, rows_of_part
 from hma_jax.config import ConfigError
@@ -35,8 +35,8 @@ from hma_jax.config.json import from_dict, to_dict
 FACTS = "parts"
 """Directory of the facts of all parts."""
 
-PartItem = tuple[str, StoredEpisode] | LostEpisodes
-"""One of what a part is made of: an episode with its split, or what could not be used."""
+PartItem = tuple[str, StoredEpisode] | SkippedEpisodes
+"""An item of a part: an episode with its split, or an unusable one."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class PartFacts:
     train: PartSplit
     val: PartSplit
     moments: Moments  # of the native actions of the train split
-    lost: tuple[LostEpisodes, ...]
+    lost: tuple[SkippedEpisodes, ...]  # called so in the file
     sample: RowSample = RowSample()  # of the same actions
 
 
@@ -85,11 +85,11 @@ def write_part(
         split: _SplitWriter(scratch / part_name(split, part.number, part.count), split in keep_frames)
         for split in SPLITS
     }
-    lost: list[LostEpisodes] = []
+    skipped: list[SkippedEpisodes] = []
     moments, rows, sampler = [], [], RowSampler(rows_of_part(part.count))
     for item in items:
-        if isinstance(item, LostEpisodes):
-            lost.append(item)
+        if isinstance(item, SkippedEpisodes):
+            skipped.append(item)
             continue
         split, episode = item
         if split == "train" and len(episode.actions):
@@ -104,7 +104,7 @@ def write_part(
         sync(beside)
         os.replace(beside, directory / beside.name)
     splits = [writers[split].close() for split in SPLITS]
-    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost), sampler.sample())
+    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(skipped), sampler.sample())
     new_facts = scratch / "facts.json"
     new_facts.write_text(json.dumps(to_dict(facts)))
     sync(new_facts)

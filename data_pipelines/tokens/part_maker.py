@@ -1,6 +1,6 @@
 """The parts of a dataset that is being made: which are finished, which are free, and who makes them.
 
-Owns the locks of parts and the count of lost episodes over all processes. Each process takes the next
+Owns the locks of parts and the count of skipped episodes over all processes. Each process takes the next
 part that is neither finished nor locked; the part of a dead process is free again.
 """
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.output_lock import OutputLock, lock_output
-from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, Manifest
+from data_pipelines.tokens.manifest import SPLITS, Manifest, SkippedEpisodes
 from data_pipelines.tokens.part_files import FACTS, Part, PartItem, read_part, write_part
 from hma_jax.runtime.locks import Held
 
@@ -37,9 +37,9 @@ class PartMaker:
     final: Path  # where the dataset will be
     plan: Manifest
     parts: Sequence[Part]
-    lost: tuple[LostEpisodes, ...]  # episodes in no part
-    max_lost: int
-    _done: dict[int, tuple[LostEpisodes, ...]] = field(default_factory=dict)  # what each part that is there lost
+    skipped: tuple[SkippedEpisodes, ...]  # in no part
+    max_skipped: int
+    _done: dict[int, tuple[SkippedEpisodes, ...]] = field(default_factory=dict)  # per finished part: what was skipped
 
     def complete(self) -> bool:
         """Whether every part is there."""
@@ -52,11 +52,11 @@ class PartMaker:
     def make_free_parts(self, make: Make, progress: Progress | None) -> None:
         """Makes every part that is missing and that no other process makes.
 
-        Raises DataError for too many lost episodes, OSError, and what `make` raises.
+        Raises DataError for too many skipped episodes, OSError, and what `make` raises.
         """
         (self.work / FACTS).mkdir(parents=True, exist_ok=True)
         missing = [part for part in self.parts if not self._there(part)]
-        self.check_losses()
+        self.check_skipped()
         total = sum(len(part.episodes) for part in self.parts)
         report = (lambda done: progress(done, total)) if progress else (lambda done: None)
         report(self._episodes_there())
@@ -71,17 +71,17 @@ class PartMaker:
             except Held:
                 others.append(part)
             others = [part for part in others if not self._there(part)]
-            self.check_losses()
+            self.check_skipped()
 
     def _make(self, part: Part, make: Make, lock: OutputLock, report: Callable[[int], None]) -> None:
         before = self._episodes_there()
 
         def counted() -> Iterator[PartItem]:
-            lost: list[LostEpisodes] = []
+            skipped: list[SkippedEpisodes] = []
             for n, item in enumerate(make(part), start=1):
-                if isinstance(item, LostEpisodes):
-                    lost.append(item)
-                    self.check_losses(lost)
+                if isinstance(item, SkippedEpisodes):
+                    skipped.append(item)
+                    self.check_skipped(skipped)
                 yield item
                 report(before + n)
 
@@ -97,11 +97,11 @@ class PartMaker:
     def _there(self, part: Part) -> bool:
         """Whether a part is finished, by whichever process.
 
-        One with losses was made when they were allowed. Made again, it says what is wrong.
+        A part with skipped episodes, made when that was allowed, does not count where it is not: made again, it raises.
         """
         if part.number not in self._done:
             facts = read_part(self.work, part)
-            if facts is None or (facts.lost and not self.max_lost):
+            if facts is None or (facts.lost and not self.max_skipped):
                 return False
             self._done[part.number] = facts.lost
         return True
@@ -109,13 +109,13 @@ class PartMaker:
     def _episodes_there(self) -> int:
         return sum(len(part.episodes) for part in self.parts if part.number in self._done)
 
-    def check_losses(self, more: Sequence[LostEpisodes] = ()) -> None:
-        """DataError if too many episodes are lost by all processes together, and `more` in the part at hand."""
-        losses = [*self.lost, *chain.from_iterable(self._done.values()), *more]
-        lost = sum(loss.episodes for loss in losses)
-        if lost > self.max_lost:
+    def check_skipped(self, more: Sequence[SkippedEpisodes] = ()) -> None:
+        """Raises DataError if all processes together, with `more` in the part at hand, skipped too many episodes."""
+        skipped = [*self.skipped, *chain.from_iterable(self._done.values()), *more]
+        total = sum(entry.episodes for entry in skipped)
+        if total > self.max_skipped:
             raise DataError(
-                f"{self.plan.spec.name}: {lost} episodes are unusable, more than max_skipped={self.max_lost}. "
-                f"The last: {without_advice(losses[-1].reason)} If the rest is worth it, raise the limit: "
+                f"{self.plan.spec.name}: {total} episodes are unusable, more than max_skipped={self.max_skipped}. "
+                f"The last: {without_advice(skipped[-1].reason)} If the rest is worth it, raise the limit: "
                 "--set store.max_skipped=N."
             )

@@ -5,7 +5,7 @@ episodes are put through the tokenizer in equal pieces. Reading ahead is in `rea
 restarts, several processes and publishing are in `dataset_writer`.
 DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written,
 and everything behind it is misaligned (reference section 5.1). Here an episode is stored whole,
-or recorded as lost with its file and offset.
+or recorded as skipped with its file and offset.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
     RECIPE,
     JobSettings,
-    LostEpisodes,
     Manifest,
+    SkippedEpisodes,
     SplitFacts,
     TokenizerFacts,
     rate_in_words,
@@ -92,16 +92,17 @@ def tokenize_dataset(
         max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
     )  # fmt: skip
     work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8))
-    lost = [
-        LostEpisodes(_without_place(reason, source), episodes=count) for reason, count in sorted(source.skipped.items())
+    skipped = [
+        SkippedEpisodes(_without_place(reason, source), episodes=count)
+        for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
         store_root,
         plan,
         cut_parts(source.sizes(), part_size),
         work.make,
-        lost=lost,
-        max_lost=source.max_skipped if corrupt == "skip" else 0,
+        skipped=skipped,
+        max_skipped=source.max_skipped if corrupt == "skip" else 0,
         overwrite=overwrite,
         wait=wait,
         progress=progress,
@@ -198,7 +199,7 @@ class _Work:
         self._is_val = held_out_episodes(plan.spec, source.runs, *bounds)[self._numbers]
 
     def make(self, part: Part) -> Iterator[PartItem]:
-        """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""
+        """The episodes of a part, in order. An unusable one is skipped, or raised, as the source's policy says."""
         spec, size = self._plan.spec, self._plan.tokenizer.image_size
         items = frames_ahead(
             part.episodes,
@@ -238,7 +239,7 @@ class _Work:
             episode = pending.popleft()
             tokens = encoder.take(episode.came)
             if episode.end.error is not None:
-                yield self._lose(episode.end.error)
+                yield self._skip(episode.end.error)
                 continue
             begin = episode.begin
             frames = np.stack(episode.frames) if episode.keep else None
@@ -254,8 +255,8 @@ class _Work:
                 ),
             )
 
-    def _lose(self, error: EpisodeError) -> LostEpisodes:
+    def _skip(self, error: EpisodeError) -> SkippedEpisodes:
         if self._source.corrupt == "raise":
             raise error
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
-        return LostEpisodes(_without_place(str(error), self._source), *place)
+        return SkippedEpisodes(_without_place(str(error), self._source), *place)

@@ -85,7 +85,7 @@ class WindowSet:
         if not self.longest:
             return f"it has no {self.split} episode"
         if self.longest >= self.needed:
-            return "the trajectories that were drawn of it are all lost: raise max_trajectories"
+            return "the trajectories that were drawn of it were all skipped: raise max_trajectories"
         return (
             f"{self.least} frames, the least there may be, need {self.needed} native frames at stride "
             f"{self.cut.stride}; the longest of its {self.too_short} {self.split} episodes has {self.longest}"
@@ -163,7 +163,7 @@ def _windows(store: TokenStore, name: str, split: str, cut: Cut, least: int, lim
 def _chosen(manifest: Manifest, split: str, usable: np.ndarray, limit: int, salt: str) -> np.ndarray:
     """Positions in the store's split, ascending, of those `usable` (bool) episodes that are among the `limit` drawn.
 
-    Drawn from the usable ones and those that were lost, whose length nobody knows: what is lost leaves a gap.
+    They are drawn from the usable ones and the skipped ones, whose length nobody knows: a skipped one is not replaced.
     """
     name, present = manifest.spec.name, np.asarray(manifest.split(split).episodes, np.int64)
     at = np.flatnonzero(usable)

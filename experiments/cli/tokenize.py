@@ -135,7 +135,7 @@ def show_store(workspace: Workspace, rate: float | None) -> None:
             name,
             f"{len(steps)}",
             f"{len(manifest.val.steps)}",
-            f"{manifest.lost}",
+            f"{manifest.skipped_count}",
             f"{manifest.train.native_frames + manifest.val.native_frames}",
             f"{steps.min()}",
             f"{np.median(steps):g}",
@@ -145,10 +145,10 @@ def show_store(workspace: Workspace, rate: float | None) -> None:
         )
     console.print(table)
     for name in store.names:
-        losses = store.manifest(name).skipped
-        for loss in losses[:MAX_EXAMPLES]:
-            console.print(f"[yellow]lost[/] {name}: {escape(without_advice(loss.reason))}", soft_wrap=True)
-        if rest := sum(loss.episodes for loss in losses[MAX_EXAMPLES:]):
+        skipped = store.manifest(name).skipped
+        for one in skipped[:MAX_EXAMPLES]:
+            console.print(f"[yellow]lost[/] {name}: {escape(without_advice(one.reason))}", soft_wrap=True)
+        if rest := sum(one.episodes for one in skipped[MAX_EXAMPLES:]):
             console.print(
                 f"[yellow]lost[/] {name}: {rest:,} more, see {short(store.root / name / FILE)}", soft_wrap=True
             )

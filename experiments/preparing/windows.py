@@ -147,7 +147,7 @@ def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float 
             "padded": windows.padded,
             "windows": len(windows),
             "held_out": len(manifest.val.episodes),
-            "skipped": manifest.lost,
+            "skipped": manifest.skipped_count,
         }
     return summary
 

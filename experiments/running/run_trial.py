@@ -98,7 +98,7 @@ def train_trial(
     store, loader = materials.store, loader_of(trial)
     table = table or training_table(store, loader, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
-    lost = {"lost": {name: store.manifest(name).lost for name in trial.datasets}}  # damaged episodes, left out
+    lost = {"lost": {name: store.manifest(name).skipped_count for name in trial.datasets}}  # damaged episodes, left out
 
     def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
         before = {"order": 1} | provenance["loader"]  # of versions that did not say in which order they drew

@@ -194,7 +194,7 @@ class RldsDataset(EpisodeSource):
             )
             if self.corrupt == "raise" or shard.records > count:
                 raise DataError(message)
-            self.lose(str(problem or message), count - shard.records)
+            self.count_skipped(str(problem or message), count - shard.records)
         if not len(self):
             why = next(iter(self.skipped), None) or self._said_empty()
             raise DataError(f"{self.directory}: split {self.split!r} has no readable episode: {why}")

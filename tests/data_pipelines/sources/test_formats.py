@@ -344,7 +344,7 @@ def test_a_damaged_video_loses_its_episode_alone(tmp_path):
     with pytest.raises(EpisodeError, match=clip.name):
         tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "a", frame_step=1)
     manifest = tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "b", frame_step=1, corrupt="skip")
-    assert manifest.lost == 1 and 2 not in (*manifest.train.episodes, *manifest.val.episodes)
+    assert manifest.skipped_count == 1 and 2 not in (*manifest.train.episodes, *manifest.val.episodes)
     clip.unlink()
     write_video(clip, [48 + t for t in range(6)], 10)  # shorter than the table says
     with pytest.raises(EpisodeError, match="no frame at"):

@@ -49,7 +49,7 @@ def test_losing_episodes_moves_no_other(tmp_path):
     tokenize_dataset(SPEC, directory, FakeTokenizer(), tmp_path / "less", **OPTIONS)
     whole, less = TokenStore(tmp_path / "whole"), TokenStore(tmp_path / "less")
     before, after = whole.manifest("toy"), less.manifest("toy")
-    assert len(before.val.episodes) == 50 and after.lost == 5
+    assert len(before.val.episodes) == 50 and after.skipped_count == 5
     assert set(after.val.episodes) == set(before.val.episodes) - lost
     assert set(after.train.episodes) == set(before.train.episodes) - lost
     for limit in (1, 10, 100, 900):

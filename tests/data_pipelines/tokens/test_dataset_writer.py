@@ -262,7 +262,7 @@ def test_losses_of_all_processes_count_against_the_bound(lossy, tmp_path):
     assert len(kept_parts(tmp_path / "a")) <= 7, "it went on to the end before it said so"
     with pytest.raises(EpisodeError, match="not finite"):  # parts with losses are no longer good enough
         run(lossy, tmp_path / "a")
-    assert run(lossy, tmp_path / "a", corrupt="skip", max_skipped=4).lost == 4
+    assert run(lossy, tmp_path / "a", corrupt="skip", max_skipped=4).skipped_count == 4
 
 
 def test_losses_of_a_process_at_the_same_time_are_seen_before_the_end(lossy, tmp_path):
