@@ -154,9 +154,9 @@ def inspect_dataset(
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
     if not any(f.per_step for f in fields):
-        there = ", ".join(f.key for f in fields[:MAX_EXAMPLES])
+        keys = ", ".join(f.key for f in fields[:MAX_EXAMPLES])
         raise DataError(
-            f"{source.schema}: none of its fields ({there}) is one of a step, below `steps`: these are no episodes. Give a "
+            f"{source.schema}: none of its fields ({keys}) is one of a step, below `steps`: these are no episodes. Give a "
             "dataset in the layout of RLDS, or write this one so (docs/own_data.md, Writing RLDS)."
         )
     cameras = {f.key: _CameraLog(f.key) for f in fields if f.per_step and f.kind == "image"}

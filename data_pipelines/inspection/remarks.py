@@ -82,8 +82,8 @@ def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Remark]:
             missing.append(f"{key} with {dim} values")
     if not missing:
         return []
-    there = [c.key for c in facts.cameras] + [f"{key} ({n})" for key, n in sizes.items()]
-    text = f"the registry's entry wants {', '.join(missing)}; there are {', '.join(there) or 'neither'}"
+    available = [c.key for c in facts.cameras] + [f"{key} ({n})" for key, n in sizes.items()]
+    text = f"the registry's entry wants {', '.join(missing)}; there are {', '.join(available) or 'neither'}"
     return [Remark("bad", MISFIT, text)]
 
 

@@ -35,7 +35,7 @@ from hma_jax.runtime.locks import Held
 
 GENERATOR = 1
 """Raise it when simulation, behaviour, drawing or encoding change: older datasets are then told apart
-(`made_before`)."""
+(`made_by_other_versions`)."""
 
 JOB_EPISODES = 10
 """At most so many episodes in one process: starting one costs a few seconds."""
@@ -51,8 +51,9 @@ def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
 
 
 def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: int) -> list[str] | None:
-    """How the dataset that is there was made otherwise; [] if by other versions of the packages or the generator alone;
-    None if it is as it should be, is not there, or lacks shards and is to be made in any case."""
+    """What differs between the settings of the existing dataset and those asked for; [] if only the versions of the
+    packages or of the generator do. None if nothing differs, or the dataset is missing or incomplete and is made in any
+    case."""
     if not directory.exists():
         return None
     metadata = read_metadata(directory)
@@ -61,19 +62,19 @@ def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: 
         return ["it says nothing of what it was made from"]
     if made_as == fingerprint(spec, episodes, size, seed) or not is_complete(directory, made_as):
         return None
-    there = {
+    existing = {
         "episodes": sum(shard_lengths(directory)),
         "size": read_features(directory)[f"steps/observation/{IMAGE_KEY}"].shape[0],
         "seed": metadata.get("seed"),
     }
     wanted = {"episodes": episodes, "size": size, "seed": seed}
-    return [f"{name}: {there[name]} -> {value}" for name, value in wanted.items() if there[name] != value]
+    return [f"{name}: {existing[name]} -> {value}" for name, value in wanted.items() if existing[name] != value]
 
 
-def made_before(root: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
-    """Which datasets are there as they are asked for, but made by other versions of the packages or the generator.
+def made_by_other_versions(root: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
+    """Datasets that exist with the settings asked for, made by other versions of the packages or of the generator.
 
-    Raises ConfigError where one is there that was made with other settings, or by others: it is not replaced.
+    Raises ConfigError for one that was made with other settings or by another program: it is not replaced.
     """
     found = {s.name: differences(s, root / s.name / VERSION, episodes, size, seed) for s in specs}
     lines = [f"{root / name / VERSION}: {'; '.join(how)}" for name, how in found.items() if how]
@@ -101,7 +102,7 @@ def generate_sim(
 
     `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
     is left as it is; what other versions of the packages or the generator made is replaced. Raises
-    ConfigError for bad arguments, missing packages, what `made_before` refuses and a dataset that another
+    ConfigError for bad arguments, missing packages, what `made_by_other_versions` refuses and a dataset that another
     process is making, DataError when a simulator fails; the other datasets are then made all the same.
     """
     require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
@@ -109,7 +110,7 @@ def generate_sim(
     require(workers >= 1, f"workers must be at least 1, got {workers}")
     specs, root = select(names), Path(root)
     require_packages(specs)
-    made_before(root, specs, episodes, size, seed)
+    made_by_other_versions(root, specs, episodes, size, seed)
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -43,21 +43,21 @@ class LeRobotSource:
         self.meta = read_meta(self.root)
         features = self.meta.features
         _check_names(features, self.root / "meta" / "info.json")
-        there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
+        available = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
         others = {
             key: tuple(feature["shape"])
             for key, feature in features.items()
             if feature["dtype"] in PICTURES and not _is_camera(feature)
         }
-        if not there:
+        if not available:
             listed = ", ".join(f"{shown(key)}: {'x'.join(map(str, shape))}" for key, shape in others.items())
             found = f" (there are {listed}; grey ones are to be written as red, green and blue)" if others else ""
             raise DataError(
                 f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels{found}."
             )
         wanted = [_short(camera) for camera in settings.camera]
-        names = choose(wanted, tuple(there), "camera", str(self.root))
-        self.cameras = {f"observation/{name}": there[name] for name in names}
+        names = choose(wanted, tuple(available), "camera", str(self.root))
+        self.cameras = {f"observation/{name}": available[name] for name in names}
         self.left_out = {f"observation/{_short(key)}": shape for key, shape in others.items()}
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self.vectors}:
@@ -109,8 +109,8 @@ class LeRobotSource:
         """The episode's rows, in order: when, and those of `columns` that the file has."""
         with _as_units():
             first, count = self._place(entry)
-            there = self._tables.columns(entry.data)
-            return self._tables.read(entry.data, [TIME, *(n for n in columns if n in there)], first, count)
+            available = self._tables.columns(entry.data)
+            return self._tables.read(entry.data, [TIME, *(n for n in columns if n in available)], first, count)
 
     def image(self, entry: EpisodeEntry, camera: str, n: int, where: str) -> bytes:
         """Frame `n` of a camera whose images the table holds or names."""
@@ -127,8 +127,8 @@ class LeRobotSource:
 
     def _place(self, entry: EpisodeEntry) -> tuple[int, int]:
         """(first row, rows) in the episode's file."""
-        there = self._tables.columns(entry.data)
-        missing = [n for n in (EPISODE, TIME, *self.vectors.values()) if n not in there]
+        available = self._tables.columns(entry.data)
+        missing = [n for n in (EPISODE, TIME, *self.vectors.values()) if n not in available]
         if missing:
             raise UnitError(f"{entry.data}: no column {shown(missing[0])}. {ADVICE}")
         place = self._tables.find(entry.data, entry.index)

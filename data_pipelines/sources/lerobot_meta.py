@@ -132,8 +132,8 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     table = read_table(path, ["task_index", *texts])
     text = [c for c in texts if c in table.column_names]
     if not text or "task_index" not in table.column_names:
-        there = ", ".join(table.column_names) or "neither"
-        raise DataError(f"{path}: of task and task_index, which are needed, it has {there}.")
+        present = ", ".join(table.column_names) or "neither"
+        raise DataError(f"{path}: of task and task_index, which are needed, it has {present}.")
     rows = enumerate(_rows(table.select(["task_index", text[0]]), path))
     return {_count(row, "task_index", f"{path}: row {line}"): str(row[text[0]]) for line, row in rows}
 

@@ -148,20 +148,20 @@ class RobomimicSource:
         shapes."""
         where = f"{self.path}: {demo.name.lstrip('/')}"
         obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # groups are none of robomimic's
-        there = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
+        available = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
         pictures = sorted(k for k in obs if obs[k].dtype == np.uint8 and obs[k].ndim == 4 and obs[k].shape[3] == 3)
-        if not there and pictures:  # as LIBERO's, agentview_rgb
+        if not available and pictures:  # as LIBERO's, agentview_rgb
             raise DataError(
                 f"{where}/obs has no *_image, as robomimic calls pictures, but {', '.join(pictures)}: rename each to end "
                 "in _image in every demonstration, in a copy of the file (h5py: obs.move(OLD, NEW))."
             )
-        if not there:
+        if not available:
             raise DataError(
                 f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a "
                 "low-dimensional or raw file. Download the image file of the task, or render one from "
                 "its states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
             )
-        cameras = choose(wanted, there, "camera", where)
+        cameras = choose(wanted, available, "camera", where)
         if "actions" not in demo:
             raise DataError(f"{where} has no 'actions'; this is not a robomimic file.")
         vectors = {"action": int(np.prod(demo["actions"].shape[1:]))}
@@ -248,15 +248,15 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
 
 def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:
     """Names in the order of their numbers."""
-    there = [name for name in file["data"] if re.fullmatch(r"demo_\d+", name)]
-    if not there:
+    names = [name for name in file["data"] if re.fullmatch(r"demo_\d+", name)]
+    if not names:
         raise DataError(f"{path}: no demonstration 'data/demo_*' in it.")
     if filter_key is not None:
         masks = sorted(file["mask"]) if "mask" in file else []
         if filter_key not in masks:
             raise ConfigError(f"{path}: no mask {filter_key!r}; it has {', '.join(masks) or 'none'}.")
         chosen = [n.decode() if isinstance(n, bytes) else str(n) for n in file["mask"][filter_key][()]]
-        missing = sorted(set(chosen) - set(there))
+        missing = sorted(set(chosen) - set(names))
         if missing:
             raise DataError(f"{path}: mask/{filter_key} names {missing[0]!r}, which 'data' does not have.")
         if not chosen:
@@ -264,5 +264,5 @@ def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:
         for name, following in pairwise(sorted(chosen)):
             if name == following:
                 raise DataError(f"{path}: mask/{filter_key} names {name!r} twice. Correct the mask.")
-        there = chosen
-    return sorted(there, key=lambda name: int(name.removeprefix("demo_")))
+        names = chosen
+    return sorted(names, key=lambda name: int(name.removeprefix("demo_")))

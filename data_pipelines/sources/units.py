@@ -102,9 +102,11 @@ def require_module(name: str, needed_by: str = "this format") -> ModuleType:
         ) from error
 
 
-def choose(wanted: Sequence[str], there: Sequence[str], what: str, where: str) -> tuple[str, ...]:
-    """`wanted`, or all that are there; ConfigError for one that is not."""
-    missing = [name for name in wanted if name not in there]
+def choose(wanted: Sequence[str], available: Sequence[str], what: str, where: str) -> tuple[str, ...]:
+    """`wanted`, or all that are available if none is wanted; ConfigError for one that is not available."""
+    missing = [name for name in wanted if name not in available]
     if missing:
-        raise ConfigError(f"{where}: no {what} {', '.join(map(repr, missing))}; it has {', '.join(there) or 'none'}.")
-    return tuple(wanted) or tuple(there)
+        raise ConfigError(
+            f"{where}: no {what} {', '.join(map(repr, missing))}; it has {', '.join(available) or 'none'}."
+        )
+    return tuple(wanted) or tuple(available)

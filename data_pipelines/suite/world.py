@@ -186,9 +186,9 @@ class World:
             s.held[s.q[:, joint] > 0.6, m] = -1
             has = s.held[:, m] >= 0
             s.hold[:, m] *= 0.8  # a held object settles between the fingers
-            there = (tools[:, m] + s.hold[:, m])[has]
-            s.object_v[rows[has], s.held[has, m]] = np.clip((there - s.objects[rows[has], s.held[has, m]]) / h, -2, 2)
-            s.objects[rows[has], s.held[has, m]] = there
+            place = (tools[:, m] + s.hold[:, m])[has]
+            s.object_v[rows[has], s.held[has, m]] = np.clip((place - s.objects[rows[has], s.held[has, m]]) / h, -2, 2)
+            s.objects[rows[has], s.held[has, m]] = place
 
     def _slide(self, h: float) -> None:
         """Objects that nobody holds go on as they went, slower by friction."""

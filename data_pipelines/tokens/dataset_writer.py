@@ -55,7 +55,7 @@ def write_dataset(
     `plan`: the manifest without statistics and splits. `parts` cover the source in order, as
     `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or SkippedEpisodes
     for one that cannot be used; equal parts must give equal items. `skipped` are episodes that are
-    in no part. A dataset that is there, made from the same source in the same way, is kept; one
+    in no part. An existing dataset that was made from the same source in the same way is kept; one
     made otherwise is refused or, with `overwrite`, removed.
 
     Parts that other processes are making are waited for, and made here if those die; without
@@ -92,9 +92,10 @@ def write_dataset(
 
 
 def differences(store_root: str | Path, plan: Manifest) -> list[str]:
-    """How the dataset of this name that is in the store was made otherwise than planned, one line per field.
+    """What differs between the existing dataset of this name and the plan, one line per field.
 
-    Empty if it is as planned, or not there. Raises DataError if it cannot be read, as one of an older format.
+    Empty if nothing does, or there is no such dataset. Raises DataError if it cannot be read, such as one of an older
+    format.
     """
     final = Path(store_root) / plan.spec.name
     return _changes(load_manifest(final / FILE), plan) if final.exists() else []
@@ -186,26 +187,26 @@ def _merge(plan: Manifest, facts: Sequence[PartFacts], skipped: Sequence[Skipped
 
 
 def _published(final: Path, plan: Manifest) -> Manifest | None:
-    """The manifest that is there, if it was made as planned; ConfigError naming what differs."""
+    """The manifest of the existing dataset, None without one. ConfigError, naming what differs, if it is not as planned."""
     if not final.exists():
         return None
-    there = load_manifest(final / FILE)
-    changes = _changes(there, plan)
+    existing = load_manifest(final / FILE)
+    changes = _changes(existing, plan)
     require(
         not changes,
         f"{final}: already tokenised in another way ({'; '.join(changes)}). "
         "Choose another store directory, or remove this dataset from the store.",
     )
-    return there
+    return existing
 
 
-def _changes(there: Manifest, plan: Manifest) -> list[str]:
+def _changes(existing: Manifest, plan: Manifest) -> list[str]:
     inputs = ("spec", "tokenizer", "settings", "source", "recipe")
-    n, asked = len(there.train.episodes) + len(there.val.episodes) + there.skipped_count, plan.settings
-    own = replace(asked, max_val_fraction=there.settings.max_val_fraction)
+    n, asked = len(existing.train.episodes) + len(existing.val.episodes) + existing.skipped_count, plan.settings
+    own = replace(asked, max_val_fraction=existing.settings.max_val_fraction)
     if own.count_held_out(n) == asked.count_held_out(n):  # the limit differs, and changes nothing here
         plan = replace(plan, settings=own)
-    return [line for name in inputs for line in diff(getattr(there, name), getattr(plan, name), name)]
+    return [line for name in inputs for line in diff(getattr(existing, name), getattr(plan, name), name)]
 
 
 def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:

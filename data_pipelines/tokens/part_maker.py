@@ -43,7 +43,7 @@ class PartMaker:
 
     def complete(self) -> bool:
         """Whether every part is there."""
-        return all(self._there(part) for part in self.parts)
+        return all(self._is_finished(part) for part in self.parts)
 
     def forget(self, part: Part) -> None:
         """For a part that turned out damaged: the next look finds it missing."""
@@ -55,26 +55,26 @@ class PartMaker:
         Raises DataError for too many skipped episodes, OSError, and what `make` raises.
         """
         (self.work / FACTS).mkdir(parents=True, exist_ok=True)
-        missing = [part for part in self.parts if not self._there(part)]
+        missing = [part for part in self.parts if not self._is_finished(part)]
         self.check_skipped()
         total = sum(len(part.episodes) for part in self.parts)
         report = (lambda done: progress(done, total)) if progress else (lambda done: None)
-        report(self._episodes_there())
+        report(self._finished_episodes())
         others: list[Part] = []  # of other processes
         for part in missing:
             if self.final.exists():
                 return
             try:
                 with lock_output(locks_of(self.work) / f"{part.number:05d}") as lock:
-                    if not self._there(part):  # another process may have finished it before the lock was taken
+                    if not self._is_finished(part):  # another process may have finished it before the lock was taken
                         self._make(part, make, lock, report)
             except Held:
                 others.append(part)
-            others = [part for part in others if not self._there(part)]
+            others = [part for part in others if not self._is_finished(part)]
             self.check_skipped()
 
     def _make(self, part: Part, make: Make, lock: OutputLock, report: Callable[[int], None]) -> None:
-        before = self._episodes_there()
+        before = self._finished_episodes()
 
         def counted() -> Iterator[PartItem]:
             skipped: list[SkippedEpisodes] = []
@@ -94,7 +94,7 @@ class PartMaker:
             return  # this process had been stopped for so long that another host took the part over
         self._done[part.number] = facts.lost
 
-    def _there(self, part: Part) -> bool:
+    def _is_finished(self, part: Part) -> bool:
         """Whether a part is finished, by whichever process.
 
         A part with skipped episodes, made when that was allowed, does not count where it is not: made again, it raises.
@@ -106,7 +106,7 @@ class PartMaker:
             self._done[part.number] = facts.lost
         return True
 
-    def _episodes_there(self) -> int:
+    def _finished_episodes(self) -> int:
         return sum(len(part.episodes) for part in self.parts if part.number in self._done)
 
     def check_skipped(self, more: Sequence[SkippedEpisodes] = ()) -> None:

@@ -228,7 +228,7 @@ def retried(location: Location, request: Callable[[], T]) -> T:
     raise AssertionError("unreachable")
 
 
-def is_there(location: Location, kind: Literal["file", "directory"]) -> bool:
+def exists(location: Location, kind: Literal["file", "directory"]) -> bool:
     """Whether a file or a directory is there. Raises UnreachableError where nobody can tell."""
     found = retried(location, location.is_dir if kind == "directory" else location.is_file)
     if found or not is_remote(location):

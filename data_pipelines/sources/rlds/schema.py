@@ -16,7 +16,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
 from data_pipelines.names import NAME_RULE, is_name, shown
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
-from data_pipelines.sources.rlds.location import is_there, locate, retried
+from data_pipelines.sources.rlds.location import exists, locate, retried
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class SplitMetadata:
 def resolve_version(directory: str | Location) -> Location:
     """The version directory: `directory` itself or its newest version."""
     directory = locate(directory)
-    if not is_there(directory, "directory"):
+    if not exists(directory, "directory"):
         raise DataError(f"{directory}: no such directory. Give the path of an RLDS dataset.")
     if _has_info(directory):
         return directory
@@ -105,7 +105,7 @@ def resolve_version(directory: str | Location) -> Location:
 
 
 def _has_info(directory: Location) -> bool:
-    return is_there(directory / INFO, "file")
+    return exists(directory / INFO, "file")
 
 
 def dataset_name(directory: str | Location) -> str:

@@ -108,9 +108,9 @@ def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
 
     Raises ConfigError, before anything is made, where one is there that was made with other settings, or by others.
     """
-    from data_pipelines.simulators.generate import made_before
+    from data_pipelines.simulators.generate import made_by_other_versions
 
-    kept = made_before(out, specs, episodes, size, seed)
+    kept = made_by_other_versions(out, specs, episodes, size, seed)
     if kept:
         say(
             f"note: {few(kept)} in {out}: made by other versions of simulators, and still used; remove them to have them "
