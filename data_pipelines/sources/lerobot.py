@@ -21,7 +21,7 @@ from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import inside, shown
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta
 from data_pipelines.sources.parquet_rows import ParquetRows
-from data_pipelines.sources.rlds.location import retried
+from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import LeRobotSettings
 from data_pipelines.sources.units import Episode, Layout, UnitError, choose
@@ -175,7 +175,7 @@ class LeRobotSource:
             except ValueError as error:
                 raise UnitError(f"{where}: {error}. {ADVICE}") from error
             try:
-                return retried(path, path.read_bytes)
+                return retry(path, path.read_bytes)
             except FileNotFoundError as error:
                 raise UnitError(f"{where}: {path} cannot be read ({error.strerror}). {ADVICE}") from error
         raise UnitError(f"{where} holds neither bytes nor a path. {ADVICE}")

@@ -21,7 +21,7 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
-from data_pipelines.sources.rlds.location import retried
+from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
@@ -85,7 +85,7 @@ class LeRobotDataset(EpisodeSource):
         digest = hashlib.sha256()
         meta = self.location / "meta"
         for path in sorted(p for p in meta.rglob("*") if p.is_file()):
-            content = hashlib.sha256(retried(path, path.read_bytes)).hexdigest()
+            content = hashlib.sha256(retry(path, path.read_bytes)).hexdigest()
             digest.update(f"{path.relative_to(meta).as_posix()}:{content};".encode())
         for path, size in self._bytes.items():
             digest.update(f"{path.relative_to(self.location).as_posix()}:{size};".encode())
@@ -213,6 +213,6 @@ def _runs(numbers: np.ndarray) -> tuple[EpisodeRun, ...]:
 
 def _size(path: Path) -> int:
     try:
-        return retried(path, lambda: os.stat(path)).st_size
+        return retry(path, lambda: os.stat(path)).st_size
     except FileNotFoundError:
         return 0  # its episodes cannot be read, as reading them says

@@ -17,7 +17,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.sources.parquet_pages import RowGroup, check_pages, read_groups
-from data_pipelines.sources.rlds.location import is_failure, retried
+from data_pipelines.sources.rlds.location import is_io_error, retry
 
 T = TypeVar("T")
 
@@ -136,11 +136,11 @@ def _reading(path: Path, read: Callable[[], T]) -> T:
         try:
             return read()
         except (OSError, ValueError, arrow.ArrowException) as error:
-            if is_failure(error):
+            if is_io_error(error):
                 raise  # to be tried again
             raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
 
-    return retried(path, attempt)
+    return retry(path, attempt)
 
 
 def _read_layout(path: Path, label: str) -> _Layout:

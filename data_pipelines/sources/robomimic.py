@@ -26,7 +26,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import shown
-from data_pipelines.sources.rlds.location import is_failure, retried
+from data_pipelines.sources.rlds.location import is_io_error, retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.units import Episode, Layout, UnitError, choose, require_module
@@ -132,11 +132,11 @@ class RobomimicSource:
             try:
                 return h5py.File(self.path, "r")
             except OSError as error:
-                if is_failure(error):
+                if is_io_error(error):
                     raise  # to be tried again
                 raise DataError(f"{self.path}: no readable HDF5 file ({error}). Fetch it again.") from error
 
-        return retried(self.path, opened)
+        return retry(self.path, opened)
 
     def array(self, demo: Any, key: str, where: str) -> np.ndarray:
         return read_rows(demo, key, slice(None), where)
@@ -186,7 +186,7 @@ def damage(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
     except (DataError, ConfigError):
         raise
     except DAMAGED as error:
-        if is_failure(error):
+        if is_io_error(error):
             raise UnreachableError(f"{where} cannot be read ({error}). Run the same command again.") from error
         advice = ADVICE if kind is UnitError else "Fetch the file again."
         raise kind(f"{where} is damaged ({error}). {advice}") from error
@@ -199,11 +199,11 @@ def read_rows(demo: Any, key: str, rows: slice, where: str) -> np.ndarray:
         try:
             return np.asarray(demo[key][rows])
         except DAMAGED as error:
-            if is_failure(error):
+            if is_io_error(error):
                 raise  # to be tried again
             raise UnitError(f"{where}/{key} cannot be read ({error}). {ADVICE}") from error
 
-    return retried(Path(demo.file.filename), read)
+    return retry(Path(demo.file.filename), read)
 
 
 def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | None:

@@ -17,7 +17,7 @@ from PIL import Image
 
 from data_pipelines.errors import UnreachableError
 from data_pipelines.sources.rlds.images import decode_image
-from data_pipelines.sources.rlds.location import is_failure, retried
+from data_pipelines.sources.rlds.location import is_io_error, retry
 from data_pipelines.sources.rlds.writer import encode_jpeg
 from data_pipelines.sources.units import UnitError, require_module
 
@@ -115,15 +115,15 @@ class Video:
             for frame in self._container.decode(self._stream):
                 yield (frame.pts - self._start) * base, frame
         except (av.FFmpegError, TypeError) as error:  # TypeError: a frame without a time
-            if _is_failure(error):
+            if _is_io_error(error):
                 again = "Run the same command again."
                 raise UnreachableError(f"{self._path}: cannot be read ({error}). {again}") from error
             raise UnitError(f"{self._path}: it cannot be decoded ({error}). {ADVICE}") from error
 
 
-def _is_failure(error: Exception) -> bool:
-    """As `is_failure`; where a file may not be read the system says EACCES, and FFmpeg says EPERM of its bytes."""
-    return is_failure(error) and getattr(error, "errno", None) != errno.EPERM
+def _is_io_error(error: Exception) -> bool:
+    """As `is_io_error`; where a file may not be read the system says EACCES, and FFmpeg says EPERM of its bytes."""
+    return is_io_error(error) and getattr(error, "errno", None) != errno.EPERM
 
 
 @contextmanager
@@ -135,11 +135,11 @@ def open_video(path: Path) -> Iterator[Video]:
         try:
             return av.open(str(path), metadata_errors="ignore")
         except (OSError, av.FFmpegError) as error:
-            if _is_failure(error):
+            if _is_io_error(error):
                 raise  # to be tried again
             raise UnitError(f"{path}: no readable video ({error}). {ADVICE}") from error
 
-    with retried(path, opened) as container:
+    with retry(path, opened) as container:
         if not container.streams.video:
             raise UnitError(f"{path}: it has no video stream. {ADVICE}")
         if container.streams.video[0].codec_context is None:

@@ -187,7 +187,7 @@ def _merge(plan: Manifest, facts: Sequence[PartFacts], skipped: Sequence[Skipped
 
 
 def _published(final: Path, plan: Manifest) -> Manifest | None:
-    """The manifest of the existing dataset, None without one. ConfigError, naming what differs, if it is not as planned."""
+    """The manifest of the existing dataset, None without one. Raises ConfigError, naming what differs from the plan."""
     if not final.exists():
         return None
     existing = load_manifest(final / FILE)

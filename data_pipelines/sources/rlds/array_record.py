@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_pipelines.errors import CorruptRecordError, UnreachableError
-from data_pipelines.sources.rlds.location import is_remote, missing, open_ranges, retried
+from data_pipelines.sources.rlds.location import is_remote, missing_shard, open_random_access, retry
 from data_pipelines.sources.rlds.tfrecord import ShardIndex
 from hma_jax.config import ConfigError
 
@@ -40,7 +40,7 @@ def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
     """
     if is_remote(path):
         raise ConfigError(f"{path}: ArrayRecord files are read from a disk only. Copy the dataset to one.")
-    with open_ranges(path) as file:
+    with open_random_access(path) as file:
         size = file.size
         ends = file.read(0, ENDS) + file.read(max(size - ENDS, 0), ENDS)
     try:
@@ -63,9 +63,9 @@ def open_record(path: Location, offset: int, length: int) -> Iterator[bytes]:
 
 def _reader(path: Path):
     try:
-        status = retried(path, lambda: os.stat(path))
+        status = retry(path, lambda: os.stat(path))
     except FileNotFoundError:
-        raise missing(path) from None
+        raise missing_shard(path) from None
     return _opened(path, (status.st_size, status.st_mtime_ns))
 
 

@@ -22,7 +22,7 @@ from data_pipelines.sources.rlds import array_record
 from data_pipelines.sources.rlds.example import Feature, parse_record
 from data_pipelines.sources.rlds.frame_places import FramePlaces
 from data_pipelines.sources.rlds.index import index_path, load_index
-from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing
+from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing_shard
 from data_pipelines.sources.rlds.schema import field_slice, listing, read_info, read_metadata, resolve_version, step_key
 from data_pipelines.sources.rlds.steps import load_steps, save_steps
 from data_pipelines.sources.rlds.tfrecord import open_record, read_parts, scan_shard
@@ -180,7 +180,7 @@ class RldsDataset(EpisodeSource):
         for path, shard, count in zip(self._paths, self._index.shards, expected, strict=True):
             problem = None
             if shard.missing:
-                problem = missing(path)
+                problem = missing_shard(path)
             elif shard.damage:
                 problem = CorruptRecordError(path, shard.damage_at, shard.damage)
             if problem is not None and self.corrupt == "raise":

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from data_pipelines.sources.rlds.location import is_remote, retried
+from data_pipelines.sources.rlds.location import is_remote, retry
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -23,10 +23,10 @@ TIME_FIELDS = ("LastModified", "last_modified", "updated", "mtime", "modified", 
 def list_files(directory: Location) -> dict[str, tuple[int, str]]:
     """(size, stamp) of every file of a directory, by name, without opening one."""
     if not is_remote(directory):
-        return retried(directory, lambda: _list_directory(directory))
+        return retry(directory, lambda: _list_directory(directory))
     fs = directory.fs
     fs.invalidate_cache(directory.path)
-    found = retried(directory, lambda: fs.ls(directory.path, detail=True))
+    found = retry(directory, lambda: fs.ls(directory.path, detail=True))
     files = [f for f in found if f["type"] == "file"]
     return {f["name"].rstrip("/").rsplit("/", 1)[-1]: (int(f["size"]), _stamp(f)) for f in files}
 

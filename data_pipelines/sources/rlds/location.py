@@ -1,8 +1,8 @@
-"""Where files of datasets lie: on a disk, or in any store that fsspec knows.
+"""Locations of dataset files: paths on a disk, or URLs of any object store that fsspec supports.
 
-Owns the difference between the two, which nothing else sees: a location has the methods of
-`pathlib.Path` either way, and any of its bytes can be read without the others. Remote ones
-(gs://, s3://, hf://, memory://, ...) are `upath.UPath` objects, of the extra `remote`.
+Owns the difference between the two, which no other module sees: a location has the methods of `pathlib.Path`
+either way, and any range of its bytes can be read without the others. Remote locations (gs://, s3://, hf://,
+memory://, ...) are `upath.UPath` objects, of the extra `remote`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 RETRY_WAITS = (0.1, 0.5, 2.0, 6.0)
-"""Seconds before a read that failed is tried again, each time by up to half more or less."""
+"""Seconds to wait before each retry of a failed read, with a random factor of 0.5 to 1.5."""
 
-FAILURES = frozenset(
+IO_ERRNOS = frozenset(
     getattr(errno, name)
     for name in (
         "EIO ESTALE ETIMEDOUT EREMOTEIO ENXIO ENODEV EAGAIN EBUSY EINTR EMFILE ENFILE ENOMEM ENETDOWN "
@@ -40,17 +40,17 @@ FAILURES = frozenset(
     ).split()
     if hasattr(errno, name)
 )
-"""What the system says of a disk, a network or itself, and never of what a file holds."""
+"""errno values that report a failing disk, network or operating system, and never damaged contents."""
 
-LASTING = (PermissionError, IsADirectoryError, NotADirectoryError)
-"""Failures that no waiting mends."""
+PERMANENT_ERRORS = (PermissionError, IsADirectoryError, NotADirectoryError)
+"""Errors that retrying does not cure."""
 
 MAX_OPEN_FILES = 128
 """Files that `OpenFiles` keeps open by default: half of the smallest usual limit of open files per process."""
 
 
-class Ranges(Protocol):
-    """An open file of `size` bytes."""
+class RandomAccessFile(Protocol):
+    """An open file of `size` bytes, any range of which can be read."""
 
     @property
     def size(self) -> int: ...
@@ -58,7 +58,7 @@ class Ranges(Protocol):
     def read(self, offset: int, length: int) -> bytes:
         """Up to `length` bytes from `offset` on; fewer at the end of the file.
 
-        Raises UnreachableError where the disk or the store fails again and again.
+        Raises UnreachableError if the disk or the store still fails after all retries.
         """
         ...
 
@@ -86,23 +86,23 @@ def locate(text: str | Path | UPath) -> Location:
 
 
 def is_remote(location: str | Path | UPath) -> bool:
-    """Whether it names a store and not a place on a disk."""
+    """Whether it is a URL of an object store, not a path on a disk."""
     return "://" in str(location) and not isinstance(location, Path)
 
 
 def absolute(text: str) -> str:
-    """The text of a location that means the same from any working directory."""
+    """The location as text that does not depend on the working directory."""
     return text if is_remote(text) else str(Path(text).absolute())
 
 
 @contextmanager
-def open_ranges(location: Location) -> Iterator[Ranges]:
-    """The shard at `location`. Raises DataError if it is missing or cannot be opened."""
+def open_random_access(location: Location) -> Iterator[RandomAccessFile]:
+    """Opens the shard at `location`. Raises DataError if it is missing or cannot be opened."""
     if is_remote(location):
         try:
             file = _RemoteFile(location)
         except FileNotFoundError:
-            raise missing(location) from None
+            raise missing_shard(location) from None
         yield file
         return
     file = DiskFile(location)
@@ -124,14 +124,14 @@ def read_head(location: Location, max_bytes: int) -> bytes:
         with open(location, "rb") as file:
             return file.read(max_bytes)
 
-    return retried(location, read)
+    return retry(location, read)
 
 
 class OpenFiles:
-    """Files of a disk that stay open between reads: the `limit` read last.
+    """An LRU cache of at most `limit` open files on a disk.
 
-    To open one costs as much as to read a frame, on a network drive far more. A file that gives
-    way to another is closed when the last thread has read from it. Pickles as an empty one.
+    Opening a file costs as much as reading a frame, on a network drive far more. An evicted file is closed when
+    the last thread has read from it. Pickles as an empty cache.
     """
 
     def __init__(self, limit: int = MAX_OPEN_FILES):
@@ -142,12 +142,12 @@ class OpenFiles:
         return type(self), (self._limit,)
 
     def get(self, path: Path) -> DiskFile:
-        """The file at `path` as it was when it was opened. Raises DataError as `open_ranges` does."""
+        """The file at `path` as it was when it was opened. Raises DataError as `open_random_access` does."""
         return self._open(path)
 
 
 class Descriptor:
-    """An open file descriptor of somebody else as ranges."""
+    """A file descriptor that somebody else opened and closes, as a `RandomAccessFile`."""
 
     def __init__(self, fd: int):
         self._fd = fd
@@ -161,17 +161,17 @@ class Descriptor:
 
 
 class DiskFile(Descriptor):
-    """A file of a disk, closed by `close` or when nobody refers to it any more.
+    """A file on a disk, closed by `close` or when it is garbage-collected.
 
-    A read that fails opens the file again and is tried again: that is how a network disk comes back
-    (ESTALE). Raises DataError if the file is missing or was replaced since it was opened.
+    After a failed read the file is reopened and read again, as a network disk needs it after ESTALE. Raises
+    DataError if the file is missing or was replaced since it was opened.
     """
 
     def __init__(self, path: Path):
         try:
-            super().__init__(retried(path, lambda: os.open(path, os.O_RDONLY)))
+            super().__init__(retry(path, lambda: os.open(path, os.O_RDONLY)))
         except FileNotFoundError:
-            raise missing(path) from None
+            raise missing_shard(path) from None
         self._path, self._stamp = path, _stamp(self._fd)
         self._finalizer = weakref.finalize(self, os.close, self._fd)
         self._finalizer.atexit = False  # threads may still read while a process ends
@@ -185,11 +185,11 @@ class DiskFile(Descriptor):
         except OSError:
             pass
         try:
-            return retried(self._path, lambda: self._read_anew(offset, length))
+            return retry(self._path, lambda: self._reopen_and_read(offset, length))
         except FileNotFoundError:
-            raise missing(self._path) from None
+            raise missing_shard(self._path) from None
 
-    def _read_anew(self, offset: int, length: int) -> bytes:
+    def _reopen_and_read(self, offset: int, length: int) -> bytes:
         fd = os.open(self._path, os.O_RDONLY)
         try:
             if _stamp(fd) != self._stamp:
@@ -207,11 +207,11 @@ def _stamp(fd: int) -> tuple[int, int]:
     return status.st_size, status.st_mtime_ns
 
 
-def retried(location: Location, request: Callable[[], T]) -> T:
-    """The answer of `request`, asked again after each of RETRY_WAITS where a disk or a store fails.
+def retry(location: Location, request: Callable[[], T]) -> T:
+    """The result of `request`, which is repeated after each of RETRY_WAITS while a disk or a store fails.
 
-    A failed read is no damage of data: after the last try the job stops, and goes on when it is
-    repeated. Raises UnreachableError, naming `location`; FileNotFoundError and DataError at once.
+    A failed read does not mean damaged data: after the last retry the job stops, and the same command resumes it.
+    Raises UnreachableError, naming `location`; FileNotFoundError and DataError at once.
     """
     for wait in (*RETRY_WAITS, None):
         try:
@@ -219,7 +219,7 @@ def retried(location: Location, request: Callable[[], T]) -> T:
         except (FileNotFoundError, DataError):
             raise
         except Exception as error:  # every protocol of a remote store has exceptions of its own
-            if wait is None or isinstance(error, LASTING):
+            if wait is None or isinstance(error, PERMANENT_ERRORS):
                 raise UnreachableError(
                     f"{location}: cannot be read ({type(error).__name__}: {error}). Check the disk or the "
                     "connection and the right to read, and run the same command again."
@@ -229,34 +229,34 @@ def retried(location: Location, request: Callable[[], T]) -> T:
 
 
 def exists(location: Location, kind: Literal["file", "directory"]) -> bool:
-    """Whether a file or a directory is there. Raises UnreachableError where nobody can tell."""
-    found = retried(location, location.is_dir if kind == "directory" else location.is_file)
+    """Whether `location` is an existing file or directory. Raises UnreachableError if that cannot be determined."""
+    found = retry(location, location.is_dir if kind == "directory" else location.is_file)
     if found or not is_remote(location):
         return found
-    try:  # a store that fails says No to the question above
-        return retried(location, lambda: location.fs.info(location.path))["type"] == kind
+    try:  # is_dir and is_file of a remote store return False for errors too
+        return retry(location, lambda: location.fs.info(location.path))["type"] == kind
     except FileNotFoundError:
         return False
 
 
-def is_failure(error: Exception) -> bool:
-    """Whether a library's error says that a file cannot be read, and nothing of its bytes."""
-    told = re.search(r"errno\s*[=:]?\s*(\d+)", str(error), re.IGNORECASE)  # HDF5 has it in its words only
-    number = getattr(error, "errno", None) or (int(told[1]) if told else 0)
-    return isinstance(error, PermissionError) or number in FAILURES
+def is_io_error(error: Exception) -> bool:
+    """Whether a library's error is one of reading the file, not of its contents."""
+    match = re.search(r"errno\s*[=:]?\s*(\d+)", str(error), re.IGNORECASE)  # HDF5 has it in its message only
+    number = getattr(error, "errno", None) or (int(match[1]) if match else 0)
+    return isinstance(error, PermissionError) or number in IO_ERRNOS
 
 
-def missing(location: Location) -> DataError:
-    """What a shard that is not there is told as."""
+def missing_shard(location: Location) -> DataError:
+    """The error for a shard that does not exist."""
     return DataError(f"{location}: the shard is missing. Fetch it again, or check the path.")
 
 
 class _RemoteFile:
-    """One request per read."""
+    """A file in an object store; every read is one request."""
 
     def __init__(self, location: UPath):
         self._location = location
-        self.size = int(retried(location, lambda: location.fs.size(location.path)))
+        self.size = int(retry(location, lambda: location.fs.size(location.path)))
 
     def read(self, offset: int, length: int) -> bytes:
         end = min(offset + length, self.size)
@@ -264,6 +264,6 @@ class _RemoteFile:
             return b""
         place = self._location
         try:
-            return retried(place, lambda: place.fs.cat_file(place.path, start=offset, end=end))
+            return retry(place, lambda: place.fs.cat_file(place.path, start=offset, end=end))
         except FileNotFoundError:
-            raise missing(place) from None
+            raise missing_shard(place) from None

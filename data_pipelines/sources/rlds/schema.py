@@ -16,7 +16,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
 from data_pipelines.names import NAME_RULE, is_name, shown
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
-from data_pipelines.sources.rlds.location import exists, locate, retried
+from data_pipelines.sources.rlds.location import exists, locate, retry
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def resolve_version(directory: str | Location) -> Location:
         raise DataError(f"{directory}: no such directory. Give the path of an RLDS dataset.")
     if _has_info(directory):
         return directory
-    inside = retried(directory, lambda: list(directory.iterdir()))
+    inside = retry(directory, lambda: list(directory.iterdir()))
     versions = [d for d in inside if re.fullmatch(r"\d+\.\d+\.\d+", d.name) and _has_info(d)]
     if versions:
         return max(versions, key=lambda d: tuple(map(int, d.name.split("."))))

@@ -4,10 +4,10 @@ Owns the framing and its checksums. Does not know what is inside a record (see `
 
 A record is: length (uint64), checksum of the length (uint32), payload, checksum of the
 payload (uint32), all little-endian. As lengths are known from the headers, a scan that skips
-payloads gives the place of every record, and any record is then one read away. Records of
-hundreds of megabytes are never held: their checksum is taken in pieces, and their bytes are
-read where they are looked at. Nothing here keeps a file open beyond a call or a `with`; who
-reads small parts again and again gives a file that is open (see `location.OpenFiles`).
+payloads gives the offset of every record, and any record then takes one read. Records of
+hundreds of megabytes are never held in memory as a whole: their checksum is computed in pieces, and
+bytes are read on access. Nothing here keeps a file open beyond a call or a `with`; callers that read
+small parts again and again pass an open file (see `location.OpenFiles`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import google_crc32c
 import numpy as np
 
 from data_pipelines.errors import CorruptRecordError
-from data_pipelines.sources.rlds.location import Descriptor, Ranges, is_remote, locate, open_ranges
+from data_pipelines.sources.rlds.location import Descriptor, RandomAccessFile, is_remote, locate, open_random_access
 from hma_jax.runtime.files import naming
 
 if TYPE_CHECKING:
@@ -35,13 +35,13 @@ HEADER = 12  # bytes: length and its checksum
 FOOTER = 4  # bytes: checksum of the payload
 
 WHOLE = 16 * 2**20
-"""Records up to this many bytes are read at once, larger ones where they are looked at."""
+"""Records up to this many bytes are read as a whole, larger ones on access."""
 
 CHUNK = 4 * 2**20
-"""Bytes of a large record that are in memory while its checksum is taken."""
+"""Bytes of a large record in memory at a time while its checksum is computed."""
 
 BLOCK = 4096
-"""Bytes read at least: the few bytes asked for next are mostly among them."""
+"""Smallest read in bytes: the bytes asked for next are usually among them."""
 
 SMALL, SCAN_BLOCK = 4096, 65536
 """A scan reads through records of up to SMALL bytes in blocks of SCAN_BLOCK, and skips larger ones."""
@@ -52,7 +52,7 @@ REMOTE_SMALL, REMOTE_BLOCK = 256 * 2**10, 4 * 2**20
 
 @dataclass(frozen=True)
 class ShardIndex:
-    """Where the records of one file are, and the checksums that stand behind them."""
+    """Offsets, lengths and stored checksums of the records of one file."""
 
     path: Location
     offsets: np.ndarray  # int64 [records]: first byte of the header
@@ -73,11 +73,11 @@ def _mask(crc: int) -> int:
 
 
 def index_shard(path: str | Location) -> ShardIndex:
-    """The place of every record, from a scan that skips the payloads.
+    """The index of a file, from a scan that skips the payloads.
 
     Raises CorruptRecordError where a header's checksum is wrong or the file ends inside a
     record; payload checksums are verified by `read_record`. A file of 0 bytes has 0 records.
-    Here as everywhere, UnreachableError says that a file cannot be read: no damage of its bytes.
+    A file that cannot be read raises UnreachableError, which is not damage.
     """
     index, damage = scan_shard(path)
     if damage is not None:
@@ -86,18 +86,18 @@ def index_shard(path: str | Location) -> ShardIndex:
 
 
 def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | None]:
-    """`index_shard` that returns what it could index, and what stopped it.
+    """As `index_shard`, but returns the index of what could be scanned, and the error that stopped the scan.
 
-    After a damaged header the place of the next record is unknown, so the rest of the file
-    is lost: records before it are indexed, nothing behind it. The scan holds one block: many
-    records where they are small, little more than a header where they are large.
+    After a damaged header the offset of the next record is unknown, so records before it are indexed and the
+    rest of the file is not. The scan reads block by block: a block holds many records if they are small, little
+    more than a header if they are large.
     """
     path = locate(path)
     offsets: list[int] = []
     lengths: list[int] = []
     checksums: list[int] = []
     damage = None
-    with open_ranges(path) as file:
+    with open_random_access(path) as file:
         size = file.size
         small, block = (REMOTE_SMALL, REMOTE_BLOCK) if is_remote(path) else (SMALL, SCAN_BLOCK)
         view = FileView(file, 0, size, SCAN_BLOCK if is_remote(path) else BLOCK)
@@ -139,14 +139,14 @@ def read_record(path: str | Location, offset: int, length: int) -> bytes:
     Raises CorruptRecordError if the file is shorter than its index says or if the payload does not match its checksum.
     """
     path = locate(path)
-    with open_ranges(path) as file:
+    with open_random_access(path) as file:
         body = _read(file, path, offset, offset + HEADER, length + FOOTER)
     payload = body[:length]
     _verify(masked_crc32c(payload), body[length:], path, offset)
     return payload
 
 
-def read_parts(file: Ranges, path: Location, offset: int, spans: Iterable[tuple[int, int]]) -> list[bytes]:
+def read_parts(file: RandomAccessFile, path: Location, offset: int, spans: Iterable[tuple[int, int]]) -> list[bytes]:
     """Bytes [start, end) of the payload of a record that was verified before, of an open file.
 
     Raises CorruptRecordError, which names `path`, if the file has become shorter.
@@ -158,15 +158,15 @@ def read_parts(file: Ranges, path: Location, offset: int, spans: Iterable[tuple[
 def open_record(path: str | Location, offset: int, length: int) -> Iterator[bytes | FileView]:
     """The verified payload of a record, for the time of a `with`, in bounded memory.
 
-    Up to WHOLE bytes it is read at once. A larger one is verified in pieces and then a view
-    that reads what is looked at; from a remote store it passes through an unnamed temporary
-    file, so that every byte is fetched once. Raises CorruptRecordError as `read_record` does.
+    Up to WHOLE bytes it is read at once. A larger payload is verified in pieces and given as a view that reads
+    on access; from a remote store it passes through an unnamed temporary file, so that every byte is fetched
+    once. Raises CorruptRecordError as `read_record` does.
     """
     path = locate(path)
     if length <= WHOLE:
         yield read_record(path, offset, length)
         return
-    with open_ranges(path) as file:
+    with open_random_access(path) as file:
         footer = _read(file, path, offset, offset + HEADER + length, FOOTER)
         if not is_remote(path):
             _verify(_stream(file, path, offset, length, None), footer, path, offset)
@@ -179,13 +179,13 @@ def open_record(path: str | Location, offset: int, length: int) -> Iterator[byte
 
 
 class FileView:
-    """A part of an open file that is indexed and sliced like `bytes`, and read on demand.
+    """A part of an open file that is indexed and sliced like `bytes`, and read on access.
 
-    Not safe in threads: it remembers the block it read last. `block`: bytes read at least, which
-    may be changed between reads.
+    Not thread-safe: it caches the block read last. `block` is the smallest read in bytes and may be changed
+    between reads.
     """
 
-    def __init__(self, file: Ranges, start: int, length: int, block: int = BLOCK):
+    def __init__(self, file: RandomAccessFile, start: int, length: int, block: int = BLOCK):
         self._file, self._start, self._length, self.block = file, start, length, block
         self._at, self._block = 0, b""
 
@@ -211,7 +211,7 @@ class FileView:
         return self._block[first : first + count]
 
 
-def _read(file: Ranges, path: Location, record: int, at: int, length: int) -> bytes:
+def _read(file: RandomAccessFile, path: Location, record: int, at: int, length: int) -> bytes:
     """Exactly `length` bytes of the record that starts at byte `record`."""
     data = file.read(at, length)
     if len(data) < length:
@@ -219,7 +219,7 @@ def _read(file: Ranges, path: Location, record: int, at: int, length: int) -> by
     return data
 
 
-def _stream(file: Ranges, path: Location, offset: int, length: int, copy) -> int:
+def _stream(file: RandomAccessFile, path: Location, offset: int, length: int, copy) -> int:
     """The masked checksum of a payload, read in pieces that are also written to `copy`."""
     crc, at = 0, offset + HEADER
     for begin in range(at, at + length, CHUNK):

@@ -11,7 +11,7 @@ import pytest
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.sources.rlds.location import OpenFiles, retried
+from data_pipelines.sources.rlds.location import OpenFiles, retry
 from data_pipelines.sources.rlds.tfrecord import index_shard
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
@@ -116,7 +116,7 @@ def test_what_no_waiting_mends_is_not_waited_for(tmp_path, waits):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     with pytest.raises(UnreachableError, match="Permission denied"):
-        retried(tmp_path, denied)
+        retry(tmp_path, denied)
     assert not waits
 
 
