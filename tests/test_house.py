@@ -1,5 +1,4 @@
-"""The plan of the house: who may import whom, and that there are no circles (docs/development.md, "Map of the
-house")."""
+"""Who may import whom, and that there are no circles (docs/development.md, "Map of the code")."""
 
 from __future__ import annotations
 
