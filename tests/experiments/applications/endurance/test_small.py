@@ -33,30 +33,30 @@ def test_the_page_shows_what_was_measured():
 
 
 MINUTE = {
-    "likeliest tokens": ("variants model/likeliest", "variants model/shipped"),
+    "greedy decoding": ("variants model/likeliest", "variants model/shipped"),
     "temperature 0.4": ("variants model/temperature_0.4", "variants model/shipped"),
     "order by confidence": ("variants model/confidence", "variants model/shipped"),
     "streaming window": ("variants model/streaming", "variants model/shipped"),
-    "its own past, drawn once": ("own_past own_past/shipped", "variants model/shipped"),
-    "its own past, drawn once, likeliest tokens": ("own_past own_past/likeliest", "variants model/likeliest"),
+    "its own past, sampled once": ("own_past own_past/shipped", "variants model/shipped"),
+    "its own past, sampled once, greedy decoding": ("own_past own_past/likeliest", "variants model/likeliest"),
     "chained factors": ("chained chained", "chained shipped"),
-    'changes counted thrice: "weighed"': ("weighed", "chained shipped"),
-    '"weighed", likeliest tokens': ("weighed_likeliest", "weighed"),
-    'half as long again: "long"': ("long", "weighed"),
-    'half the bits: "coarse"': ("coarse", "weighed"),
-    'its own past, drawn thrice: "mended"': ("mended", "long"),
-    '"mended", likeliest tokens': ("mended_likeliest", "long_likeliest"),
+    'changed tokens with weight 3: "weighed"': ("weighed", "chained shipped"),
+    '"weighed", greedy decoding': ("weighed_likeliest", "weighed"),
+    '24,000 steps: "long"': ("long", "weighed"),
+    'half the bits per token: "coarse"': ("coarse", "weighed"),
+    'its own past, sampled three times: "mended"': ("mended", "long"),
+    '"mended", greedy decoding': ("mended_likeliest", "long_likeliest"),
     'more data and its own past: "resumed"': ("resumed", "weighed"),
-    'a displaced past besides: "displaced"': ("displaced", "resumed"),
-    '"displaced", likeliest tokens': ("displaced_likeliest", "resumed_likeliest"),
+    'also a displaced past: "displaced"': ("displaced", "resumed"),
+    '"displaced", greedy decoding': ("displaced_likeliest", "resumed_likeliest"),
 }
 """Line of the table of what was tried -> (table and variant of the change, of what it is beside)."""
 
 TEN = {
-    'changes counted thrice: "weighed"': ("endurance", "first_ten"),
-    'half as long again: "long"': ("long_ten", "endurance"),
-    '"mended", likeliest tokens': ("mended_ten", "endurance"),
-    'a displaced past besides: "displaced"': ("displaced_ten", "endurance"),
+    'changed tokens with weight 3: "weighed"': ("endurance", "first_ten"),
+    '24,000 steps: "long"': ("long_ten", "endurance"),
+    '"mended", greedy decoding': ("mended_ten", "endurance"),
+    'also a displaced past: "displaced"': ("displaced_ten", "endurance"),
 }
 """Of ten minutes."""
 
@@ -79,7 +79,8 @@ def beside(measure: str, name: str, other: str) -> tuple[float, float]:
 def test_what_each_change_brings_is_as_the_page_says():
     columns = ("object_found", 2), ("tool_found", 2), ("psnr", 1)
     shown = {
-        re.sub(r"\]\([^)]*\)|[\[*]", "", label): cells for label, cells in table(SMALL, "| what was changed |").items()
+        re.sub(r"\]\([^)]*\)|[\[*]", "", label): cells
+        for label, cells in table(SMALL, "| change | compared with |").items()
     }
     assert shown.keys() == MINUTE.keys()
     for label, (_, *cells) in shown.items():
@@ -98,13 +99,13 @@ def test_streaming_loses_motion_at_once():
     pairs = [(row, each["model/shipped", robot]) for (v, robot), row in each.items() if v == "model/streaming"]
     psnr, follows = gain("psnr", pairs), gain("follows", pairs)
     assert f"it costs {-psnr[0]:.1f} ± {psnr[1]:.1f} dB in the first 20 seconds" in page
-    assert "any more ({:.2f} ± {:.2f} there)".format(*follows) in page
+    assert 'hardly follows ("follows" {:.2f} ± {:.2f} there)'.format(*follows) in page
 
 
 def test_chained_factors_keep_bodies():
     page, found = words_of(SMALL), partial(gains, "chained")
     for measure, words in (
-        ("variance", "nearer to the truth's by {:.2f} ± {:.2f}, at the edge of chance"),
+        ("variance", "nearer to the truth's by {:.2f} ± {:.2f}, at the limit of significance"),
         ("tool_close", "no better in place ({:.2f} ± {:.2f})"),
     ):
         assert words.format(*found(measure)) in page, measure
@@ -113,7 +114,7 @@ def test_chained_factors_keep_bodies():
 def test_changes_counted_thrice_keep_bodies():
     page, found = words_of(SMALL), partial(gains, "weighed")
     for measure, words in (
-        ("variance", "nearer to the truth's by {:.2f} ± {:.2f};"), ("tool_close", "places (tools {:+.2f} ± {:.2f})"),
+        ("variance", "nearer to the truth's by {:.2f} ± {:.2f}."), ("tool_close", "in place do not change ({:+.2f} ± {:.2f})"),
     ):  # fmt: skip
         assert words.format(*found(measure)) in page, measure
 
@@ -121,7 +122,7 @@ def test_changes_counted_thrice_keep_bodies():
 def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     page = words_of(SMALL)
     drawn = beside("object_found", "long_likeliest", "long")
-    assert "sooner than when it draws ({:.2f} ± {:.2f})".format(*drawn) in page
+    assert "sooner than with sampled decoding ({:.2f} ± {:.2f})".format(*drawn) in page
     three = [beside(measure, "mended_likeliest", "weighed") for measure in ("object_found", "object_close", "psnr")]
     said = "(objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, PSNR {:.1f} ± {:.1f} dB)"
     assert said.format(abs(three[0][0]), three[0][1], *three[1], *three[2]) in page
@@ -136,18 +137,21 @@ def test_a_displaced_past_keeps_objects_for_a_minute_where_tokens_are_drawn():
     control, before = partial(gains, "displaced", beside="resumed"), partial(gains, "displaced", beside="weighed")
     (more, half), (less, off) = control("object_found"), control("psnr")
     assert more > half and less < -off
-    assert 'beside "weighed", too, they are found in {:.2f} ± {:.2f} more'.format(*before("object_found")) in page
+    assert (
+        'compared with "weighed", too, they are found in {:.2f} ± {:.2f} more'.format(*before("object_found")) in page
+    )
     places = *control("object_close"), *before("object_close")
-    said = 'In place they are {:.2f} ± {:.2f} (beside "resumed") and {:.2f} ± {:.2f} ("weighed") more.'
+    said = 'Objects in place: {:+.2f} ± {:.2f} (compared with "resumed") and {:+.2f} ± {:.2f} ("weighed").'
     assert said.format(*places) in page
-    assert '{:+.1f} ± {:.1f} dB beside "weighed"'.format(*before("psnr")) in page
-    assert 'tools follow as they did ({:.2f} ± {:.2f} beside "resumed")'.format(*control("follows")) in page
+    assert '{:+.1f} ± {:.1f} dB compared with "weighed"'.format(*before("psnr")) in page
+    assert '"follows" does not change ({:.2f} ± {:.2f} compared with "resumed")'.format(*control("follows")) in page
     back = [
         over_robots([r for r in read_rows(RESULTS / f"{name}_hidden.csv") if r["kind"] == "hidden"], "found")[0]
         for name in ("displaced", "resumed")
     ]
-    assert f"hidden comes back in {100 * back[0]:.0f} % of the cases" in page
-    assert f'with "resumed" in {100 * back[1]:.0f} (' in page
+    said = "Memory is no better**: hidden objects reappear in {:.0f} % of the cases ("
+    assert said.format(100 * back[0]) in page
+    assert f'with "resumed" in {100 * back[1]:.0f} % (' in page
     weighed, ten = by_place("endurance.csv"), by_place("displaced_ten.csv")
     assert len(weighed) == 8 * 10 and weighed.keys() == ten.keys()
 
@@ -169,11 +173,11 @@ def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
     assert f"found in {100 * last:.0f} % of the frames of the last minute; pusher_sand keeps" in page
     for robot, measure, words in (
         ("pusher_sand", "object_found", '({:.0f} % of the last minute, "weighed" {:.0f})'),
-        ("picker_slate", "tool_found", 'its own body ({:.0f} %, "weighed" {:.0f})'),
+        ("picker_slate", "tool_found", 'its own body (found in {:.0f} %, "weighed" {:.0f})'),
     ):
         assert words.format(*(100 * of[robot, 0, 10][measure] for of in (ten, served))) in page
     back = over_robots([row for row in read_rows(RESULTS / "mended_hidden.csv") if row["kind"] == "hidden"], "found")[0]
-    assert f"hidden comes back in {100 * back:.0f} % of the cases" in page
+    assert f"Hidden objects reappear in {100 * back:.0f} % of the cases" in page
 
 
 def test_ten_minutes_are_as_the_page_says():
@@ -194,7 +198,8 @@ def test_ten_minutes_are_as_the_page_says():
 
     tools, objects = percent("tool_found", 10), [percent("object_found", minute) for minute in (1, 2, 10)]
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
-    assert f"commands by {mean('follows', 10):.2f} after {mean('follows', 1):.2f} in the first minute" in page
+    said = '"Follows" is {:.2f} in the first minute and {:.2f} in the last.'
+    assert said.format(mean("follows", 1), mean("follows", 10)) in page
     assert (
         f"found in {objects[0]} % of frames of the first minute, in {objects[1]} % of those of the second, in" in page
     )
@@ -202,24 +207,25 @@ def test_ten_minutes_are_as_the_page_says():
     variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
     assert f"variance ({variance:.2f} of the truth's)" in page
     level, half, _ = over_robots([row for (_, minute), row in mine.items() if minute > 1], "level")
-    assert f"mean level ({level:.1f} ± {half:.1f} grey levels too high)" in page
+    assert f"Mean level ({level:.1f} ± {half:.1f} grey levels too high)" in page
     colours = mean("histogram", 1), mean("histogram", 10)
     assert "({:.2f} of the histogram differs in the first minute, {:.2f} in the last)".format(*colours) in page
     before = percent("tool_found", 10, first), percent("object_found", 10, first)
-    assert f"where it was {before[0]}, objects in {objects[2]}, where it was {before[1]}" in page
+    said = "of the last minute ({}), objects in {} % ({});"
+    assert said.format(before[0], objects[2], before[1]) in page
     arm = [each["arm_sand", 10]["follows"] for each in (mine, first)]
-    assert f"(follows by {arm[0]:.2f}, where the first model has {arm[1]:.2f})" in page
+    assert f'("follows" {arm[0]:.2f}, first model {arm[1]:.2f})' in page
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
     assert len(following) == 6 and all(mine[r, 10]["follows"] > mine[r, 1]["follows"] / 2 for r in following)
     places = [f"{100 * mine[robot, 10]['tool_close']:.0f}" for robot in ("gripper_wood", "gripper_night")]
-    assert f"{places[0]} and {places[1]} % of the last minute of the two grippers" in page
+    assert f"in {places[0]} and {places[1]} % of the last minute for the two grippers" in page
     pusher = mine["pusher_sand", 10]
-    assert f"follows by {pusher['follows']:.2f} and stands {pusher['tool_px']:.0f} pixels beside the truth" in page
+    assert f'pusher_sand ("follows" {pusher["follows"]:.2f}) is {pusher["tool_px"]:.0f} pixels off' in page
     last = [(mine[robot, 10], mine[robot, 2]) for robot, minute in mine if minute == 10]
     later = [(row, first[place]) for place, row in mine.items() if place[1] > 1]
     for measure, words, pairs in (
         ("psnr", "PSNR {:.1f} ± {:.1f} dB, follows", last), ("follows", "follows {:.2f} ± {:.2f})", last),
-        ("follows", "follows by {:.2f} ± {:.2f} more", later), ("psnr", "PSNR is level ({:.1f} ± {:.1f} dB)", later),
+        ("follows", '"follows" is higher by {:.2f} ± {:.2f},', later), ("psnr", "PSNR is equal ({:.1f} ± {:.1f} dB)", later),
     ):  # fmt: skip
         assert words.format(*gain(measure, pairs)) in page, measure
 
