@@ -38,6 +38,7 @@ def test_fewer_windows_are_a_subset_of_more(store):
     few, more = (freeze_manifest(store, store.names, 4, n, seed=0) for n in (2, 4))
     for a, b in zip(few.datasets, more.datasets, strict=True):
         assert len(a.windows) == 2 and set(a.windows) < set(b.windows)
+    assert len({freeze_manifest(store, store.names, 4, 2, seed=seed).datasets for seed in range(4)}) > 2
 
 
 def test_some_of_the_windows_are_of_as_many_episodes_as_can_be_and_not_of_neighbours():
@@ -95,11 +96,12 @@ def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, mani
 
 
 def test_only_the_last_batch_is_padded_by_repeating(store, table, manifest):
-    *whole, last = eval_batches(store, table, manifest, 4)
+    *whole, last = eval_batches(store, table, manifest, 7)
     assert all(b["valid"].all() for b in whole) and any(len(set(b["dataset"])) == 2 for b in whole)
-    count = sum(len(d.windows) for d in manifest.datasets) % 4
-    assert last["valid"].tolist() == [row < count for row in range(4)]
-    for row in range(count, 4):
+    count = sum(len(d.windows) for d in manifest.datasets) % 7
+    assert count > 1
+    assert last["valid"].tolist() == [row < count for row in range(7)]
+    for row in range(count, 7):
         assert np.array_equal(last["tokens"][row], last["tokens"][count - 1])
         assert last["dataset"][row] == last["dataset"][count - 1]
 
@@ -213,6 +215,7 @@ def test_the_rate_is_that_of_the_frames(tmp_path):
     store = TokenStore(tmp_path / "s")
     for rate, stride in ((2.0, 2), (None, 1), (1.0, 4)):
         frozen = freeze_manifest(store, ("toy",), 4, 5, 0, rate=rate)
+        assert {start for _, start in frozen.datasets[0].windows} == set(range(0, 21 - 4 * stride, 4 * stride))
         batch = next(eval_batches(store, store.embodiment_table(("toy",), rate), frozen, 1))
         assert (np.diff(batch["tokens"][0, :, 0]) == stride).all()
         assert batch["actions"].shape == (1, 4, 3 * stride)

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.windows.cut import Cut
 from data_pipelines.windows.windows import require_windows, train_windows, val_windows
@@ -94,9 +97,12 @@ def test_subsets_of_trajectories_are_nested():
         train_windows(data, "toy", 4, 0)
 
 
-def test_too_short_episodes_use_up_no_trajectories():
+@pytest.mark.parametrize("runs", [(), (EpisodeRun("toy.tfrecord", 0, 200),)], ids=["numbers", "names"])
+def test_too_short_episodes_use_up_no_trajectories(runs):
     """Four in five are too short here: ten trajectories are ten that can be trained on."""
     data = OneDataset([1, 30, 1, 1, 1] * 40)
+    settings = replace(data.manifest("toy").settings, val_fraction=0.0, min_val=0)
+    data._manifest = replace(data.manifest("toy"), runs=runs, settings=settings)
     windows = train_windows(data, "toy", 5, max_trajectories=10)
     assert windows.too_short == 160 and len(windows.episodes) == 10 and (windows.episodes % 5 == 1).all()
 
