@@ -1,6 +1,6 @@
-"""Columns in a file: a small JSON header and numpy arrays behind it, mapped when they are asked for.
+"""A file of named numpy columns: a small JSON header, then the arrays, which are memory-mapped on access.
 
-Owns the layout and its checks, nothing of what the columns mean. A file appears under its name only
+Owns the file layout and its checksums, not the meaning of the columns. A file gets its name only
 when it is complete, and every part of it is checked against its hash before it is used.
 
     8 bytes    magic, with the version of the layout
@@ -39,13 +39,13 @@ def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np
         if array.ndim != 1 or array.dtype.str not in DTYPES:
             raise ValueError(f"column {name!r} is {array.dtype.str} {list(array.shape)}; it must be one of {DTYPES}")
         digest = hashlib.sha256(array.data).hexdigest()
-        at = _aligned(end) if array.nbytes else 0  # an empty one lies nowhere
+        at = _aligned(end) if array.nbytes else 0  # an empty one takes no space
         table[name], arrays[name] = [array.dtype.str, len(array), at, digest], array
         end = max(end, at + array.nbytes)
     header = json.dumps({"facts": facts, "columns": table}, sort_keys=True).encode()
-    aside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:
-        with open(aside, "wb") as out:
+        with open(temporary, "wb") as out:
             out.write(MAGIC + len(header).to_bytes(8, "little") + hashlib.sha256(header).digest() + header)
             begin = _aligned(_START + len(header))
             for name, array in arrays.items():
@@ -54,9 +54,9 @@ def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np
             out.truncate(begin + end)
             out.flush()
             os.fsync(out.fileno())
-        os.replace(aside, path)
+        os.replace(temporary, path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -65,9 +65,9 @@ def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np
 
 
 class Columns:
-    """A file that `write_columns` wrote: `facts` at once, `columns[name]` when it is asked for.
+    """A file that `write_columns` wrote. `facts` are read at once, `columns[name]` on access.
 
-    Columns are read-only views of the mapped file, which the kernel may drop from memory and read again.
+    Columns are read-only views of the memory-mapped file, whose pages the kernel may evict and read again.
     Raises OSError if the file is missing, DataError if it is damaged.
     """
 
@@ -110,7 +110,7 @@ class Columns:
         return self._entry(name)[1]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """A column, verified when it is asked for first. Raises DataError if it is damaged or missing."""
+        """A column, verified on first access. Raises DataError if it is damaged or missing."""
         if name not in self._mapped:
             dtype, count, at, digest = self._entry(name)
             nbytes = count * int(dtype[-1]) if dtype in DTYPES else -1
@@ -135,7 +135,7 @@ class Columns:
 
 
 class Column(Sequence[int]):
-    """Whole numbers behind the interface of a tuple, as one array; a column of a file is read when it is used."""
+    """Integers with the interface of a tuple, stored as one array. A column of a file is read on first use."""
 
     def __init__(self, values: Iterable[int] | np.ndarray = (), dtype: str = "<i4"):
         array = values if isinstance(values, np.ndarray) else np.fromiter(values, np.int64)
@@ -146,7 +146,7 @@ class Column(Sequence[int]):
 
     @classmethod
     def of(cls, columns: Columns, name: str) -> Column:
-        """A column of a file, which is read, and verified, when its entries are asked for."""
+        """A column of a file, read and verified on first use."""
         made = cls.__new__(cls)
         made._array, made._lazy = None, (columns, name)
         return made

@@ -1,8 +1,8 @@
 """One job of the simulator suite: some episodes of one dataset, in a process of its own.
 
 `python -m data_pipelines.simulators JOB`, where JOB is the JSON of a `Job`. Every episode becomes two
-files, written aside and renamed: NUMBER.record, the bytes of its RLDS record, and NUMBER.json,
-how it went. A line on stdout says that both are there.
+files, each written atomically: NUMBER.record, the bytes of its RLDS record, and NUMBER.json, its environment, length,
+success and time. A line on stdout says that both are written.
 """
 
 from __future__ import annotations

@@ -23,28 +23,30 @@ T = TypeVar("T")
 
 ADVICE = "Fetch the dataset again, meta folder included."
 
-KEPT = 64 * 2**20
-"""Bytes of columns that stay in memory, beside those of the group that was asked for last, whatever it takes."""
+CACHE_BYTES = 64 * 2**20
+"""Bytes of decoded columns in the cache. The row group that was read last stays, whatever its size."""
 
-FILES = 256
-"""Files of which it is remembered how they are laid out: some kilobytes each."""
+MAX_LAYOUTS = 256
+"""Files whose layout is cached: some kilobytes each."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """`ends` int64 [groups]: rows up to and including each; the runs of equal numbers in the column of labels."""
+    """The row groups of a file, and the runs of equal values in its column of labels. `ends` int64 [groups]: the number
+    of rows up to and including each group."""
 
     columns: tuple[str, ...]
     groups: tuple[RowGroup, ...]
     ends: np.ndarray
-    labels: np.ndarray  # of each run
-    starts: np.ndarray  # int64 [runs + 1]: its first row, and the number of rows
+    labels: np.ndarray  # [runs]: the value of each run
+    starts: np.ndarray  # int64 [runs + 1]: first row of each run, and at the end the number of rows
 
 
 class ParquetRows:
-    """Columns of any files, read when they are asked for. `label`: the column of integers whose runs can be found.
+    """Reads columns of any files on demand. `label` is the integer column, such as the episode's, whose runs of equal
+    values can be looked up.
 
-    Thread-safe; pickles as an empty one. Every method raises DataError for a file that is missing or damaged,
+    Thread-safe; pickles with an empty cache. Every method raises DataError for a file that is missing or damaged,
     UnreachableError for one that cannot be read.
     """
 
@@ -52,9 +54,9 @@ class ParquetRows:
         self._label, self._lock = label, threading.RLock()
         self._layouts: OrderedDict[Path, _Layout] = OrderedDict()
         self._groups: OrderedDict[tuple[Path, int], dict[str, Any]] = OrderedDict()  # by column
-        self._held = 0
+        self._cached_bytes = 0
         self.loaded = 0
-        """Bytes of columns that were read so far."""
+        """Bytes of decoded columns that were read so far."""
 
     def __reduce__(self):
         return type(self), (self._label,)
@@ -63,7 +65,7 @@ class ParquetRows:
         return self._layout(path).columns
 
     def find(self, path: Path, label: int) -> tuple[int, int] | None:
-        """(first row, rows) labelled so; None if there are none, or if others lie between them."""
+        """(first row, number of rows) with this label; None if there are none, or if they are not contiguous."""
         layout = self._layout(path)
         at = np.flatnonzero(layout.labels == label)
         if len(at) != 1:
@@ -78,9 +80,9 @@ class ParquetRows:
         with self._lock:
             ends = self._layout(path).ends
             begin, last = np.searchsorted(ends, [first, first + count - 1], side="right").tolist()
-            held = self._load(path, range(begin, last + 1), columns)
+            cached = self._load(path, range(begin, last + 1), columns)
         pieces = []
-        for group, found in held.items():
+        for group, found in cached.items():
             before = int(ends[group - 1]) if group else 0
             a, b = max(first - before, 0), min(first + count, int(ends[group])) - before
             pieces.append(arrow.table({name: found[name] for name in columns}).slice(a, b - a))
@@ -90,27 +92,27 @@ class ParquetRows:
         with self._lock:
             if path not in self._layouts:
                 self._layouts[path] = _reading(path, lambda: _read_layout(path, self._label))
-                if len(self._layouts) > FILES:
+                if len(self._layouts) > MAX_LAYOUTS:
                     self._layouts.popitem(last=False)
             self._layouts.move_to_end(path)
             return self._layouts[path]
 
     def _load(self, path: Path, groups: Sequence[int], columns: Sequence[str]) -> dict[int, dict[str, Any]]:
-        """The groups' `columns`, those that are not kept read from the file."""
-        held = {g: self._groups.setdefault((path, g), {}) for g in groups}
-        missing = {g: [name for name in columns if name not in held[g]] for g in groups}
+        """The `columns` of these row groups, from the cache or the file."""
+        cached = {g: self._groups.setdefault((path, g), {}) for g in groups}
+        missing = {g: [name for name in columns if name not in cached[g]] for g in groups}
         missing = {g: names for g, names in missing.items() if names}
         layout = self._layout(path)
         for g, found in (_reading(path, lambda: _read_groups(path, layout, missing)) if missing else {}).items():
-            held[g].update(found)
+            cached[g].update(found)
             size = sum(column.nbytes for column in found.values())
-            self._held, self.loaded = self._held + size, self.loaded + size
+            self._cached_bytes, self.loaded = self._cached_bytes + size, self.loaded + size
         for g in groups:
             self._groups.move_to_end((path, g))
-        while self._held > KEPT and len(self._groups) > 1:
-            _, given_up = self._groups.popitem(last=False)
-            self._held -= sum(column.nbytes for column in given_up.values())
-        return held
+        while self._cached_bytes > CACHE_BYTES and len(self._groups) > 1:
+            _, evicted = self._groups.popitem(last=False)
+            self._cached_bytes -= sum(column.nbytes for column in evicted.values())
+        return cached
 
 
 def read_table(path: Path, columns: Collection[str]) -> Any:

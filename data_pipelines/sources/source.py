@@ -165,8 +165,8 @@ class EpisodeSource(ABC):
         """The native rate, where the source says it."""
         return None
 
-    def remember(self) -> None:
-        """Keeps what reading has shown, as the steps of episodes, for later starts."""
+    def save_steps(self) -> None:
+        """Saves what is known only after reading, such as the steps of episodes, for later starts."""
 
     def episode(self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1) -> RawEpisode:
         """Episode `i`, whole: one camera, the actions of `action_keys` concatenated, the success flag.

@@ -55,8 +55,8 @@ def write_dataset(
 ) -> int:
     """Simulates and writes a whole dataset into `directory`; returns its native frames.
 
-    `episodes` counts them by split, "train" among them. Not atomic: `generate` gives a
-    directory aside.
+    `episodes` counts them by split, "train" among them. Not atomic: `generate` passes
+    a scratch directory.
     """
     seeds = {split: episode_seeds(spec, count, seed, split) for split, count in episodes.items()}
     rollout = simulate(spec, np.concatenate(list(seeds.values())))

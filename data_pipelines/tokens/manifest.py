@@ -256,19 +256,20 @@ class Manifest:
             columns = {name: Column(np.asarray(values), "<i8") for name, values in columns.items()}
         return {name: values.digest() for name, values in columns.items()}
 
-    def save(self, directory: Path, aside: Path) -> None:
-        """Writes the files of the manifest by way of the directory `aside`, itself last. Raises OSError."""
-        write_columns(aside / COLUMNS_FILE, {}, {k: np.asarray(v) for k, v in self._columns().items()})
-        os.replace(aside / COLUMNS_FILE, directory / COLUMNS_FILE)
+    def save(self, directory: Path, scratch: Path) -> None:
+        """Writes the manifest's files to `directory`, the manifest itself last. `scratch` holds temporary files, on the
+        same disk. Raises OSError."""
+        write_columns(scratch / COLUMNS_FILE, {}, {k: np.asarray(v) for k, v in self._columns().items()})
+        os.replace(scratch / COLUMNS_FILE, directory / COLUMNS_FILE)
         values = self._facts() | {"columns": self._digests()}
         for split in SPLITS:
             values[split] = {k: v for k, v in values[split].items() if k not in LISTS}
         lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]
-        with open(aside / FILE, "w") as out:
+        with open(scratch / FILE, "w") as out:
             out.write("{\n" + ",\n".join(lines) + "\n}\n")
             out.flush()
             os.fsync(out.fileno())
-        os.replace(aside / FILE, directory / FILE)
+        os.replace(scratch / FILE, directory / FILE)
 
 
 def rate_in_words(rate: float | None) -> str:

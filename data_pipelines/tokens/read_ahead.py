@@ -182,8 +182,8 @@ class _Reader:
             self._out.put(Begin(index, episode.actions, episode.success))
             for step in range(0, episode.steps, self._step):
                 fetched = episode.fetch(step)
-                held = len(fetched) if isinstance(fetched, bytes) else fetched.nbytes
-                cost = max(held, self._frame_bytes)
+                size = len(fetched) if isinstance(fetched, bytes) else fetched.nbytes
+                cost = max(size, self._frame_bytes)
                 self._budget.take(cost)
                 decoding = self._decoders.submit(self._decode, episode, step, fetched)
                 self._out.put((decoding, cost))

@@ -82,7 +82,7 @@ class RowSampler:
         self._limit = limit
         self._hashes: list[np.ndarray] = []
         self._rows: list[np.ndarray] = []
-        self._held = 0
+        self._count = 0
 
     def add(self, rows: np.ndarray, episode: int) -> None:
         """The actions [N, A] of episode `episode` of the dataset, which comes once."""
@@ -94,7 +94,7 @@ class RowSampler:
 
     def sample(self) -> RowSample:
         self._shrink()
-        if not self._held:
+        if not self._count:
             return RowSample()
         hashes, rows = self._hashes[0].astype("<u8"), self._rows[0].astype("<f4")
         texts = (base64.b64encode(x.tobytes()).decode() for x in (hashes, rows))
@@ -104,15 +104,15 @@ class RowSampler:
         if rows.size:
             self._hashes.append(hashes)
             self._rows.append(rows)
-            self._held += len(hashes)
-        if self._held > 8 * self._limit:
+            self._count += len(hashes)
+        if self._count > 8 * self._limit:
             self._shrink()
 
     def _shrink(self) -> None:
-        if self._held:
+        if self._count:
             hashes, rows = np.concatenate(self._hashes), np.concatenate(self._rows)
             order = np.argsort(hashes, kind="stable")[: self._limit]
-            self._hashes, self._rows, self._held = [hashes[order]], [rows[order]], len(order)
+            self._hashes, self._rows, self._count = [hashes[order]], [rows[order]], len(order)
 
 
 def _hashes(episodes: np.ndarray, steps: np.ndarray) -> np.ndarray:

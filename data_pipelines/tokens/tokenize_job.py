@@ -107,7 +107,7 @@ def tokenize_dataset(
         wait=wait,
         progress=progress,
     )
-    source.remember()
+    source.save_steps()
     return manifest
 
 

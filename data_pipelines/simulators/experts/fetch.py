@@ -49,9 +49,9 @@ def _push(hand: np.ndarray, block: np.ndarray, goal: np.ndarray) -> np.ndarray:
     if far < 0.02:
         return _towards(hand, hand + [0, 0, ABOVE], CLOSED)
     way = way / far
-    along, aside = (hand - block)[:2] @ way, (hand - block)[:2] @ [-way[1], way[0]]
+    along, lateral = (hand - block)[:2] @ way, (hand - block)[:2] @ [-way[1], way[0]]
     low = hand[2] - block[2] < HELD
-    if low and along < 0 and abs(aside) < HELD:
+    if low and along < 0 and abs(lateral) < HELD:
         target = np.append(block[:2] + 0.02 * way, block[2])  # through the block
         return _towards(hand, target, CLOSED) * (1.0 if far > 0.05 else 0.6)
     start = np.append(block[:2] - BEHIND * way, block[2])

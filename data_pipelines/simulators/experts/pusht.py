@@ -19,12 +19,12 @@ def expert(env) -> Expert:
         far = np.linalg.norm(way)
         way = way / far if far > 15 else _turning(env, disc - block)
         offset = disc - block
-        along, aside = offset @ way, offset @ [-way[1], way[0]]
-        if along < 0 and abs(aside) < 25:
+        along, lateral = offset @ way, offset @ [-way[1], way[0]]
+        if along < 0 and abs(lateral) < 25:
             return disc + STEP * way
         target = block - BEHIND * way
         if along > -20:  # on the wrong side: round the T, not through it
-            side = np.array([-way[1], way[0]]) * (1.0 if aside >= 0 else -1.0)
+            side = np.array([-way[1], way[0]]) * (1.0 if lateral >= 0 else -1.0)
             target = block + AROUND * side - 0.5 * BEHIND * way
         step = target - disc
         return disc + step * min(1.0, STEP / max(np.linalg.norm(step), 1e-9))

@@ -20,7 +20,7 @@ from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds import array_record
 from data_pipelines.sources.rlds.example import Feature, parse_record
-from data_pipelines.sources.rlds.frame_places import FramePlaces
+from data_pipelines.sources.rlds.frame_spans import FrameSpanCache
 from data_pipelines.sources.rlds.index import index_path, load_index
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing_shard
 from data_pipelines.sources.rlds.schema import field_slice, listing, read_info, read_metadata, resolve_version, step_key
@@ -67,7 +67,7 @@ class RldsDataset(EpisodeSource):
         self.schema = self.directory / "features.json"
         self.split = split
         self._files = OpenFiles() if files is None else files
-        self._places = FramePlaces()
+        self._span_cache = FrameSpanCache()
         meta = read_metadata(self.directory, split)
         self.name, self.version = meta.name, meta.version
         self.features = meta.features
@@ -111,7 +111,7 @@ class RldsDataset(EpisodeSource):
     def _steps(self) -> np.ndarray:
         return load_steps(index_path(self.directory, self.split), self._index)
 
-    def remember(self) -> None:
+    def save_steps(self) -> None:
         save_steps(index_path(self.directory, self.split), self._index, self._steps)
 
     # --- episodes ----------------------------------------------------------------------------
@@ -142,11 +142,11 @@ class RldsDataset(EpisodeSource):
     ) -> list[np.ndarray]:
         """As `EpisodeSource.frames`; JPEG images may come smaller, see `decode_image`.
 
-        A record is read and verified as a whole once; where its frames lie is remembered, and while
-        it is, they alone are read, from a file that stays open (see `OpenFiles`).
+        A record is read and verified as a whole once, and the spans of its frames are cached. While they are, only
+        the chosen frames are read, from a file that stays open (see `OpenFiles`).
         """
         key = step_key(image_key)
-        known = self._places.get((i, key))
+        known = self._span_cache.get((i, key))
         if known is not None:
             chosen = choose(len(known))
             path, offset, _ = self._place(i)
@@ -158,7 +158,7 @@ class RldsDataset(EpisodeSource):
                 chosen = choose(len(encoded))
                 parts = [encoded[t] for t in chosen]
                 if not self._in_array_records and not is_remote(self.directory):
-                    self._places.put((i, key), encoded.spans)
+                    self._span_cache.put((i, key), encoded.spans)
         return [self._image(i, key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
 
     def record(self, i: int, keys: Sequence[str] | None = None) -> dict[str, Feature]:

@@ -241,17 +241,17 @@ def write_shard(path: str | Path, records: Iterable[bytes]) -> int:
     The file appears under its name only when it is complete. Raises OSError, which names it.
     """
     path = Path(path)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     count = 0
     try:
-        with naming(path), open(aside, "wb") as out:
+        with naming(path), open(temporary, "wb") as out:
             for record in records:
                 length = struct.pack("<Q", len(record))
                 out.write(length + struct.pack("<I", masked_crc32c(length)))
                 out.write(record)
                 out.write(struct.pack("<I", masked_crc32c(record)))
                 count += 1
-        os.replace(aside, path)
+        os.replace(temporary, path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return count

@@ -76,7 +76,7 @@ def test_a_table_of_some_columns_reads_no_other(path):
 def test_what_was_read_last_is_kept_and_little_else(path, monkeypatch):
     read, original = [], parquet_rows._read_groups
     monkeypatch.setattr(parquet_rows, "_read_groups", lambda p, layout, w: read.append(w) or original(p, layout, w))
-    monkeypatch.setattr(parquet_rows, "KEPT", 3000)  # the pictures of a group take about 1,700 bytes
+    monkeypatch.setattr(parquet_rows, "CACHE_BYTES", 3000)  # the pictures of a group take about 1,700 bytes
     rows = ParquetRows("episode")
     for first in (0, 1, 29):
         rows.read(path, ["picture.top"], first, 1)
@@ -85,7 +85,7 @@ def test_what_was_read_last_is_kept_and_little_else(path, monkeypatch):
     for first in range(ROWS):
         rows.read(path, ["picture.top"], first, 1)
     assert read[2:] == [{g: ["picture.top"]} for g in (1, 2, 3)]
-    assert rows._held == sum(c.nbytes for kept in rows._groups.values() for c in kept.values()) < 3000
-    monkeypatch.setattr(parquet_rows, "KEPT", 0)
+    assert rows._cached_bytes == sum(c.nbytes for kept in rows._groups.values() for c in kept.values()) < 3000
+    monkeypatch.setattr(parquet_rows, "CACHE_BYTES", 0)
     rows.read(path, ["picture.top"], 0, 1)
     assert list(rows._groups) == [(path, 0)]  # whatever it takes

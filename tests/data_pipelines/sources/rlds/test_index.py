@@ -15,7 +15,7 @@ from data_pipelines.sources.rlds import dataset as dataset_module
 from data_pipelines.sources.rlds import index as index_module
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.sources.rlds.frame_places import FramePlaces
+from data_pipelines.sources.rlds.frame_spans import FrameSpanCache
 from data_pipelines.sources.rlds.index import index_path
 from data_pipelines.sources.rlds.tfrecord import index_shard, scan_shard
 from tests.data_pipelines.fakes import make_spec, write_rlds
@@ -186,17 +186,17 @@ def test_steps_are_known_once_an_episode_was_read(directory):
     first = RldsDataset(directory)
     assert set(first.steps().tolist()) == {-1}
     first.episode(3, *KEYS)
-    first.remember()
+    first.save_steps()
     other = RldsDataset(directory)
     other.frames(5, SPEC.image_key, lambda n: [0])
-    other.remember()
+    other.save_steps()
     assert RldsDataset(directory).steps().tolist() == [-1, -1, -1, 8, -1, 10, -1, -1]
     shards(directory)[0].write_bytes(b"")
     assert set(RldsDataset(directory, corrupt="skip").steps().tolist()) == {-1}
 
 
 def test_places_of_frames_give_way_when_they_are_too_many():
-    places = FramePlaces(limit=8 * 100)
+    places = FrameSpanCache(limit=8 * 100)
     for i in range(50):
         places.put((i, "camera"), [(n, n + 1) for n in range(10)])
         assert places.get((0, "camera")) is not None  # asked for again and again
