@@ -50,7 +50,7 @@ def play(
         tokenizer: That the model was trained with, if it is not beside the run.
     """
     try:
-        from experiments.applications.play.server import CROWD, make_app, serve
+        from experiments.applications.play.server import SESSIONS, make_app, serve
     except ModuleNotFoundError as error:
         if error.name != "aiohttp":
             raise
@@ -88,10 +88,10 @@ def play(
         # What draws a physics simulator belongs to one thread; turns are taken in several.
         return true_simulator(simulator, [robot]) if in_suite(robot) else None
 
-    app, ended = make_app(simulator, truth, together=1), threading.Event()
+    app, ended = make_app(simulator, truth, max_acting=1), threading.Event()
 
     def reached(together: int) -> None:
-        app[CROWD].together = together
+        app[SESSIONS].max_acting = together
 
     # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.
     compiling = threading.Thread(

@@ -1,5 +1,5 @@
 """A page on which people drive a trained model (`hma play`): visitors share one simulator, a batch for all of them.
 
-`crowd` is who is there and what they asked for, `turn` answers a round of it, `recording` is what they keep, `server`
-the way in and out, page.html what runs in the browser.
+`sessions` manages visitors and their pending requests, `requests` answers a round of these, `recording` is what visitors
+download, `server` the HTTP and websocket routes, page.html what runs in the browser.
 """

@@ -12,8 +12,14 @@ from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
 
-from experiments.applications.play.crowd import FAULTS, REPLIES, Crowd, Full, Visitor
-from experiments.applications.play.turn import Truth, command, picture
+from experiments.applications.play.requests import Truth, command, picture
+from experiments.applications.play.sessions import (
+    MAX_INVALID_MESSAGES,
+    MAX_PENDING_REPLIES,
+    NoFreeSession,
+    SessionManager,
+    Visitor,
+)
 from hma_jax.config.json import to_dict
 from hma_jax.simulator.simulator import Simulator
 
@@ -25,10 +31,10 @@ LARGEST_MESSAGE = 2**16
 HEARTBEAT = 20.0
 """Seconds between questions whether a silent visitor is still there."""
 
-WAITING = 32
-"""Connections besides those with a seat that are listened to; further ones are refused."""
+EXTRA_CONNECTIONS = 32
+"""Connections beyond the number of sessions that are accepted; further ones are refused."""
 
-CROWD = web.AppKey("crowd", Crowd)
+SESSIONS = web.AppKey("sessions", SessionManager)
 SOCKETS = web.AppKey("sockets", set)
 HEADERS = {
     "Content-Security-Policy": "default-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'",
@@ -37,12 +43,12 @@ HEADERS = {
 }
 
 
-def make_app(simulator: Simulator, truth: Truth, together: int | None = None) -> web.Application:
-    """The application; it serves as many visitors at once as the simulator has episodes. Of those, `together` (default:
-    all) act at once, until its crowd is told that more can."""
+def make_app(simulator: Simulator, truth: Truth, max_acting: int | None = None) -> web.Application:
+    """The application; it serves as many visitors at once as the simulator has episodes. Of those, `max_acting` (default:
+    all) act at once, until `SESSIONS` is told that more can."""
     app = web.Application(client_max_size=LARGEST_MESSAGE)
     app[SOCKETS] = set()
-    app.cleanup_ctx.append(lambda app: _crowd(app, simulator, truth, together))
+    app.cleanup_ctx.append(lambda app: _manage_sessions(app, simulator, truth, max_acting))
     about = json.dumps(describe(simulator, truth))
     page = files("experiments.applications.play").joinpath("page.html").read_text()
 
@@ -71,16 +77,18 @@ async def serve(app: web.Application, host: str, port: int, ready: Callable[[int
         await runner.cleanup()
 
 
-async def _crowd(app: web.Application, simulator: Simulator, truth: Truth, together: int | None) -> AsyncIterator[None]:
-    crowd = app[CROWD] = Crowd(simulator, truth, together)
-    serving = asyncio.create_task(crowd.serve())
+async def _manage_sessions(
+    app: web.Application, simulator: Simulator, truth: Truth, max_acting: int | None
+) -> AsyncIterator[None]:
+    sessions = app[SESSIONS] = SessionManager(simulator, truth, max_acting)
+    serving = asyncio.create_task(sessions.serve())
     yield
     serving.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await serving
     for socket in list(app[SOCKETS]):
         await socket.close(code=1001)
-    crowd.close()
+    sessions.close()
 
 
 def describe(simulator: Simulator, truth: Truth) -> list[dict]:
@@ -108,18 +116,18 @@ def _same_origin(request: web.Request) -> bool:
 
 
 async def _drive(request: web.Request) -> web.StreamResponse:
-    crowd, sockets = request.app[CROWD], request.app[SOCKETS]
+    sessions, sockets = request.app[SESSIONS], request.app[SOCKETS]
     if not _same_origin(request):
         raise web.HTTPForbidden(text="this page is served elsewhere")
-    if len(sockets) >= len(crowd.simulator) + WAITING:
+    if len(sockets) >= len(sessions.simulator) + EXTRA_CONNECTIONS:
         raise web.HTTPServiceUnavailable(text="too many connections")
     socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=HEARTBEAT)
     await socket.prepare(request)
     sockets.add(socket)
     try:
-        visitor = crowd.enter(request.query.get("token"))
-        await _converse(crowd, visitor, socket, request.transport)
-    except Full:
+        visitor = sessions.connect(request.query.get("token"))
+        await _serve_connection(sessions, visitor, socket, request.transport)
+    except NoFreeSession:
         await socket.send_str(json.dumps({"type": "full", "message": "all seats are taken; try again later"}))
         await socket.close(code=1013)
     finally:
@@ -127,31 +135,31 @@ async def _drive(request: web.Request) -> web.StreamResponse:
     return socket
 
 
-async def _converse(
-    crowd: Crowd, visitor: Visitor, socket: web.WebSocketResponse, transport: asyncio.Transport | None
+async def _serve_connection(
+    sessions: SessionManager, visitor: Visitor, socket: web.WebSocketResponse, transport: asyncio.Transport | None
 ) -> None:
-    replies: asyncio.Queue[str] = asyncio.Queue(REPLIES)
+    replies: asyncio.Queue[str] = asyncio.Queue(MAX_PENDING_REPLIES)
     visitor.socket, visitor.transport, visitor.replies = socket, transport, replies
-    sending = asyncio.create_task(crowd.send(visitor, socket, replies))
-    robot, start = visitor.seat.robot, visitor.seat.start
+    sending = asyncio.create_task(sessions.send(visitor, socket, replies))
+    robot, start = visitor.session.robot, visitor.session.start
     visitor.tell({"type": "hello", "token": visitor.token, "robot": robot.name if robot else None, "start": start})
     try:
-        await _listen(crowd, visitor, socket)
+        await _receive(sessions, visitor, socket)
     finally:
-        crowd.leave(visitor, socket)
+        sessions.connection_lost(visitor, socket)
         sending.cancel()
 
 
-async def _listen(crowd: Crowd, visitor: Visitor, socket: web.WebSocketResponse) -> None:
+async def _receive(sessions: SessionManager, visitor: Visitor, socket: web.WebSocketResponse) -> None:
     faults = 0
     async for message in socket:
-        await crowd.room_for(visitor)
-        if visitor.socket is not socket:  # its seat, or its visitor, went elsewhere
+        await sessions.wait_for_capacity(visitor)
+        if visitor.socket is not socket:  # the session, or the visitor, has another connection
             return
-        if message.type != WSMsgType.TEXT or not crowd.wish(visitor, _parsed(message.data)):
+        if message.type != WSMsgType.TEXT or not sessions.submit(visitor, _parsed(message.data)):
             faults += 1
             visitor.tell({"type": "error", "message": "that message makes no sense"})
-            if faults >= FAULTS:
+            if faults >= MAX_INVALID_MESSAGES:
                 await socket.close(code=1008)
                 return
 
@@ -167,8 +175,8 @@ def _parsed(data: str) -> dict:
 
 async def _recording(request: web.Request) -> web.Response:
     """A download of what a visitor recorded: kind mp4, or rlds as a zip."""
-    visitor = request.app[CROWD].visitors.get(request.match_info["token"])
-    recording = visitor.seat.recording if visitor else None  # read once: the simulator's thread may take it away
+    visitor = request.app[SESSIONS].visitors.get(request.match_info["token"])
+    recording = visitor.session.recording if visitor else None  # read once: the simulator's thread may take it away
     recording = recording.copy() if recording else None
     kinds: dict[str, tuple[Callable[[], bytes], str, str]] = {}
     if recording is not None and len(recording) > 1:

@@ -10,8 +10,8 @@ from typing import Any
 from aiohttp import ClientWebSocketResponse, TCPConnector, WSMsgType
 from aiohttp.test_utils import TestClient, TestServer
 
+from experiments.applications.play.requests import Truth
 from experiments.applications.play.server import make_app
-from experiments.applications.play.turn import Truth
 from hma_jax.simulator.warm_up import warm_up
 from tests.hma_jax.simulator.small import simulator, start
 
@@ -28,16 +28,16 @@ def serving(
     *,
     visitors: int = 2,
     truth: Truth = no_truth,
-    together: int | None = None,
+    max_acting: int | None = None,
     run: Callable[[Coroutine[Any, Any, None]], None] = asyncio.run,
 ) -> None:
-    """Runs `test` with a client of a server for so many visitors, `together` of whom act at once, by `run`."""
+    """Runs `test` with a client of a server for so many visitors, `max_acting` of whom act at once, by `run`."""
     sim = simulator(episodes=visitors)
     warm_up(sim)  # nobody waits for the compiler
     sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
 
     async def main() -> None:
-        async with TestClient(TestServer(make_app(sim, truth, together)), connector=TCPConnector(limit=0)) as client:
+        async with TestClient(TestServer(make_app(sim, truth, max_acting)), connector=TCPConnector(limit=0)) as client:
             await asyncio.wait_for(test(client), 4 * SECONDS)
 
     run(main())

@@ -45,9 +45,9 @@ def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp
 
     async def serve(app, host, port, ready):
         async with TestServer(app):
-            first.append(app[server.CROWD].together)
+            first.append(app[server.SESSIONS].max_acting)
             ready(port)
-            await until(lambda: app[server.CROWD].together == 2)
+            await until(lambda: app[server.SESSIONS].max_acting == 2)
 
     monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
     monkeypatch.setattr(server, "serve", serve)

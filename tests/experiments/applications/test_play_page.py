@@ -21,8 +21,8 @@ playwright = pytest.importorskip("playwright.async_api", reason="needs the extra
 
 from PIL import Image  # noqa: E402
 
-from experiments.applications.play import crowd, server  # noqa: E402
-from experiments.applications.play.server import CROWD  # noqa: E402
+from experiments.applications.play import server, sessions  # noqa: E402
+from experiments.applications.play.server import SESSIONS  # noqa: E402
 from tests.experiments.applications.serving import serving, until  # noqa: E402
 from tests.experiments.applications.test_play_server import FakeTruth  # noqa: E402
 
@@ -99,7 +99,7 @@ async def picture(page) -> np.ndarray:
 
 async def actions(client) -> list[list[float]]:
     """The chunks of every visitor's newest frame."""
-    simulator = client.server.app[CROWD].simulator
+    simulator = client.server.app[SESSIONS].simulator
     return [e.chunks[-1].tolist() for e in simulator._episodes if e is not None and e.chunks]
 
 
@@ -228,7 +228,7 @@ def test_two_visitors_do_not_mix_and_a_third_is_told(browsing):
 def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_ones_later(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
-        simulator = client.server.app[CROWD].simulator
+        simulator = client.server.app[SESSIONS].simulator
         step = simulator.step
         simulator.step = lambda actions: (time.sleep(0.05), step(actions))[-1]
         talk = await overheard(page)
@@ -263,7 +263,7 @@ def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robo
 
 
 def test_a_model_that_takes_longer_than_the_page_waits_for_a_word_is_slow_and_not_lost(browsing, monkeypatch):
-    monkeypatch.setattr(crowd, "WORKING_SECONDS", 0.2)
+    monkeypatch.setattr(sessions, "PROGRESS_SECONDS", 0.2)
     hasty = files("experiments.applications.play").joinpath("page.html").read_text().replace("Y = 10e3", "Y = 1e3")
     whole = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda: hasty))
     monkeypatch.setattr(server, "files", lambda _: whole)
@@ -272,7 +272,7 @@ def test_a_model_that_takes_longer_than_the_page_waits_for_a_word_is_slow_and_no
         page = await opened(browser, address)
         connections, status = [], "document.getElementById('status').textContent"
         page.on("websocket", lambda socket: connections.append(socket))
-        simulator = client.server.app[CROWD].simulator
+        simulator = client.server.app[SESSIONS].simulator
         step = simulator.step
         simulator.step = lambda actions: (time.sleep(2.5), step(actions))[-1]
         await page.wait_for_function(f"{status}.startsWith('slow: this frame has taken 2 s')")
@@ -337,7 +337,7 @@ def test_the_page_says_that_a_model_without_actions_follows_none(browsing):
 
 def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_rewind(browsing):
     async def test(browser, address, client):
-        simulator = client.server.app[CROWD].simulator
+        simulator = client.server.app[SESSIONS].simulator
         simulator.describe([replace(simulator.robots["arm"], keeps=True)])
         page = await opened(browser, address)
         await page.click("#robots button[data-name=arm]")

@@ -16,10 +16,10 @@ import pytest
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
 
-from experiments.applications.play import crowd as crowd_module
 from experiments.applications.play import server
-from experiments.applications.play.crowd import REPLIES, Visitor
-from experiments.applications.play.turn import Seat
+from experiments.applications.play import sessions as sessions_module
+from experiments.applications.play.requests import Session
+from experiments.applications.play.sessions import MAX_PENDING_REPLIES, Visitor
 from hma_jax.config import require
 from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving, until
 
@@ -87,12 +87,12 @@ def test_what_the_first_window_asked_for_is_not_answered_to_the_second():
     async def test(client):
         first, second = Player(client), Player(client)
         await first.enter()
-        crowd, begun, go_on = client.server.app[server.CROWD], threading.Event(), threading.Event()
-        step, wishes = crowd.simulator.step, crowd.visitors[first.token].wishes
-        crowd.simulator.step = lambda actions: (begun.set(), go_on.wait(SECONDS), step(actions))[-1]
-        for _ in range(2 * crowd_module.WISHES):  # one under way, some that wait, the rest unread
+        sessions, begun, go_on = client.server.app[server.SESSIONS], threading.Event(), threading.Event()
+        step, requests = sessions.simulator.step, sessions.visitors[first.token].requests
+        sessions.simulator.step = lambda actions: (begun.set(), go_on.wait(SECONDS), step(actions))[-1]
+        for _ in range(2 * sessions_module.MAX_PENDING_REQUESTS):  # one under way, some that wait, the rest unread
             await first.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
-        await until(lambda: begun.is_set() and len(wishes) >= crowd_module.WISHES - 1)
+        await until(lambda: begun.is_set() and len(requests) >= sessions_module.MAX_PENDING_REQUESTS - 1)
         await second.enter(token=first.token, begin=False)
         await until(lambda: len(client.server.app[server.SOCKETS]) == 1)  # nobody listens to the first window any more
         go_on.set()
@@ -104,15 +104,15 @@ def test_what_the_first_window_asked_for_is_not_answered_to_the_second():
 
 def test_as_many_act_at_once_as_programs_are_compiled_for_and_all_take_turns():
     async def test(client):
-        crowd, at_once = client.server.app[server.CROWD], []
-        step = crowd.simulator.step
+        sessions, at_once = client.server.app[server.SESSIONS], []
+        step = sessions.simulator.step
 
         def counted(actions):
             at_once.append(sum(a is not None for a in actions))
             time.sleep(0.05)
             return step(actions)
 
-        crowd.simulator.step = counted
+        sessions.simulator.step = counted
         greedy, player = Player(client), Player(client)
         await greedy.enter()
         await player.enter()
@@ -120,11 +120,11 @@ def test_as_many_act_at_once_as_programs_are_compiled_for_and_all_take_turns():
             await greedy.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
         await player.drive(0.5, 3)
         assert set(at_once) == {1} and len(at_once) < 30, "the greedy one waits for its turn too"
-        crowd.together = 2
+        sessions.max_acting = 2
         await player.drive(0.5, 3)
         assert max(at_once) == 2
 
-    serving(test, together=1)
+    serving(test, max_acting=1)
 
 
 def test_after_a_fault_of_the_device_all_begin_again_and_drive_on(monkeypatch):
@@ -132,7 +132,7 @@ def test_after_a_fault_of_the_device_all_begin_again_and_drive_on(monkeypatch):
         first, second = Player(client), Player(client)
         await first.enter()
         await second.enter()
-        simulator = client.server.app[server.CROWD].simulator
+        simulator = client.server.app[server.SESSIONS].simulator
 
         def failing(weights, state, *_):
             jax.tree.map(lambda x: x.delete(), state)  # as donating does
@@ -214,8 +214,8 @@ def test_rewinding_and_the_same_actions_give_the_same_frames():
 
 def test_a_robot_that_went_back_is_told_where_it_was_sent_then():
     async def test(client):
-        crowd, player = client.server.app[server.CROWD], Player(client)
-        crowd.simulator.describe([replace(crowd.simulator.robots["arm"], keeps=True)])
+        sessions, player = client.server.app[server.SESSIONS], Player(client)
+        sessions.simulator.describe([replace(sessions.simulator.robots["arm"], keeps=True)])
         await player.enter()
         for value in (0.4, 0.5, 0.6):
             frame = await ask(player.socket, type="act", action=[value] * 7)
@@ -223,7 +223,7 @@ def test_a_robot_that_went_back_is_told_where_it_was_sent_then():
         back = await ask(player.socket, type="rewind", frames=1)
         assert back["command"] == pytest.approx([0.5] * 7)
         begun = await ask(player.socket, type="truth", on=True)
-        (arm, _) = [s.actions[-1] for s in crowd.simulator.starts if s.robot == "arm"]
+        (arm, _) = [s.actions[-1] for s in sessions.simulator.starts if s.robot == "arm"]
         assert begun["command"] == pytest.approx(arm, abs=1e-6)
         await player.drive(0.6, 1)
         assert "command" not in await ask(player.socket, type="truth", on=False), "it stays where it is"
@@ -262,7 +262,7 @@ NONSENSE = [
 
 
 def test_malformed_messages_are_errors_of_their_sender_alone(monkeypatch):
-    monkeypatch.setattr(server, "FAULTS", 1000)
+    monkeypatch.setattr(server, "MAX_INVALID_MESSAGES", 1000)
 
     async def test(client):
         hostile, player = Player(client), Player(client)
@@ -288,9 +288,9 @@ def test_whoever_sends_only_nonsense_is_let_go():
         hostile, player = Player(client), Player(client)
         await hostile.enter()
         await player.enter()
-        for _ in range(server.FAULTS):
+        for _ in range(server.MAX_INVALID_MESSAGES):
             await hostile.socket.send_str("?")
-        answers = [await hear(hostile.socket) for _ in range(server.FAULTS + 1)]
+        answers = [await hear(hostile.socket) for _ in range(server.MAX_INVALID_MESSAGES + 1)]
         assert answers[-1]["type"] == "closed"
         assert len(await player.drive(0.5, 2)) == 2
 
@@ -339,14 +339,14 @@ def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch, many
 
 
 def test_one_who_never_reads_is_let_go_and_others_play_on(monkeypatch):
-    monkeypatch.setattr(crowd_module, "SEND_SECONDS", 0.2)
+    monkeypatch.setattr(sessions_module, "SEND_SECONDS", 0.2)
 
     async def test(client):
         silent, player = Player(client), Player(client)
         await silent.enter()
         await player.enter()
-        crowd = client.server.app[server.CROWD]
-        visitor = crowd.visitors[silent.token]
+        sessions = client.server.app[server.SESSIONS]
+        visitor = sessions.visitors[silent.token]
 
         async def stuck(_):
             await asyncio.sleep(3600)
@@ -364,25 +364,25 @@ def test_one_who_never_reads_is_let_go_and_others_play_on(monkeypatch):
 
 
 def test_replies_that_wait_are_bounded():
-    visitor = Visitor("t", Seat(0), replies=asyncio.Queue(REPLIES))
-    for i in range(REPLIES):
+    visitor = Visitor("t", Session(0), replies=asyncio.Queue(MAX_PENDING_REPLIES))
+    for i in range(MAX_PENDING_REPLIES):
         visitor.tell({"i": i})
     assert visitor.replies is not None
     visitor.tell({"i": "one more"})
     assert visitor.replies is None
 
 
-def test_wishes_that_wait_are_bounded():
+def test_requests_that_wait_are_bounded():
     async def test(client):
         player = Player(client)
         await player.enter()
-        waiting = client.server.app[server.CROWD].visitors[player.token].wishes
+        waiting = client.server.app[server.SESSIONS].visitors[player.token].requests
         for _ in range(60):
             await player.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
         counts = []
         for _ in range(60):
             counts.append((await hear(player.socket))["count"])
-            assert len(waiting) <= crowd_module.WISHES
+            assert len(waiting) <= sessions_module.MAX_PENDING_REQUESTS
         assert counts == list(range(3, 63)), "none is lost, and they stay in order"
 
     serving(test)
