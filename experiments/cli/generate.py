@@ -59,7 +59,7 @@ def generate(
     from data_pipelines.sources.units import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
-    from experiments.applications.generating.trajectories import open_trajectories, told_of_frames
+    from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories
     from experiments.applications.simulators import DEAF, load_simulator
     from experiments.running.workspace import Workspace
     from hma_jax.simulator.folder import find_decode
@@ -84,7 +84,7 @@ def generate(
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)
-    if note := told_of_frames(recorded):
+    if note := describe_reconstruction(recorded):
         say(note)
     count = len(recorded) if episodes is None else min(episodes, len(recorded))
     mark = checkpoint_hash(run, simulator.model.step)

@@ -195,8 +195,9 @@ def open_trajectories(
     return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size), chosen
 
 
-def told_of_frames(recorded: Trajectories) -> str:
-    """What people are to be told where no recorded frames are at hand; nothing where they are."""
+def describe_reconstruction(recorded: Trajectories) -> str:
+    """A note for the user where images are the tokenizer's reconstructions, for want of recorded frames; '' where they
+    are recorded."""
     if not recorded.reconstructed:
         return ""
     return (

@@ -16,15 +16,20 @@ from experiments.applications import DRIVEN, FIRST, plan_actions, synthetic
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import (
     ALL,
-    BLIND,
     CONDITIONS,
     CONTROL,
     FEW,
     MOST,
+    PASSIVE,
     Condition,
     share_closed,
 )
-from experiments.applications.generating.lessons import RecordedLessons, Settings, Training, others_actions
+from experiments.applications.generating.demonstration_sources import (
+    RecordedSource,
+    Settings,
+    Training,
+    shuffled_actions,
+)
 from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.made_with import hash_of
 from experiments.applications.plan_actions import decided
@@ -68,7 +73,7 @@ def test_conditions_are_nested_and_no_recording_is_also_generated():
         assert (d.images[c.recorded :, :2] > 0).all()
     for fewer, more in zip(which[:3], which[1:4], strict=True):
         assert more[: len(fewer)] == fewer
-    assert which[MOST] == which[CONTROL] == which[BLIND] and sorted(which[ALL]) == sorted(which[MOST])
+    assert which[MOST] == which[CONTROL] == which[PASSIVE] and sorted(which[ALL]) == sorted(which[MOST])
     assert set(which[FEW]) != set(choose(CONDITIONS[FEW], DATA, 4, 1).actions[:, 0, 0].astype(int).tolist())
 
 
@@ -103,7 +108,7 @@ def recordings(tmp_path_factory):
     return str(directory)
 
 
-def made_where_it_was_stopped(lessons, simulator, out: Path, monkeypatch) -> dict[str, Demonstrations]:
+def made_where_it_was_stopped(source, simulator, out: Path, monkeypatch) -> dict[str, Demonstrations]:
     """What `make_data` gives where a kill came upon its second batch; the first is not made again."""
     replay, made = synthetic.replay, []
 
@@ -115,8 +120,8 @@ def made_where_it_was_stopped(lessons, simulator, out: Path, monkeypatch) -> dic
 
     monkeypatch.setattr(synthetic, "replay", stopped)
     with pytest.raises(KeyboardInterrupt):
-        make_data(lessons, simulator, out)
-    data = make_data(lessons, simulator, out)
+        make_data(source, simulator, out)
+    data = make_data(source, simulator, out)
     assert made == [[0, 1], [2, 3], [2, 3], [4], [0, 1], [2, 3], [4]] and not (out / synthetic.UNDER_WAY).exists()
     return data
 
@@ -130,8 +135,8 @@ def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordin
     train, val = (
         open_trajectories(recordings, split, robot, {}, simulator.tokenizer, tmp_path)[0] for split in ("train", "val")
     )
-    lessons = RecordedLessons(Training(trajectories=5, seeds=(0,), steps=2, given=2), robot, train, val)
-    data = made_where_it_was_stopped(lessons, simulator, tmp_path, monkeypatch)
+    source = RecordedSource(Training(trajectories=5, seeds=(0,), steps=2, given=2), robot, train, val)
+    data = made_where_it_was_stopped(source, simulator, tmp_path, monkeypatch)
     recorded, generated = data["recorded"], data["generated"]
     for i in range(5):
         length = len(train[i])
@@ -147,9 +152,9 @@ def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordin
     np.testing.assert_array_equal(data["shuffled"].actions, recorded.actions)
     assert len(data["held_out"]) == 4
 
-    found = run_trial(lessons, Condition("", 2, 3), data, 0, lambda *_: None)
+    found = run_trial(source, Condition("", 2, 3), data, 0, lambda *_: None)
     assert set(found) == {"error"} and len(found["error"]) == 4
-    trials = {(i, 0): {"error": [round((6 - i) * e, 5) for e in found["error"]]} for i in range(BLIND)}
+    trials = {(i, 0): {"error": [round((6 - i) * e, 5) for e in found["error"]]} for i in range(PASSIVE)}
     synthetic.write_results((0,), trials, synthetic.quality_of(data, 2), tmp_path)
     assert conditions.read_trials(tmp_path) == trials and not (tmp_path / conditions.TRIALS).exists()
     assert "success" not in (tmp_path / "table.md").read_text()
@@ -160,14 +165,14 @@ def test_the_second_control_is_a_model_without_actions_which_shows_the_same_unde
     run = make_run(tmp_path / "study")
     robot = load_simulator(run, history=1).robot("pusher_sand")
     with pytest.raises(ConfigError, match="setting=forward, not without actions"):
-        synthetic.find_blind(run, robot)
+        synthetic.load_passive(run, robot)
     passive = make_run(tmp_path / "passive", TrainConfig(masking=MaskingConfig(setting="passive")))
-    blind, rng, ones = synthetic.find_blind(passive, robot), np.random.default_rng(0), np.ones(2, int)
+    blind, rng, ones = synthetic.load_passive(passive, robot), np.random.default_rng(0), np.ones(2, int)
     images, acted = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8), rng.uniform(-1, 1, (2, 4, 2)).astype(np.float32)
     demos = Demonstrations(images, acted, 4 * ones, np.ones((2, 4), bool), ones > 0, ones)
     shown = [
         synthetic.imagine(blind, robot, replace(demos, actions=a), 1, tmp_path / str(i), lambda *_: None)
-        for i, a in enumerate((acted, others_actions(demos)))
+        for i, a in enumerate((acted, shuffled_actions(demos)))
     ]
     np.testing.assert_array_equal(*shown)
     assert (shown[0][:, 1:] != images[:, 1:]).any()
@@ -238,7 +243,9 @@ def test_other_actions_are_another_trajectorys_and_a_shorter_ones_last_is_held()
     demos = demonstrations(0, 3)
     demos = Demonstrations(**{**vars(demos), "actions": demos.actions + np.arange(3)[:, None] / 10})
     demos.lengths[2] = 2
-    np.testing.assert_allclose(others_actions(demos)[..., 0], [[2, 2.1, 2.1], [0, 0.1, 0.2], [1, 1.1, 1.2]], rtol=1e-6)
+    np.testing.assert_allclose(
+        shuffled_actions(demos)[..., 0], [[2, 2.1, 2.1], [0, 0.1, 0.2], [1, 1.1, 1.2]], rtol=1e-6
+    )
 
 
 def test_an_episode_ends_when_nothing_can_change_its_outcome():
@@ -270,7 +277,7 @@ def summary_of(name: str, model: Path) -> list[conditions.Summary]:
     """Of committed trials, which `name`/table.md shows."""
     place = RESULTS / name
     settings, trials = from_settings(Settings, place / "settings.json", model), conditions.read_trials(place)
-    assert set(trials) == {(i, s) for i in conditions.places(trials) for s in settings.seeds}
+    assert set(trials) == {(i, s) for i in conditions.tried_conditions(trials) for s in settings.seeds}
     assert settings.starts >= 50 and len(settings.seeds) >= 3
     found = conditions.summarise(trials, settings.seeds)
     assert conditions.markdown(found) == (place / "table.md").read_text()

@@ -1,5 +1,5 @@
-"""Whose trajectories policies learn from, and what judges the policies: a scripted expert and the true simulator, or
-recordings and nothing but held-out recordings."""
+"""Where the demonstrations come from that policies are trained on, and what judges these policies: a scripted expert
+and the true simulator, or recordings and held-out recordings alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from hma_jax.simulator.robots import Robot
 
 @dataclass(frozen=True)
 class Training:
-    """How policies are trained, on how much; besides the world model and the lessons all that results depend on."""
+    """How policies are trained, and on how many trajectories. Results depend on this, the world model and the
+    demonstrations alone."""
 
     trajectories: int = 100
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -70,9 +71,9 @@ class RecordedSettings(Training):
     held_out: dict[str, Any] | None = None
 
 
-class Lessons(Protocol):
-    """`record` gives as many trajectories as policies are trained on, `record_held_out` others to judge their actions
-    on; `judge` gives {what: a number for every start} of a policy in closed loop, nothing where no simulator can."""
+class DemonstrationSource(Protocol):
+    """Demonstrations to train policies on (`record`) and to measure their action errors on (`record_held_out`), and a
+    judge: {measure: a number for every start} of a policy in closed loop, {} where no simulator can run one."""
 
     settings: Training
     robot: Robot
@@ -84,8 +85,9 @@ class Lessons(Protocol):
     def judge(self, policy: Policy) -> dict[str, list[float]]: ...
 
 
-class ScriptedLessons:
-    """Successes of the expert that begin far enough from the goal; the true simulator judges."""
+class ScriptedSource:
+    """Successful episodes of the scripted expert that begin far enough from the goal; policies are judged in closed
+    loop in the true simulator."""
 
     def __init__(self, settings: Settings, robot: Robot, image_size: int):
         self.settings, self.robot, self._size, self._task = settings, robot, image_size, settings.make_task()
@@ -112,9 +114,9 @@ class ScriptedLessons:
         return {"success": found.success.astype(int).tolist(), "distance": np.round(found.distance, 4).tolist()}
 
 
-class RecordedLessons:
-    """The first recordings that are longer than the given frames, with actions as the simulator executes them, and at
-    most as many held-out ones."""
+class RecordedSource:
+    """The first recordings that are longer than the given frames, with actions clipped as the simulator executes them,
+    and at most as many held-out ones; nothing runs a policy in closed loop."""
 
     def __init__(self, training: Training, robot: Robot, recorded: Trajectories, held_out: Trajectories):
         """Raises ConfigError for too few recordings, and for a split that would be judged on itself."""
@@ -161,7 +163,7 @@ class RecordedLessons:
 
 
 def as_demonstrations(trajectories: list[Trajectory]) -> Demonstrations:
-    """An action is the whole chunk of its frame, [stride * A]. Nobody knows whether they succeeded."""
+    """An action is the whole chunk of its frame, [stride * A]. Success is unknown and set to False."""
     count, longest = len(trajectories), max(map(len, trajectories))
     images = np.zeros((count, longest, *trajectories[0].images.shape[1:]), np.uint8)
     actions = np.zeros((count, longest, trajectories[0].chunks[0].size), np.float32)
@@ -182,7 +184,8 @@ def as_trajectories(demos: Demonstrations, robot: Robot) -> list[Trajectory]:
     return found
 
 
-def others_actions(demos: Demonstrations) -> np.ndarray:
-    """float32 [N, L, A]: of every trajectory the one's before it; of a shorter one the last action is held."""
+def shuffled_actions(demos: Demonstrations) -> np.ndarray:
+    """float32 [N, L, A]: every trajectory gets the actions of the one before it, whose last action is held where it is
+    shorter."""
     at = np.minimum(np.arange(demos.actions.shape[1]), np.roll(demos.lengths, 1)[:, None] - 1)
     return np.take_along_axis(np.roll(demos.actions, 1, 0), at[..., None], 1)
