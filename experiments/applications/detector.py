@@ -31,8 +31,8 @@ import optax
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
-from experiments.applications.made_with import FILE, claim
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
+from experiments.applications.settings_file import FILE, pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
@@ -272,7 +272,7 @@ def main() -> None:
         not weights.exists() or (args.out / FILE).exists(),
         f"{weights} is there already, and nothing says of which run; choose another --out or remove it",
     )
-    claim(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
+    pin_settings(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
     if there := weights.exists():
         said = f"{short(weights)} of this run is there already; remove it to have it made again"
         say(said)

@@ -33,8 +33,8 @@ from experiments.applications.detector import (
     shown_by,
 )  # fmt: skip
 from experiments.applications.endurance.tables import Row, over_robots
-from experiments.applications.made_with import claim
 from experiments.applications.scenes import Points, point_names, points_of
+from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
@@ -114,7 +114,7 @@ def main() -> None:
     simulator = load_simulator(args.run, **options)
     robots, weights = chosen(known_robots(simulator.robots), args.robots), args.out / WEIGHTS
     settings = {"robots": sorted(robots)} if args.robots else {}
-    claim(args.out, args.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
+    pin_settings(args.out, args.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
     if not weights.exists():
         make_detector(list(robots), simulator.tokenizer, args.out)
     detector, rows, short = Detector.load(weights), [], []

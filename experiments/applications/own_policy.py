@@ -28,7 +28,6 @@ import numpy as np
 
 from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
-from experiments.applications.made_with import claim
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import run_policy, start_seeds
@@ -44,6 +43,7 @@ from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.tasks import Task, find_task
+from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
@@ -197,7 +197,7 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
         "run with a shorter window",
     )
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
-    claim(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
+    pin_settings(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():
         with step(f"record {settings.demonstrations} demonstrations"):

@@ -38,7 +38,6 @@ from data_pipelines.suite.world import World
 from experiments.analysis.intervals import Interval
 from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
-from experiments.applications.made_with import claim
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
 from experiments.applications.planning.goals import to_picture
@@ -53,6 +52,7 @@ from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.scripted import make_expert, noisy
 from experiments.applications.policies.tasks import Task, find_task, held, world_of
+from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
@@ -259,7 +259,7 @@ def main() -> None:
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = settings.start_seeds()
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
-    claim(out, run, simulator, asdict(settings))
+    pin_settings(out, run, simulator, asdict(settings))
     (out / "trials").mkdir(exist_ok=True)
     places = {way: kept(out, way, settings.starts) for way in WAYS}
     wanted = [way for way in WAYS if way in wanted or all(path.exists() for path in places[way])]  # tables are of all

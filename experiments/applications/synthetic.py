@@ -63,7 +63,6 @@ from experiments.applications.generating.demonstration_sources import (
 from experiments.applications.generating.figures import draw_conditions, draw_strips
 from experiments.applications.generating.source import replay
 from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories, require_layout
-from experiments.applications.made_with import claim, write_settings
 from experiments.applications.policies.acting import STILL, Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.demonstrations import (
@@ -75,6 +74,7 @@ from experiments.applications.policies.demonstrations import (
 from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
+from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
@@ -286,9 +286,9 @@ def main() -> None:
     )
     settings, passive = source.settings, args.without_actions and load_passive(args.without_actions, source.robot)
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
-    claim(out, run, simulator, asdict(settings), grows=("seeds",))
+    pin_settings(out, run, simulator, asdict(settings), may_differ=("seeds",))
     if passive:
-        claim(out, args.without_actions, passive, {}, file=SECOND)
+        pin_settings(out, args.without_actions, passive, {}, file=SECOND)
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
     data = make_data(source, simulator, out, passive)

@@ -19,10 +19,10 @@ from typing import Any
 
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import COMMITTED, WEIGHTS, Detector, chosen
-from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
+from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
@@ -112,7 +112,7 @@ def main() -> None:
     detector, simulator, rows = Detector.load(args.detector), load_simulator(args.run), []
     robots = chosen(native_robots(simulator.robots), args.robots)
     starts = true_starts_of(simulator, robots, args.starts)
-    claim_name(args.out, args.name, args.run, simulator, args.detector)
+    pin_name(args.out, args.name, args.run, simulator, args.detector)
     for kind in args.drives:
         for variant in args.variants:
             new: list[Row] = []

@@ -26,8 +26,8 @@ from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from experiments.applications.detector import CLOSE, COMMITTED, SURE, WEIGHTS, Detector
-from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import native_robots
+from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
@@ -145,7 +145,7 @@ def main() -> None:
     detector, rows, table = Detector.load(args.detector), [], args.out / f"{args.name}_hidden.csv"
     simulator = load_simulator(args.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
     robots = native_robots(simulator.robots)
-    claim_name(args.out, args.name, args.run, simulator, args.detector)
+    pin_name(args.out, args.name, args.run, simulator, args.detector)
     with step("objects that come back") as update:
         for i, name in enumerate(robots):
             spec, rng = SPECS[name], np.random.default_rng([0, i])

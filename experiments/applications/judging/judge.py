@@ -29,9 +29,9 @@ from experiments.applications.judging.own_policies import load_own, try_out
 from experiments.applications.judging.own_success import PAGE, OwnSuccess
 from experiments.applications.judging.recordings import Recordings
 from experiments.applications.judging.rollouts import Rollout, load_rollout, run, save_rollout
-from experiments.applications.made_with import claim, short_hash
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
+from experiments.applications.settings_file import pin_settings, short_hash
 from experiments.applications.simulators import load_simulator
 from experiments.own_file import naming_line
 from experiments.running.workspace import Workspace
@@ -145,7 +145,7 @@ def _judge(
     require(
         not others, f"counted on the real robot: {few(others)}; judged here: {', '.join(policies)}; use the same names"
     )
-    claim(out, run_directory, simulator, {"config": to_dict(config), **about}, file="judge.json")
+    pin_settings(out, run_directory, simulator, {"config": to_dict(config), **about}, file="judge.json")
     if own is not None:
         write_file(out / OWN_FILE, own.read_bytes())
     taught = {"robot": robot.name, "task": config.task.name}

@@ -31,13 +31,13 @@ from experiments.applications.generating.demonstration_sources import (
     shuffled_actions,
 )
 from experiments.applications.generating.trajectories import open_trajectories
-from experiments.applications.made_with import hash_of
 from experiments.applications.plan_actions import decided
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.tasks import find_task
+from experiments.applications.settings_file import hash_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig

@@ -1,4 +1,4 @@
-"""What the results in a directory were made with: none is taken for one of other settings or of another model."""
+"""The settings file of a directory of results, so that none is taken for one of other settings or another model."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"
 SIMULATOR = "simulator"
-"""What of a simulator is not in its weights."""
+"""The field of what a simulator's results depend on besides its weights."""
 
 
-def claim(
+def pin_settings(
     out: Path,
     run: Path,
     simulator: Simulator,
     settings: Mapping[str, Any],
     *,
-    grows: Collection[str] = (),
+    may_differ: Collection[str] = (),
     unused: Collection[str] = (),
     file: str = FILE,
 ) -> None:
-    """Makes `out` the directory of what the `simulator` of `run` gives with `settings`. To be called when both are
-    known to be good. Fields that `grows` names say how many results there are, those that `unused` names (and what is
-    under them) had no part in any: with others of these, results that are kept stay what they are.
+    """Pins the directory `out` to the `simulator` of `run` and to `settings`: writes them to `file` there or, where it
+    exists, checks that it says the same. To be called once both are known to be valid.
 
-    Raises ConfigError, naming the differences, where `out` holds what was made otherwise, and where its file is of a
-    time when it did not yet say how frames are filled.
+    Fields named in `may_differ` (how many results there are) and in `unused` (what no result depends on), and those
+    under them, may differ. Raises ConfigError, naming the differences, where another field does, and for a file of an
+    earlier version, which does not say how frames are filled.
     """
-    path, said = out / file, described(run, simulator, settings)
+    path, wanted = out / file, described(run, simulator, settings)
     if path.exists():
         known = json.loads(path.read_text())
-        comparable = said if SIMULATOR in known else {name: x for name, x in said.items() if name != SIMULATOR}
-        free = tuple(f"{name}{end}" for name in (*grows, *unused) for end in ":.")
+        comparable = wanted if SIMULATOR in known else {name: x for name, x in wanted.items() if name != SIMULATOR}
+        free = tuple(f"{name}{end}" for name in (*may_differ, *unused) for end in ":.")
         differences = [line for line in diff(known, comparable) if not line.startswith(free)]
         require(
             not differences,
@@ -59,14 +59,14 @@ def claim(
 
 
 def write_settings(out: Path, run: Path, simulator: Simulator, settings: Mapping[str, Any], file: str = FILE) -> None:
-    """Where more results have been added."""
+    """Writes the file anew, as after results were added that `may_differ` allows."""
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / file, json.dumps(described(run, simulator, settings), indent=1) + "\n")
 
 
 def described(run: Path, simulator: Simulator, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """As it is read again. Runs of one name are told from each other by their weights, robots of one name by a hash of
-    all that is known of them."""
+    """The content of the file. Runs are identified by name and a hash of their weights, robots by name and a hash of
+    their descriptions."""
     robots = {name: short_hash(json.dumps(to_dict(robot)).encode()) for name, robot in sorted(simulator.robots.items())}
     besides = {"decode": to_dict(simulator.decode), "robots": robots}
     said = {"run": run.resolve().name, "weights": hash_of(simulator.model.params), SIMULATOR: besides, **settings}

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.applications.made_with import claim, hash_of
+from experiments.applications.settings_file import hash_of, pin_settings
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.config.json import to_dict
 from hma_jax.simulator.robots import Robot
@@ -26,54 +26,54 @@ def simulator(params=PARAMS, decode: DecodeConfig = DecodeConfig(8, temperature=
 
 def test_what_was_made_otherwise_is_refused_by_name(tmp_path):
     out, run, other = tmp_path / "out", Path("runs/model"), simulator({"trunk": {"w": np.zeros(3)}})
-    claim(out, run, simulator(), SETTINGS)
+    pin_settings(out, run, simulator(), SETTINGS)
     before = (out / "settings.json").read_text()
     kept = json.loads(before)
     assert kept.pop("simulator")["decode"] == to_dict(DecodeConfig(8, temperature=0.7))
     assert kept == {
         "run": "model", "weights": hash_of(PARAMS), "robot": "arm", "seeds": [0, 1], "search": {"candidates": 4}
     }  # fmt: skip
-    claim(out, run, simulator(), SETTINGS)
+    pin_settings(out, run, simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="search.candidates: 4 -> 5.*another --out"):
-        claim(out, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
+        pin_settings(out, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
     with pytest.raises(ConfigError, match="run: 'model' -> 'other'"):
-        claim(out, Path("runs/other"), simulator(), SETTINGS)
-    claim(out, Path("runs/model/"), simulator(), SETTINGS)
+        pin_settings(out, Path("runs/other"), simulator(), SETTINGS)
+    pin_settings(out, Path("runs/model/"), simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="weights: "):
-        claim(out, Path("elsewhere/model"), other, SETTINGS)
+        pin_settings(out, Path("elsewhere/model"), other, SETTINGS)
     assert (out / "settings.json").read_text() == before
 
 
 def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(tmp_path):
     out, run = tmp_path / "out", Path("runs/model")
-    claim(out, run, simulator(), SETTINGS)
+    pin_settings(out, run, simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="simulator.decode.temperature: 0.7 -> 0.0"):
-        claim(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS)
-    claim(out, run, simulator(decode=DecodeConfig(4)), SETTINGS, unused=("simulator.decode",))
+        pin_settings(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS)
+    pin_settings(out, run, simulator(decode=DecodeConfig(4)), SETTINGS, unused=("simulator.decode",))
     with pytest.raises(ConfigError, match="simulator.decode.temperature: 0.7 -> 0.0"):
-        claim(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS, unused=("simulator.dec",))
+        pin_settings(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS, unused=("simulator.dec",))
     with pytest.raises(ConfigError, match="simulator.robots.arm: "):
-        claim(out, run, simulator(robot=replace(ARM, high=(2.0,))), SETTINGS)
+        pin_settings(out, run, simulator(robot=replace(ARM, high=(2.0,))), SETTINGS)
 
 
 def test_results_that_do_not_say_how_frames_were_filled_are_not_gone_on_with(tmp_path):
     """As settings.json was written before it said so. Whoever knows that nothing has changed removes the file."""
     file, run = tmp_path / "settings.json", Path("runs/model")
-    claim(tmp_path, run, simulator(), SETTINGS)
+    pin_settings(tmp_path, run, simulator(), SETTINGS)
     known = json.loads(file.read_text())
     del known["simulator"]
     file.write_text(json.dumps(known))
     with pytest.raises(ConfigError, match="settings.json does not say how frames were filled.*or remove that file"):
-        claim(tmp_path, run, simulator(), SETTINGS)
+        pin_settings(tmp_path, run, simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="search.candidates: 4 -> 5"):
-        claim(tmp_path, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
+        pin_settings(tmp_path, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
     file.unlink()
-    claim(tmp_path, run, simulator(), SETTINGS)
+    pin_settings(tmp_path, run, simulator(), SETTINGS)
 
 
 def test_more_of_the_same_is_not_otherwise(tmp_path):
-    claim(tmp_path, Path("model"), simulator(), SETTINGS)
+    pin_settings(tmp_path, Path("model"), simulator(), SETTINGS)
     more = SETTINGS | {"seeds": (0, 1, 2)}
-    claim(tmp_path, Path("model"), simulator(), more, grows=("seeds",))
+    pin_settings(tmp_path, Path("model"), simulator(), more, may_differ=("seeds",))
     with pytest.raises(ConfigError, match="seeds"):
-        claim(tmp_path, Path("model"), simulator(), more)
+        pin_settings(tmp_path, Path("model"), simulator(), more)
