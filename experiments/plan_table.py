@@ -52,7 +52,7 @@ def plan_table(
         study, simulated=not (given or done.suite), trained=trained and not done.tokenizer, tokenised=not done.tokens
     )
     left = [plan for id, plan in plans.items() if id not in done.finished and id not in done.left]
-    table.caption = _say_done(done, len(plans))
+    table.caption = _describe_done(done, len(plans))
     if left:
         table.caption += _caption(study, left, devices, before, evaluated)
     elif before.seconds or before.unknown:  # it is made before trials are looked at
@@ -87,7 +87,7 @@ def plan_table(
     return table
 
 
-def _say_done(done: Done, trials: int) -> str:
+def _describe_done(done: Done, trials: int) -> str:
     """What is not counted, since it is there."""
     before = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
     parts = [name for name, there in before.items() if there]

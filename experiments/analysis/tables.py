@@ -22,7 +22,7 @@ from hma_jax.training.claim import CHECKPOINTS
 
 
 @dataclass(frozen=True)
-class Judged:
+class FinishedTrial:
     """A finished trial, what names it, and every window's numbers."""
 
     id: str
@@ -35,7 +35,7 @@ class Judged:
         return self.trial.train.seed
 
 
-def read_trial(directory: Path) -> Judged:
+def read_trial(directory: Path) -> FinishedTrial:
     """Raises ConfigError for a trial that is not finished, was changed, or kept no numbers of its windows."""
     if not (directory / RESULT).exists():
         raise ConfigError(f"{directory}: no finished trial (it has no {RESULT})")
@@ -48,10 +48,10 @@ def read_trial(directory: Path) -> Judged:
         raise ConfigError(
             f"{directory}: the finished trial does not say what it is ({error}); copy it again from where it ran"
         ) from error
-    return Judged(directory.name, trial, provenance, windows)
+    return FinishedTrial(directory.name, trial, provenance, windows)
 
 
-def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, Judged]:
+def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, FinishedTrial]:
     """The finished ones among `ids` (None: all in the directory), by id and sorted by it. Raises ConfigError."""
     chosen = [p.name for p in trials.iterdir()] if ids is None else ids
     return {id: read_trial(trials / id) for id in sorted(chosen) if (trials / id / RESULT).exists()}

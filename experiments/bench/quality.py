@@ -27,8 +27,8 @@ PASSES = (8, 4, 2, 1)
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One decoding; a row of quality.csv. Quality is a mean over datasets with its standard error, which
+class DecodingQuality:
+    """The quality and cost of one decoding: a row of quality.csv. Quality is a mean over datasets with its standard error, which
     counts episodes."""
 
     decoding: str
@@ -76,7 +76,7 @@ def judge(
     repeats: int,
     setting: Setting,
     progress: Callable[[str, int], None],
-) -> tuple[list[Judged], list[Stage]]:
+) -> tuple[list[DecodingQuality], list[Stage]]:
     """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time, `setting` is
     what the model was trained for."""
     rows, calls, reference = [], {}, None
@@ -97,7 +97,7 @@ def judge(
             for metric, stat in stats.items()
             for end, kind in (("", "mean"), ("_sem", "sem"))
         }
-        rows.append(Judged(name, frames, found["psnr"].n, found["psnr"].episodes, **values))
+        rows.append(DecodingQuality(name, frames, found["psnr"].n, found["psnr"].episodes, **values))
         calls[name] = compile_rollout(subject, 1, frames, config.prompt_frames, config.decode)
     progress("timing", len(settings))
     weights = subject.inference_params
@@ -116,7 +116,7 @@ def judge(
     return timed, make_stages(1, calls, timings, frames=made_by, flops=dict.fromkeys(calls, 0.0))
 
 
-def plot_quality(rows: Sequence[Judged], path: Path) -> None:
+def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
     """PSNR and delta PSNR over the time per frame, every point named."""
     import matplotlib.pyplot as plt
 

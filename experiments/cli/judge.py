@@ -152,7 +152,13 @@ def judge(
 
 
 def _say(summary: dict) -> None:
-    from experiments.applications.judging.page import NOTHING, say_beyond, say_control, say_head, say_recorded
+    from experiments.applications.judging.page import (
+        NOTHING,
+        describe_clipping,
+        describe_control,
+        describe_head,
+        describe_recorded_head,
+    )
     from experiments.applications.judging.summary import shown
 
     columns = list(next(iter(summary["policies"].values())))
@@ -161,8 +167,13 @@ def _say(summary: dict) -> None:
         table.add_row(name, *(shown(rates[column]) for column in columns))
     console.print(table)
     found = summary["agreement"]
-    say(f"The success head. {say_head(summary)}")
-    for said in (say_recorded(summary["head"]), say_control(summary), say_beyond(summary), "" if found else NOTHING):
+    say(f"The success head. {describe_head(summary)}")
+    for said in (
+        describe_recorded_head(summary["head"]),
+        describe_control(summary),
+        describe_clipping(summary),
+        "" if found else NOTHING,
+    ):
         if said:
             say(said)
     if not found:

@@ -15,10 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.own_file import find_function, naming_line
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, judge_less
+from experiments.user_file import find_function, naming_line
 from experiments.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict

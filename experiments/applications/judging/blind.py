@@ -15,7 +15,7 @@ from PIL import Image
 
 from experiments.analysis.intervals import Interval
 from experiments.applications.judging.agreement import rate_interval
-from experiments.applications.judging.judge import Judged
+from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, Outcome
 from experiments.report.pieces import data_uri
 from hma_jax.config import ConfigError, require
@@ -67,7 +67,7 @@ button { font: inherit; padding: .5rem 1rem; margin: .6rem .4rem 0 0; }
 """
 
 
-def choose(judged: Judged, clips: int, seed: int = 0) -> list[tuple[str, str, int]]:
+def choose(judged: Judgement, clips: int, seed: int = 0) -> list[tuple[str, str, int]]:
     """(policy, world, start) of `clips` episodes, drawn from all of the true world, if there is one, and the learned
     one, shuffled."""
     worlds = [world for world in (TRUE, LEARNED) if world in judged.worlds]
@@ -76,7 +76,7 @@ def choose(judged: Judged, clips: int, seed: int = 0) -> list[tuple[str, str, in
     return [every[i] for i in drawn]
 
 
-def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
+def write_blind(judged: Judgement, out: Path, clips: int = 60) -> Path:
     """OUT/blind.html: clips by number alone. Which number is which episode stands in OUT/blind.json."""
     chosen, pictures = choose(judged, clips), []
     for number, (policy, world, start) in enumerate(chosen):

@@ -20,21 +20,21 @@ import numpy as np
 
 from experiments.applications.generating.trajectories import open_trajectories, require_layout
 from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.ground_truth import GroundTruth, SimulatedTruth
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
 from experiments.applications.judging.head import Head, load_head, save_head
 from experiments.applications.judging.ladder import OWN_HEAD, find_policy, names, train_ladder
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED, TRUE, Outcome, judge_rollout
-from experiments.applications.judging.outside import Outside, TrueOutside
-from experiments.applications.judging.own_policies import load_own, try_out
-from experiments.applications.judging.own_success import PAGE, OwnSuccess
-from experiments.applications.judging.recordings import Recordings
+from experiments.applications.judging.recordings import RecordedTruth
 from experiments.applications.judging.rollouts import Rollout, load_rollout, run, save_rollout
+from experiments.applications.judging.user_policies import load_user_policies, try_out
+from experiments.applications.judging.user_success import PAGE, UserSuccess
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.settings_file import pin_settings, short_hash
 from experiments.applications.simulators import load_simulator
-from experiments.own_file import naming_line
 from experiments.running.workspace import Workspace
+from experiments.user_file import naming_line
 from experiments.words import few
 from hma_jax.config import require
 from hma_jax.config.json import to_dict
@@ -44,34 +44,36 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
-OWN_FILE, MEASURED = "own_policies.py", "measured.json"
+USER_FILE, MEASURED = "own_policies.py", "measured.json"
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What was found."""
+class Judgement:
+    """The outcomes of all policies in all worlds, and what they were made with."""
 
     config: JudgeConfig
     head: Head
     policies: tuple[str, ...]
-    own: tuple[str, ...]  # of these, the user's
+    user_policies: tuple[str, ...]  # of these, the user's
     worlds: tuple[str, ...]
     outcomes: tuple[Outcome, ...]
-    beyond: dict[str, float]  # the share of each policy's actions in the model that the robot's range did not have
+    clipped: dict[str, float]  # the share of each policy's actions in the model that were clipped to the robot's range
     seconds: dict[str, float]  # per episode in each world, of the simulator's steps
     rollouts: Callable[[str, str], Rollout]  # by policy and world
 
 
-def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step, own: Path | None = None) -> Judged:
-    """The ladder's policies, and those of the user's file `own`, in the true and in the learned simulator.
+def judge_run(
+    run_directory: Path, out: Path, config: JudgeConfig, step: Step, user_file: Path | None = None
+) -> Judgement:
+    """The ladder's policies, and those of the user's file `user_file`, in the true and in the learned simulator.
 
     Raises ConfigError where `out` holds other judgements, the robot is not the run's or has no true simulator, or what
     the file gives are no policies.
     """
     simulator = load_simulator(run_directory, episodes=config.batch)
-    _require_some(simulator, own is not None or config.ladder.cloned or config.ladder.diffusion)
+    _require_policy(simulator, user_file is not None or config.ladder.cloned or config.ladder.diffusion)
     robot = simulator.robot(config.task.robot)
-    return _judge(run_directory, out, simulator, robot, TrueOutside(config, robot, simulator, step), step, own)
+    return _judge(run_directory, out, simulator, robot, SimulatedTruth(config, robot, simulator, step), step, user_file)
 
 
 def judge_recorded(
@@ -80,10 +82,10 @@ def judge_recorded(
     config: JudgeConfig,
     dataset: str,
     step: Step,
-    own: Path | None = None,
+    user_file: Path | None = None,
     split: str = "train",
     counted: Sequence[str] = (),
-) -> Judged:
+) -> Judgement:
     """The same for a robot without a true simulator, whose recordings in `dataset` say what success looks like. Of the
     starts and episodes at once that are asked for, as many as recordings are held out. `counted` are the policies that
     the real robot was seen to act by.
@@ -92,27 +94,29 @@ def judge_recorded(
     EpisodeError for one that cannot be read.
     """
     simulator = load_simulator(run_directory, own_starts=True)
-    _require_some(simulator, own is not None)
+    _require_policy(simulator, user_file is not None)
     robot, stores = simulator.robot(config.task.robot), Workspace.of_run(run_directory).store
     recorded, _ = open_trajectories(dataset, split, robot, {}, simulator.tokenizer, stores)
     require_layout(recorded, robot, simulator.model.table)
-    outside = Recordings(config, recorded, robot, step)
-    return _judge(run_directory, out, _of_episodes(simulator, outside.config.batch), robot, outside, step, own, counted)
+    truth = RecordedTruth(config, recorded, robot, step)
+    return _judge(
+        run_directory, out, _with_episodes(simulator, truth.config.batch), robot, truth, step, user_file, counted
+    )
 
 
-def _require_some(simulator: Simulator, given: bool | int) -> None:
+def _require_policy(simulator: Simulator, given: bool | int) -> None:
     """Raises ConfigError where neither are policies given nor is the model one."""
-    some = given or _acts(simulator)
+    some = given or _predicts_actions(simulator)
     require(bool(some), "there is no policy to judge but the random one: give --policies FILE")
 
 
-def _acts(simulator: Simulator) -> bool:
+def _predicts_actions(simulator: Simulator) -> bool:
     """Whether the model itself is a policy: heads alone do not make it one, which know nothing until actions are
     trained."""
     return predicts_actions(simulator.model.config, simulator.model.run.train.masking.setting)
 
 
-def _of_episodes(simulator: Simulator, episodes: int) -> Simulator:
+def _with_episodes(simulator: Simulator, episodes: int) -> Simulator:
     """The same one with so many episodes at once."""
     robots = tuple(simulator.robots.values())
     return Simulator(simulator.model, simulator.tokenizer, robots=robots, episodes=episodes, decode=simulator.decode)
@@ -123,40 +127,42 @@ def _judge(
     out: Path,
     simulator: Simulator,
     robot: Robot,
-    outside: Outside,
+    truth: GroundTruth,
     step: Step,
-    own: Path | None,
+    user_file: Path | None,
     counted: Sequence[str] = (),
-) -> Judged:
-    config = outside.config
-    policies = names(config.ladder) + [OWN_HEAD] * _acts(simulator)  # may refuse the ladder
-    users, success, about = {}, None, outside.about()
-    if own is not None:
-        users, success = load_own(own, robot)
+) -> Judgement:
+    config = truth.config
+    policies = names(config.ladder) + [OWN_HEAD] * _predicts_actions(simulator)  # may refuse the ladder
+    user_policies, success, about = {}, None, truth.about()
+    if user_file is not None:
+        user_policies, success = load_user_policies(user_file, robot)
     encoders = [config.ladder.encoder] * bool(config.ladder.cloned + config.ladder.diffusion)
     for encoder in encoders + [config.head.encoder] * (success is None):
         require_multiples(*simulator.tokenizer.image_shape, encoder.size)
-    if own is not None:
-        with naming_line(own, PAGE):
-            try_out(users, success, config.batch, simulator.tokenizer.image_shape)
-        about["contents of --policies"] = short_hash(own.read_bytes())
-    policies += users
+    if user_file is not None:
+        with naming_line(user_file, PAGE):
+            try_out(user_policies, success, config.batch, simulator.tokenizer.image_shape)
+        about["contents of --policies"] = short_hash(user_file.read_bytes())
+    policies += user_policies
     others = [name for name in counted if name not in policies]
     require(
         not others, f"counted on the real robot: {few(others)}; judged here: {', '.join(policies)}; use the same names"
     )
     pin_settings(out, run_directory, simulator, {"config": to_dict(config), **about}, file="judge.json")
-    if own is not None:
-        write_file(out / OWN_FILE, own.read_bytes())
-    taught = {"robot": robot.name, "task": config.task.name}
+    if user_file is not None:
+        write_file(out / USER_FILE, user_file.read_bytes())
+    about_policies = {"robot": robot.name, "task": config.task.name}
     with step("policies") as report:
-        train_ladder(out / "policies", outside.demonstrations, config.ladder, config.seed, taught, lambda kind: report)
-    head = _find_head(out / "head", outside, simulator, success)
-    starts = outside.starts()
+        train_ladder(
+            out / "policies", truth.demonstrations, config.ladder, config.seed, about_policies, lambda kind: report
+        )
+    head = _find_head(out / "head", truth, simulator, success)
+    starts = truth.starts()
     seeds = [config.seed + i for i in range(len(starts))]
-    acting: dict[str, Policy] = dict(users)  # what was compiled for one world serves the next
-    with outside.open() as true:
-        for world, name in itertools.product(outside.worlds, policies):
+    acting: dict[str, Policy] = dict(user_policies)  # what was compiled for one world serves the next
+    with truth.open() as true:
+        for world, name in itertools.product(truth.worlds, policies):
             path = _place(out, name, world)
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -167,37 +173,37 @@ def _judge(
                         shuffled=world == SHUFFLED, report=report,
                     )  # fmt: skip
                 save_rollout(made, path)
-    return _collect(out, outside, head, policies, tuple(users), robot, starts, seeds)
+    return _collect(out, truth, head, policies, tuple(user_policies), robot, starts, seeds)
 
 
 def _collect(
     out: Path,
-    outside: Outside,
+    truth: GroundTruth,
     head: Head,
     policies: Sequence[str],
-    own: tuple[str, ...],
+    user_policies: tuple[str, ...],
     robot: Robot,
     starts: Sequence[Start],
     seeds: Sequence[int],
-) -> Judged:
+) -> Judgement:
     numbers = [start.seed if start.seed is not None else -1 for start in starts]
-    outcomes, seconds, beyond = [], {}, {}
-    for world in outside.worlds:
+    outcomes, seconds, clipped = [], {}, {}
+    for world in truth.worlds:
         times = []
         for name in policies:
             rollout = load_rollout(_place(out, name, world))
             times.append(rollout.seconds)
-            outcomes += judge_rollout(rollout, head, outside.config.task, name, world, numbers, seeds)
+            outcomes += judge_rollout(rollout, head, truth.config.task, name, world, numbers, seeds)
             if world == LEARNED:
-                beyond[name] = _beyond(rollout.actions, robot)
+                clipped[name] = _clipped_share(rollout.actions, robot)
         seconds[world] = float(np.median(np.concatenate(times)))  # the first one compiles
     rollouts = lambda name, world: load_rollout(_place(out, name, world))  # noqa: E731
-    return Judged(
-        outside.config, head, tuple(policies), own, outside.worlds, tuple(outcomes), beyond, seconds, rollouts
+    return Judgement(
+        truth.config, head, tuple(policies), user_policies, truth.worlds, tuple(outcomes), clipped, seconds, rollouts
     )
 
 
-def _beyond(actions: np.ndarray, robot: Robot) -> float:
+def _clipped_share(actions: np.ndarray, robot: Robot) -> float:
     """The share of actions [..., A] of which a value lies outside the robot's range, to which it is then moved."""
     low, high = np.array(robot.low, np.float32), np.array(robot.high, np.float32)
     return float(((actions < low) | (actions > high)).any(-1).mean())
@@ -207,22 +213,22 @@ def _place(out: Path, name: str, world: str) -> Path:
     return out / "rollouts" / f"{name}.{world}.npz"
 
 
-def _find_head(directory: Path, outside: Outside, simulator: Simulator, own: OwnSuccess | None) -> Head:
+def _find_head(directory: Path, truth: GroundTruth, simulator: Simulator, user_success: UserSuccess | None) -> Head:
     tokenizer = simulator.tokenizer
 
     def reconstruct(images: np.ndarray) -> np.ndarray:
         return np.asarray(tokenizer.decode(tokenizer.encode(images)))
 
-    if own is not None:
+    if user_success is not None:
         kept = directory / MEASURED
         if not kept.exists():
             directory.mkdir(parents=True, exist_ok=True)
-            write_file(kept, json.dumps(outside.measure(own, reconstruct), indent=1) + "\n")
-        own.measured |= json.loads(kept.read_text())
-        return own
+            write_file(kept, json.dumps(truth.measure(user_success, reconstruct), indent=1) + "\n")
+        user_success.measured |= json.loads(kept.read_text())
+        return user_success
     if (directory / HEAD_DESCRIPTION).exists():
         return load_head(directory)
-    head = outside.make_head(reconstruct)
-    head.measured |= outside.measure(head, reconstruct)
+    head = truth.make_head(reconstruct)
+    head.measured |= truth.measure(head, reconstruct)
     save_head(head, directory)
     return head

@@ -15,7 +15,7 @@ from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
 from experiments.applications.judging.agreement import count_interval
-from experiments.applications.judging.judge import Judged
+from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
 from experiments.applications.judging.recordings import LAST
 from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE, shown
@@ -45,12 +45,12 @@ AXES = {
     REAL: "success of the real robot",
     CONTROL: "success in the control: actions of other episodes, by the head",
 }
-"""What is told from left to right."""
+"""Labels of the horizontal axis."""
 
 
 def draw_scatter(summary: dict[str, Any], path: Path) -> None:
-    """Success in the learned world, and in the control, against what they are compared with, a point for each policy;
-    where that is nothing, one against the other."""
+    """Success in the learned world, and in the control, against the reference (the true simulator or the real robot), a
+    point for each policy; without a reference, against each other."""
     across, titles = (
         summary["compared with"] or CONTROL,
         {MODEL: "learned model", CONTROL: "control: actions of other episodes"},
@@ -111,8 +111,8 @@ def place(words: Sequence[Annotation], panel: Axes) -> None:
             word.set_visible(False)
 
 
-def say_beyond(summary: dict[str, Any]) -> str:
-    """In words, of which policies of the user's many actions were clipped; "" where of none."""
+def describe_clipping(summary: dict[str, Any]) -> str:
+    """A warning that names the user's policies of which many actions were clipped; "" where there is none."""
     shares = {name: summary["actions beyond the range"][name] for name in summary["own"]}
     many = [f"{name} ({share:.0%})" for name, share in shares.items() if share > MANY_BEYOND]
     if not many:
@@ -123,7 +123,7 @@ def say_beyond(summary: dict[str, Any]) -> str:
     )
 
 
-def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str) -> Path:
+def write_page(judged: Judgement, summary: dict[str, Any], out: Path, command: str) -> Path:
     """OUT/judge.html, from the figures drawn already."""
     columns = list(next(iter(summary["policies"].values())))
     lines = [[html.escape(name), *(shown(rates[c]) for c in columns)] for name, rates in summary["policies"].items()]
@@ -149,7 +149,9 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
 
 
 def _doubts(summary: dict[str, Any]) -> list[str]:
-    return [f"<p><b>{html.escape(said)}</b></p>" for said in (say_control(summary), say_beyond(summary)) if said]
+    return [
+        f"<p><b>{html.escape(said)}</b></p>" for said in (describe_control(summary), describe_clipping(summary)) if said
+    ]
 
 
 NOTHING = (
@@ -191,13 +193,13 @@ def _head(summary: dict[str, Any]) -> str:
     rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
     return section(
         "The success head",
-        f"<p>{html.escape(say_head(summary))} {html.escape(say_recorded(summary['head']))}</p>"
+        f"<p>{html.escape(describe_head(summary))} {html.escape(describe_recorded_head(summary['head']))}</p>"
         f"<p>Episodes per second, this machine as loaded as it was: {html.escape(rates)}.</p>",
     )
 
 
-def say_head(summary: dict[str, Any]) -> str:
-    """In words, what whoever tells success is worth on frames that nobody was trained on."""
+def describe_head(summary: dict[str, Any]) -> str:
+    """A sentence on the accuracy of the success head, or of the user's function, on held-out episodes."""
     measured = summary["head"]
     usual = max(measured["positive"], 1 - measured["positive"])
     doubt = "" if measured["frame accuracy"] > usual else " It does no better: do not trust the rates that it tells."
@@ -209,8 +211,8 @@ def say_head(summary: dict[str, Any]) -> str:
     )
 
 
-def say_control(summary: dict[str, Any]) -> str:
-    """In words, that success in the model may not hang on what policies do; "" where it is known to."""
+def describe_control(summary: dict[str, Any]) -> str:
+    """A warning that success in the model may not depend on the policies' actions; "" where it is known to."""
     above = summary["above the control"]
     if above["low"] > 0:
         return ""
@@ -221,8 +223,8 @@ def say_control(summary: dict[str, Any]) -> str:
     )
 
 
-def say_recorded(measured: dict[str, float]) -> str:
-    """In words, what a head says of recordings of success and failure that are held out; "" where there are none."""
+def describe_recorded_head(measured: dict[str, float]) -> str:
+    """Sentences on the accuracy of a head that learnt from recordings, on held-out ones; "" for other heads."""
     if "successes" not in measured:
         return ""
     n, good = round(measured["episodes"]), round(measured["successes"])
@@ -249,7 +251,7 @@ def say_recorded(measured: dict[str, float]) -> str:
     )
 
 
-def _left_of(judged: Judged) -> tuple[tuple[tuple[str, str], ...], str]:
+def _left_of(judged: Judgement) -> tuple[tuple[tuple[str, str], ...], str]:
     """Whose clips are shown beside each other, (world, judge) of both, and what the left one is called."""
     if TRUE in judged.worlds:
         return ((TRUE, STATE), (LEARNED, HEAD)), "the true world"
@@ -259,7 +261,7 @@ def _left_of(judged: Judged) -> tuple[tuple[tuple[str, str], ...], str]:
 CALLED = {TRUE: "true", LEARNED: "model", SHUFFLED: "control"}
 
 
-def _clips(judged: Judged, *sides: tuple[str, str]) -> str:
+def _clips(judged: Judgement, *sides: tuple[str, str]) -> str:
     """Of policies spread over the ladder, one start each, and what the judges said."""
     chosen = np.unique(np.linspace(0, len(judged.policies) - 1, CLIPS).round().astype(int))
     said = [successes(judged.outcomes, judged.policies, *side) for side in sides]

@@ -19,9 +19,9 @@ from data_pipelines.sampling.order import hash64, stream_seed
 from experiments.applications.generating.source import confined
 from experiments.applications.generating.trajectories import Trajectories, describe
 from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.ground_truth import Reconstruct
 from experiments.applications.judging.head import Head, SuccessHead, balanced_error, fit_heads, worth_of
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
-from experiments.applications.judging.outside import Reconstruct
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.learning import Report, ladder
 from experiments.applications.policies.network import shrink_bytes
@@ -59,9 +59,9 @@ BEFORE = START_FRAMES - 1
 """Frames of a recording before the first that is looked at."""
 
 
-class Recordings:
-    """See `outside.Outside`. `config` is the one asked for, with the task and the number of starts that the recordings
-    leave."""
+class RecordedTruth:
+    """The `GroundTruth` of recordings. `config` is the given one, with the task's length and goal and the number of
+    starts that the recordings allow."""
 
     worlds = (LEARNED, SHUFFLED)
 
@@ -179,22 +179,22 @@ class Recordings:
         """From first to last frame of the recordings that are held out; also as the model's tokenizer shows them, which
         is how it sees those of the model."""
         hold, successes = self.config.task.hold, self._success[self.held_out]
-        scores, labels, said, said_decoded = [], [], [], []
+        scores, labels, decisions, decoded_decisions = [], [], [], []
         for i in self.held_out:
             images = self._images(i)
             chosen, label = self._labelled(i, len(images))
-            for shown, found in ((images, said), (reconstruct(images), said_decoded)):
+            for shown, found in ((images, decisions), (reconstruct(images), decoded_decisions)):
                 probability = head.probabilities(shown, shown[:1])
                 found.append(held(probability[None, 1:] > head.threshold, hold).any())
                 if shown is images:
                     scores.append(probability[chosen])
                     labels.append(label)
-        by_head = np.array(said)
+        by_head = np.array(decisions)
         return worth_of(head, np.concatenate(scores), np.concatenate(labels), by_head, successes) | {
             "successes": float(successes.sum()),
             "successes told": float(by_head[successes].sum()),
             "failures told": float((~by_head[~successes]).sum()),
-            "episode accuracy, decoded": float((np.array(said_decoded) == successes).mean()),
+            "episode accuracy, decoded": float((np.array(decoded_decisions) == successes).mean()),
             **self._left_out,
         }
 

@@ -21,10 +21,10 @@ from experiments.applications.judging.agreement import (
     rate_interval,
     share,
 )
-from experiments.applications.judging.judge import Judged
+from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
-from experiments.applications.judging.own_success import OwnSuccess
 from experiments.applications.judging.real import Count
+from experiments.applications.judging.user_success import UserSuccess
 from hma_jax.runtime.files import write_file
 
 REFERENCE, REAL, MODEL, CONTROL = "true, by state", "real robot", "learned, by head", "shuffled, by head"
@@ -47,7 +47,7 @@ COMPARED = {
 UNKNOWN = {"mean": None, "low": None, "high": None}
 
 
-def summarise(judged: Judged, real: Mapping[str, Count] | None = None) -> dict[str, Any]:
+def summarise(judged: Judgement, real: Mapping[str, Count] | None = None) -> dict[str, Any]:
     """What agreement.json says; every number with its interval. `real`: what happened on the real robot, of some
     policies."""
     columns = {name: where for name, where in COLUMNS.items() if where[0] in judged.worlds}
@@ -66,9 +66,9 @@ def summarise(judged: Judged, real: Mapping[str, Count] | None = None) -> dict[s
         "hold": judged.config.task.hold,
         "starts": judged.config.starts,
         "policies": rates,
-        "own": list(judged.own),
-        "own success": isinstance(judged.head, OwnSuccess),
-        "actions beyond the range": {name: round(share, 4) for name, share in judged.beyond.items()},
+        "own": list(judged.user_policies),
+        "own success": isinstance(judged.head, UserSuccess),
+        "actions beyond the range": {name: round(share, 4) for name, share in judged.clipped.items()},
         "compared with": REAL if real else REFERENCE if REFERENCE in each else None,
         "agreement": {
             name: {
@@ -84,7 +84,9 @@ def summarise(judged: Judged, real: Mapping[str, Count] | None = None) -> dict[s
     }
 
 
-def _compare(judged: Judged, each: Mapping[str, np.ndarray], real: Mapping[str, Count] | None) -> dict[str, Agreement]:
+def _compare(
+    judged: Judgement, each: Mapping[str, np.ndarray], real: Mapping[str, Count] | None
+) -> dict[str, Agreement]:
     compared = {name: column for name, column in COMPARED.items() if column in each}
     if REFERENCE in each:
         return {name: agree(each[REFERENCE], each[column]) for name, column in compared.items()}

@@ -38,7 +38,7 @@ def quality(
     from dataclasses import replace
 
     from data_pipelines.windows.evalset import eval_batches, freeze_manifest
-    from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
+    from experiments.bench.quality import DecodingQuality, decodings, judge, plot_quality, subject_of
     from experiments.cli.evaluate import check_fits, require_prepared
     from experiments.rows import write_csv
     from experiments.running.run_trial import open_materials
@@ -81,7 +81,7 @@ def quality(
     out = run / "quality"
     out.mkdir(exist_ok=True)
     stem = out / f"quality-{frames}"
-    write_csv(stem.with_suffix(".csv"), Judged, rows)
+    write_csv(stem.with_suffix(".csv"), DecodingQuality, rows)
     plot_quality(rows, stem.with_suffix(".png"))
     gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr_gap for r in rows[1:]}
     facts = {"model": trained.model, "eval": replace(config, batch=1), "frames": frames, "windows": rows[0].windows}

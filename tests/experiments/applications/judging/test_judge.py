@@ -16,7 +16,7 @@ from experiments.applications.judging.head import PIECE, HeadConfig, HeadJudge, 
 from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, read_outcomes, write_outcomes
-from experiments.applications.judging.page import draw_scatter, place, say_beyond, write_page
+from experiments.applications.judging.page import describe_clipping, draw_scatter, place, write_page
 from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
 from experiments.applications.policies.learning import FitConfig
@@ -144,7 +144,7 @@ def test_policies_of_ones_own_are_judged_beside_the_random_one_and_told_from_cha
     assert found.policies == ("random", "hma", "still") and found.own == ("still",)
     assert not (out / "policies").exists() and (out / "own_policies.py").read_text() == file.read_text()
     assert (found.rollouts("still", TRUE).actions == 0).all()
-    assert found.beyond["still"] == 0
+    assert found.clipped["still"] == 0
     assert [o for o in found.outcomes if o.policy == "random"] == [o for o in before.outcomes if o.policy == "random"]
 
     kept = out / "rollouts" / "still.learned.npz"
@@ -158,8 +158,8 @@ def test_policies_of_ones_own_are_judged_beside_the_random_one_and_told_from_cha
 
 def test_actions_in_other_units_are_told():
     said = {"robot": "arm", "own": ["a", "b"], "actions beyond the range": {"a": 0.5, "b": 0.05, "random": 1.0}}
-    assert "outside what arm was ever given, and were clipped to it: of a (50%)." in say_beyond(said)
-    assert not say_beyond(said | {"own": ["b"]})
+    assert "outside what arm was ever given, and were clipped to it: of a (50%)." in describe_clipping(said)
+    assert not describe_clipping(said | {"own": ["b"]})
 
 
 def test_a_policy_without_right_actions_is_refused_before_anything_is_made(judged, tmp_path):

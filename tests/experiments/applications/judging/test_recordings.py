@@ -15,7 +15,7 @@ from experiments.applications.generating.trajectories import Outline, RldsTrajec
 from experiments.applications.judging.agreement import agree, agree_with_counts, mean_above
 from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
-from experiments.applications.judging.page import say_control, say_head, say_recorded
+from experiments.applications.judging.page import describe_control, describe_head, describe_recorded_head
 from experiments.applications.judging.real import read_real
 from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
@@ -322,10 +322,12 @@ def test_success_that_does_not_hang_on_what_policies_do_is_told():
         mean_above(learned | (rng.random((4, 30)) < 0.6), control, draws=200),
     )
     assert same.low < 0 < same.high and 0 < better.low < better.mean < better.high
-    told = [say_control({"above the control": {"mean": x.mean, "low": x.low, "high": x.high}}) for x in (same, better)]
+    told = [
+        describe_control({"above the control": {"mean": x.mean, "low": x.low, "high": x.high}}) for x in (same, better)
+    ]
     assert "not known that policies succeed more often in the model than in the control" in told[0] and told[1] == ""
     unsure = {"above the control": {"mean": 0.3, "low": -0.02, "high": 0.6}}
-    assert "they do by 0.30 (-0.02 to 0.60) on average" in say_control(unsure), (
+    assert "they do by 0.30 (-0.02 to 0.60) on average" in describe_control(unsure), (
         "few starts are no proof of the contrary"
     )
 
@@ -335,13 +337,15 @@ def test_a_head_that_is_no_better_than_always_saying_the_same_is_told():
         "episodes": 20.0, "successes": 10.0, "successes told": 9.0, "failures told": 10.0, "learnt from": 60.0,
         "episode accuracy, decoded": 0.9, "successes among them": 30.0, "unknown": 0.0, "too short": 1.0,
     }  # fmt: skip
-    assert "9 of 10 successes and 10 of 10 failures: 0.95" in say_recorded(measured)
-    assert "do not trust" not in say_recorded(measured)
-    assert "do not trust" in say_recorded(measured | {"failures told": 3.0}) and say_recorded({}) == ""
+    assert "9 of 10 successes and 10 of 10 failures: 0.95" in describe_recorded_head(measured)
+    assert "do not trust" not in describe_recorded_head(measured)
+    assert (
+        "do not trust" in describe_recorded_head(measured | {"failures told": 3.0}) and describe_recorded_head({}) == ""
+    )
 
 
 def test_whoever_tells_success_no_better_than_always_the_same_is_told():
     measured = {"positive": 0.3, "frame accuracy": 0.71, "frame AUROC": 0.6, "episodes": 40.0, "episode accuracy": 0.7}
-    said = [say_head({"head": measured | {"frame accuracy": x}, "own success": True}) for x in (0.71, 0.7)]
+    said = [describe_head({"head": measured | {"frame accuracy": x}, "own success": True}) for x in (0.71, 0.7)]
     assert all("To call every frame the same would be right in 0.700" in one for one in said)
     assert "do not trust" not in said[0] and "do not trust" in said[1]

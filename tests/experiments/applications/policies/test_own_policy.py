@@ -11,7 +11,7 @@ import pytest
 
 from data_pipelines.suite.world import World
 from experiments.applications import own_policy
-from experiments.applications.judging.own_policies import load_own, try_out
+from experiments.applications.judging.user_policies import load_user_policies, try_out
 from experiments.applications.own_policy import (
     OWN,
     RANDOM,
@@ -99,7 +99,7 @@ def test_what_is_post_trained_is_no_simulator_and_acts_in_one_by_the_file_of_the
     page = (Path(__file__).parents[4] / "docs/policies.md").read_text()
     (tmp_path / "mine.py").write_text(page.split("```python\n")[1].split("```")[0])
     monkeypatch.chdir(tmp_path)
-    users, _ = load_own(tmp_path / "mine.py", robot)
+    users, _ = load_user_policies(tmp_path / "mine.py", robot)
     try_out(users, None, 2, (8, 8))
     assert list(users) == ["own_head"]
 

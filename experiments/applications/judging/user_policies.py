@@ -1,6 +1,6 @@
-"""Policies of a user's own: `policies(robot)` of a Python file gives them by name. What they answer is checked.
+"""Policies of the user: `policies(robot)` of a Python file returns them by name. Their actions are checked.
 
-The file may have a function `success` as well (`own_success`): it is run once for both."""
+The file may have a function `success` as well (`user_success`): it is run once for both."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments.applications.judging.ladder import OWN_HEAD, RANDOM
-from experiments.applications.judging.own_success import PAGE, OwnSuccess, success_of
+from experiments.applications.judging.user_success import PAGE, UserSuccess, success_of
 from experiments.applications.policies.cloning import ClonedPolicy
 from experiments.applications.policies.diffusion import DiffusionPolicy
 from experiments.applications.policies.policy import Policy
-from experiments.own_file import function_of, naming_line, run_file
+from experiments.user_file import function_of, naming_line, run_file
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 
@@ -65,16 +65,16 @@ class CheckedPolicy:
         return actions
 
 
-def load_own(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], OwnSuccess | None]:
+def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], UserSuccess | None]:
     """What `policies(robot)` of the file gives, and what it says of success, if it does. Modules beside the file can be
     imported by it, as where it is a program.
 
     Raises ConfigError for another thing than policies, for names that rollouts cannot be kept under, and, with its
     line, for what the file raises.
     """
-    beside = str(path.resolve().parent)
-    if beside not in sys.path:
-        sys.path.append(beside)  # behind all others: it hides none
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)  # behind all others: it hides none
     with naming_line(path, PAGE):
         file = run_file(path, SIGNATURE, "policies of your own are", PAGE)
         found = function_of(file, SIGNATURE, PAGE)(robot)
@@ -98,7 +98,9 @@ def load_own(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], OwnSuc
     return checked, success_of(file)
 
 
-def try_out(policies: dict[str, CheckedPolicy], success: OwnSuccess | None, batch: int, shape: tuple[int, int]) -> None:
+def try_out(
+    policies: dict[str, CheckedPolicy], success: UserSuccess | None, batch: int, shape: tuple[int, int]
+) -> None:
     """Shows each black images: what would stop it later stops it before anything is made."""
     black = np.zeros((batch, *shape, 3), np.uint8)
     if success is not None:

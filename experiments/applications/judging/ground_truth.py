@@ -1,4 +1,5 @@
-"""What of a judgement does not come from the model: where episodes begin, what success looks like, and the truth."""
+"""What policies are judged against, and what does not come from the model: starts of episodes, labels of success, and
+the true simulator where there is one."""
 
 from __future__ import annotations
 
@@ -27,17 +28,17 @@ HELD_OUT = 7919
 """Added to the seed of recordings that nothing is trained on."""
 
 OFTEN = 0.5
-"""Share of its demonstrations in which an expert should do what it is cloned for."""
+"""Share of demonstrations that should succeed, for policies to learn the task from them."""
 
 Reconstruct = Callable[[np.ndarray], np.ndarray]
 """uint8 [n, H, W, 3] as the model's tokenizer shows them."""
 
 
-class Outside(Protocol):
-    """The part in which a robot with a true simulator differs from one with recordings alone.
+class GroundTruth(Protocol):
+    """The ground truth of a robot: of its true simulator, or of recordings alone.
 
-    worlds: those in which policies act, in this order; the true one only where `open` gives it. `about`: what tells it
-    from others, for whoever goes on. Expensive parts are made when they are asked for.
+    worlds: those in which policies act, in this order; the true one only where `open` gives it. `about`: what
+    identifies the source, for judge.json. Expensive parts are made by the methods, not before.
     """
 
     config: JudgeConfig
@@ -46,15 +47,15 @@ class Outside(Protocol):
     def about(self) -> dict[str, Any]: ...
 
     def demonstrations(self) -> Demonstrations:
-        """What the ladder is trained on."""
+        """The training set of the policies of the ladder."""
         ...
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
-        """Trained, and not measured yet."""
+        """A trained success head, not measured yet."""
         ...
 
     def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
-        """What it is worth on episodes that no head is trained on."""
+        """The accuracy of a head on episodes that no head is trained on."""
         ...
 
     def starts(self) -> list[Start]: ...
@@ -64,8 +65,8 @@ class Outside(Protocol):
         ...
 
 
-class TrueOutside:
-    """Of a robot that has a true simulator: its expert is cloned, and its state is the truth."""
+class SimulatedTruth:
+    """Of a robot with a true simulator, whose expert is cloned and whose state says what succeeded."""
 
     worlds = WORLDS
 
@@ -91,7 +92,7 @@ class TrueOutside:
                 after=0,
                 seed=config.seed,
             )
-        if seldom := say_seldom(made, short):
+        if seldom := describe_rare_success(made, short):
             say(seldom)
         return made
 
@@ -116,9 +117,9 @@ class TrueOutside:
         return closing(true_simulator(self._learned, [self._robot], self.config.batch))
 
 
-def say_seldom(demos: Demonstrations, task: Task) -> str:
-    """In words, that an expert of the suite hardly does its robot's own task; "" where it does, or where there is no
-    easier one."""
+def describe_rare_success(demos: Demonstrations, task: Task) -> str:
+    """A warning that the suite's expert rarely succeeds at its robot's own task, so that policies cannot learn it; ""
+    where it succeeds, or where there is no easier task."""
     done = float(demos.successes.mean())
     if not task.in_suite or task.name != OWN or done >= OFTEN:
         return ""

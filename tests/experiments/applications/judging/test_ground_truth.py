@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from experiments.applications.judging.outside import say_seldom
+from experiments.applications.judging.ground_truth import describe_rare_success
 from experiments.applications.policies.tasks import find_task
 
 
@@ -13,5 +13,5 @@ def test_an_expert_that_hardly_does_its_own_task_is_told():
     seldom, often = (SimpleNamespace(successes=np.arange(10) < n) for n in (2, 6))
     task = replace(find_task("pusher_sand"), frames=12)
     told = "The expert of pusher_sand does its own task in 20% of the demonstrations (12 frames each)."
-    assert say_seldom(seldom, task).startswith(told) and say_seldom(often, task) == ""
-    assert say_seldom(seldom, find_task("pusher_sand", "reach")) == ""
+    assert describe_rare_success(seldom, task).startswith(told) and describe_rare_success(often, task) == ""
+    assert describe_rare_success(seldom, find_task("pusher_sand", "reach")) == ""

@@ -1,4 +1,4 @@
-"""Python files of a user's own that the program runs for one function: an axis, policies."""
+"""Python files of the user that the program runs for the functions in them: an axis, policies."""
 
 from __future__ import annotations
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.applications.judging.own_policies import CheckedPolicy, load_own, try_out
-from experiments.applications.judging.own_success import OwnSuccess
+from experiments.applications.judging.user_policies import CheckedPolicy, load_user_policies, try_out
+from experiments.applications.judging.user_success import UserSuccess
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
 
@@ -38,7 +38,7 @@ def policies(robot):
 def test_policies_of_a_file_are_found_by_name_with_what_lies_beside_it(tmp_path):
     (tmp_path / "helper_of_policies.py").write_text("VALUE = 0.5")
     (tmp_path / "mine.py").write_text(FILE)
-    found, success = load_own(tmp_path / "mine.py", ROBOT)
+    found, success = load_user_policies(tmp_path / "mine.py", ROBOT)
     assert list(found) == ["still", "Onward-2"] and success is None
     try_out(found, success, 2, (8, 8))
     actions = found["Onward-2"].act(np.zeros((2, 8, 8, 3), np.uint8))
@@ -50,13 +50,13 @@ def test_success_of_a_file_is_asked_of_frames_beside_the_first_of_their_episodes
     path = tmp_path / "mine.py"
     text = "def policies(robot): return {'a': A}\nclass A:\n def reset(episodes=None, seeds=None): 0\n def act(images): 0\n"
     path.write_text(text + "def success(images, first): return images.mean((1, 2, 3)) > first.mean((1, 2, 3))\n")
-    _, success = load_own(path, ROBOT)
+    _, success = load_user_policies(path, ROBOT)
     images = np.arange(600, dtype=np.uint8).reshape(2, 300, 1, 1, 1) * np.ones((1, 1, 4, 4, 3), np.uint8)
     found = success.reached(images, images[:, 10:11])
     assert found.shape == (2, 300) and (found == (images > images[:, 10:11])[..., 0, 0, 0]).all()
     path.write_text(text + "success = 3\n")
     with pytest.raises(ConfigError, match=r"mine.py: has no function success\(images, first\)"):
-        load_own(path, ROBOT)
+        load_user_policies(path, ROBOT)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_success_of_a_file_is_asked_of_frames_beside_the_first_of_their_episodes
     ],
 )
 def test_success_that_is_no_probability_of_each_image_is_refused(given, said):
-    success = OwnSuccess(lambda images, first: eval(given), "mine.py")
+    success = UserSuccess(lambda images, first: eval(given), "mine.py")
     with pytest.raises(ConfigError, match=rf"mine.py: success\(images, first\) must give \[2\].*{said}"):
         try_out({}, success, 2, (8, 8))
 
@@ -78,7 +78,7 @@ def test_success_that_is_no_probability_of_each_image_is_refused(given, said):
 def test_the_policies_of_the_page_are_some(tmp_path):
     page = (Path(__file__).parents[4] / "docs" / "judging.md").read_text()
     (tmp_path / "my_policies.py").write_text(page.split("```python\n")[1].split("```")[0])
-    found, success = load_own(tmp_path / "my_policies.py", ROBOT)
+    found, success = load_user_policies(tmp_path / "my_policies.py", ROBOT)
     try_out(found, success, 2, (8, 8))
     bright = np.full((1, 8, 8, 3), 255, np.uint8)
     assert {name: policy.act(bright).tolist() for name, policy in found.items()} == {
@@ -112,7 +112,7 @@ def test_what_is_no_file_of_policies_is_refused_by_file_function_and_name(tmp_pa
     if text is not None:
         path.write_text(text)
     with pytest.raises(ConfigError, match=message) as error:
-        load_own(path, ROBOT)
+        load_user_policies(path, ROBOT)
     assert str(error.value).startswith(str(path))
 
 
@@ -133,7 +133,7 @@ def test_what_the_file_raises_is_a_message_that_names_its_line(tmp_path, text, m
     path = tmp_path / "mine.py"
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
-        load_own(path, ROBOT)
+        load_user_policies(path, ROBOT)
     assert str(error.value).startswith(f"{path}, {message}") and "docs/judging.md" in str(error.value)
 
 

@@ -1,4 +1,4 @@
-"""Success as a user's own file tells it: `success(images, first)`, in place of a head that is trained here."""
+"""A success detector of the user: `success(images, first)` of a Python file, in place of a head that is trained here."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable
 import numpy as np
 
 from experiments.applications.judging.head import PIECE, HeadConfig
-from experiments.own_file import function_of
+from experiments.user_file import function_of
 from hma_jax.config import ConfigError, require
 
 PAGE, NAME = "docs/judging.md", "success"
 SIGNATURE = f"{NAME}(images, first)"
 
 
-class OwnSuccess:
+class UserSuccess:
     """A `Head` by a user's function. `measured` is what it is worth on recordings, once that is known."""
 
     threshold = HeadConfig.threshold
@@ -54,8 +54,8 @@ class OwnSuccess:
         return values
 
 
-def success_of(file: types.ModuleType) -> OwnSuccess | None:
+def success_of(file: types.ModuleType) -> UserSuccess | None:
     """What a user's file says of success, or None where it says nothing. Raises ConfigError for what is no function."""
     if not hasattr(file, NAME):
         return None
-    return OwnSuccess(function_of(file, SIGNATURE, PAGE), str(file.__file__))
+    return UserSuccess(function_of(file, SIGNATURE, PAGE), str(file.__file__))
