@@ -28,8 +28,8 @@ PASSES = (8, 4, 2, 1)
 
 @dataclass(frozen=True)
 class DecodingQuality:
-    """The quality and cost of one decoding: a row of quality.csv. Quality is a mean over datasets with its standard error, which
-    counts episodes."""
+    """The quality and cost of one decoding: a row of quality.csv. Quality is a mean over datasets with its standard
+    error, which counts episodes."""
 
     decoding: str
     frames: int  # of a rollout, prompt included

@@ -1,4 +1,5 @@
-"""A success detector of the user: `success(images, first)` of a Python file, in place of a head that is trained here."""
+"""A success detector of the user: `success(images, first)` of a Python file, in place of a head that is trained
+here."""
 
 from __future__ import annotations
 

@@ -44,8 +44,8 @@ HEADERS = {
 
 
 def make_app(simulator: Simulator, truth: Truth, max_acting: int | None = None) -> web.Application:
-    """The application; it serves as many visitors at once as the simulator has episodes. Of those, `max_acting` (default:
-    all) act at once, until `SESSIONS` is told that more can."""
+    """The application; it serves as many visitors at once as the simulator has episodes. Of those, `max_acting`
+    (default: all) act at once, until `SESSIONS` is told that more can."""
     app = web.Application(client_max_size=LARGEST_MESSAGE)
     app[SOCKETS] = set()
     app.cleanup_ctx.append(lambda app: _manage_sessions(app, simulator, truth, max_acting))

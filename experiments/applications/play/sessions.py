@@ -101,7 +101,8 @@ class SessionManager:
     """The visitors of one simulator, whose episodes are the sessions."""
 
     def __init__(self, simulator: Simulator, truth: Truth, max_acting: int | None = None):
-        """`max_acting`: how many may act in one round, those that programs are compiled for (default: all). May grow later."""
+        """`max_acting`: how many may act in one round, those that programs are compiled for (default: all). May grow
+        later."""
         self.simulator, self.truth = simulator, truth
         self.max_acting = len(simulator) if max_acting is None else max_acting
         self.visitors: dict[str, Visitor] = {}
@@ -140,7 +141,8 @@ class SessionManager:
         visitor.answered.set()  # whoever listens to that connection waits for this
 
     def _evict(self, now: float) -> None:
-        """Frees the session of the visitor who has been away or idle for the longest. Raises NoFreeSession without any."""
+        """Frees the session of the visitor who has been away or idle for the longest. Raises NoFreeSession without
+        any."""
         away = [v for v in self.visitors.values() if v.socket is None or now - v.active > IDLE_SECONDS]
         if not away:
             raise NoFreeSession
@@ -214,8 +216,8 @@ class SessionManager:
             self.remove_expired()
 
     def _next_round(self) -> list[Visitor]:
-        """The visitors whose oldest request is answered next: all who have one, but at most `max_acting` of those who act;
-        these take turns."""
+        """The visitors whose oldest request is answered next: all who have one, but at most `max_acting` of those who
+        act; these take turns."""
         self._rounds += 1
         due = [v for v in self.visitors.values() if v.requests]
         acting = sorted((v for v in due if v.requests[0].kind == "act"), key=lambda v: v.acted)

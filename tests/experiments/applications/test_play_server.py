@@ -312,7 +312,7 @@ def test_a_huge_message_ends_its_connection_and_nothing_else():
 
 @pytest.mark.parametrize("many", [150, pytest.param(1000, marks=pytest.mark.slow)])
 def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch, many):
-    monkeypatch.setattr(server, "WAITING", 3)
+    monkeypatch.setattr(server, "EXTRA_CONNECTIONS", 3)
     files, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     if files < 2 * many + 200:  # both ends of every connection are in this process
         resource.setrlimit(resource.RLIMIT_NOFILE, (2 * many + 200, most))
