@@ -2,7 +2,7 @@
 
 Question: held-out nats, PSNR and what actions decide, of the reference and with masked tokens that also hold what stood
     there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
-    change alone, and the study's long runs, are of the first seed. The rungs have `designs.ablation_steps`;
+    change alone, and the study's long runs, are of the first seed. The variants have `designs.ablation_steps`;
     for the study's own number of steps all are trained too, and both changes with factors that are chained
     (`model.chain_factors`) and with tokens that count thrice, or tenfold, where they change
     (`train.masking.change_weight`); long runs have both, the shortest of them also with changes thrice.
@@ -51,14 +51,14 @@ def with_changes_weighed(trial: Trial, weight: float) -> Trial:
     return replace(trial, train=replace(trial.train, masking=masking))
 
 
-RUNGS: dict[str, Callable[[Trial], Trial]] = {
+VARIANTS: dict[str, Callable[[Trial], Trial]] = {
     REFERENCE: lambda trial: trial,
     RECALL: recalling,
     MUON: with_muon,
     BEST: with_both,
 }
 
-LONGER = RUNGS | {
+LONGER = VARIANTS | {
     CHAINED: lambda trial: chained(with_both(trial)),
     WEIGHED: lambda trial: with_changes_weighed(with_both(trial), 3.0),
     TENFOLD: lambda trial: with_changes_weighed(with_both(trial), 10.0),
@@ -66,14 +66,14 @@ LONGER = RUNGS | {
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories on every rung; `LONGER` for longer, which the label says, unless rungs take as
-    long."""
+    """All datasets and trajectories for every variant, and those of `LONGER` for the study's steps, which the label
+    says, unless the variants have as many."""
     seeds, first = study.ablation_seeds, study.ablation_seeds[0]
     sweep = make_ablation(
         study,
         name="ladder",
         axis="change",
-        variants=RUNGS,
+        variants=VARIANTS,
         default=REFERENCE,
         question="What makes the model better for as many steps? One change alone, changes tenfold, and the longest runs are of one seed.",
         gain="such changes",
@@ -85,7 +85,7 @@ def plan(study: Study) -> Sweep:
     longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED, WEIGHED)]
     longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, TENFOLD)]
     if study.designs.ablation_steps in (None, study.train.steps):
-        longer = [one for one in longer if one[0] not in RUNGS]
+        longer = [one for one in longer if one[0] not in VARIANTS]
     longer += [(BEST, steps, (first,)) for steps in study.designs.long]
     longer += [(WEIGHED, steps, (first,)) for steps in study.designs.long[:1]]
     for name, steps, chosen in longer:

@@ -88,7 +88,7 @@ def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(stu
 
 @pytest.mark.parametrize("steps", [None, CPU.train.steps, 1000])
 def test_no_rung_of_the_ladder_is_trained_twice(steps):
-    """Where rungs take as many steps as the study, none stands again among those that are trained for longer."""
+    """Where variants take as many steps as the study, none stands again among those that are trained for longer."""
     study = replace(CPU, designs=replace(CPU.designs, ablation_steps=steps))
     points = [p for p in ladder_axis.plan(study).points if p.role == POINT]
     trained = Counter((stable_hash(training_of(p.trial)), p.trial.train.steps) for p in points)

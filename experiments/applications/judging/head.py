@@ -26,14 +26,14 @@ from experiments.applications.policies.network import (
     EncoderConfig,
     Params,
     as_floats,
-    beside,
+    downsample_uint8,
     encode,
     init_encoder,
     init_mlp,
-    lit,
+    jitter_colour,
     mlp,
-    moved,
-    shrink_bytes,
+    random_shift,
+    stack_frames,
 )
 from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import ConfigError, require
@@ -74,7 +74,7 @@ def init_head(config: HeadConfig, seed: int) -> Params:
 
 def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Array:
     """Logits [B] of frames [B, 2, H, W, 3] in [-1, 1]: the first one of the episode, and the present one."""
-    return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames)))[:, 0]
+    return mlp(params["mlp"], encode(params["encoder"], config.encoder, stack_frames(frames)))[:, 0]
 
 
 class Head(Protocol):
@@ -111,18 +111,18 @@ class SuccessHead:
         """See `Head`."""
         size = self.config.encoder.size
         whole = (*images.shape[:-3], size, size, 3)
-        small = [np.broadcast_to(shrink_bytes(x, size), whole) for x in (first, images)]
-        return self.on_pairs(np.stack(small, -4).reshape(-1, 2, size, size, 3)).reshape(images.shape[:-3])
+        small = [np.broadcast_to(downsample_uint8(x, size), whole) for x in (first, images)]
+        return self.predict_pairs(np.stack(small, -4).reshape(-1, 2, size, size, 3)).reshape(images.shape[:-3])
 
-    def on_pairs(self, seen: np.ndarray) -> np.ndarray:
+    def predict_pairs(self, pairs: np.ndarray) -> np.ndarray:
         """float32 [n] of pairs uint8 [n, 2, size, size, 3], as heads are trained on."""
-        found, piece = [], min(PIECE, 1 << (len(seen) - 1).bit_length())  # a few episodes are judged at every frame
-        for at in range(0, len(seen), PIECE):
-            part = seen[at : at + PIECE]
-            padded = np.zeros((piece, *part.shape[1:]), np.uint8)
+        parts, size = [], min(PIECE, 1 << (len(pairs) - 1).bit_length())  # a few episodes are judged at every frame
+        for at in range(0, len(pairs), PIECE):
+            part = pairs[at : at + PIECE]
+            padded = np.zeros((size, *part.shape[1:]), np.uint8)
             padded[: len(part)] = part
-            found.append(np.asarray(self._apply(self.params, padded))[: len(part)])
-        return np.concatenate(found)
+            parts.append(np.asarray(self._apply(self.params, padded))[: len(part)])
+        return np.concatenate(parts)
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         return self.probabilities(images, first) > self.threshold
@@ -141,17 +141,17 @@ def train_head(
     Raises ConfigError where all frames have one label.
     """
     steps = demos.steps()
-    images, begun = demos.images[steps[:, 0], steps[:, 1]], demos.images[steps[:, 0], 0]
+    images, first = demos.images[steps[:, 0], steps[:, 1]], demos.images[steps[:, 0], 0]
     labels = demos.reached[steps[:, 0], steps[:, 1]]
     if reconstruct is not None:
-        for seen in (images, begun):
-            seen[::RECONSTRUCTED] = reconstruct(seen[::RECONSTRUCTED])
-    seen = np.stack([shrink_bytes(x, config.encoder.size) for x in (begun, images)], 1)
-    return fit_heads(seen, labels, config, seed, report)[config.fit.steps]
+        for frames in (images, first):
+            frames[::RECONSTRUCTED] = reconstruct(frames[::RECONSTRUCTED])
+    pairs = np.stack([downsample_uint8(x, config.encoder.size) for x in (first, images)], 1)
+    return fit_heads(pairs, labels, config, seed, report)[config.fit.steps]
 
 
 def fit_heads(
-    seen: np.ndarray,
+    pairs: np.ndarray,
     labels: np.ndarray,
     config: HeadConfig,
     seed: int = 0,
@@ -165,14 +165,14 @@ def fit_heads(
     recordings it would otherwise learn by heart where things were. Raises ConfigError where all have one label."""
     require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
-    data = {"images": seen, "label": labels.astype(np.float32), "weight": weight}
+    data = {"images": pairs, "label": labels.astype(np.float32), "weight": weight}
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
-        frames = lit(moved(as_floats(data["images"][index]), key, shift), key, config.light)
+        frames = jitter_colour(random_shift(as_floats(data["images"][index]), key, shift), key, config.light)
         errors = optax.sigmoid_binary_cross_entropy(apply_head(params, config, frames), data["label"][index])
         return jnp.mean(errors * data["weight"][index])
 
-    kept = fit(init_head(config, seed), loss, data, len(seen), config.fit, seed, report)
+    kept = fit(init_head(config, seed), loss, data, len(pairs), config.fit, seed, report)
     return {step: SuccessHead(config, params) for step, params in kept.items()}
 
 
@@ -200,10 +200,10 @@ def worth_of(
     }
 
 
-def balanced_error(head: SuccessHead, seen: np.ndarray, labels: np.ndarray) -> float:
+def balanced_error(head: SuccessHead, pairs: np.ndarray, labels: np.ndarray) -> float:
     """Cross-entropy in nats of pairs [n, 2, size, size, 3], those with and those without success counted alike."""
-    sure = np.clip(np.where(labels, p := head.on_pairs(seen), 1 - p), 1e-6, 1).astype(np.float64)
-    return float(-(np.log(sure[labels]).mean() + np.log(sure[~labels]).mean()) / 2)
+    likelihood = np.clip(np.where(labels, p := head.predict_pairs(pairs), 1 - p), 1e-6, 1).astype(np.float64)
+    return float(-(np.log(likelihood[labels]).mean() + np.log(likelihood[~labels]).mean()) / 2)
 
 
 def auroc(score: np.ndarray, label: np.ndarray) -> float:
@@ -240,7 +240,7 @@ def load_head(directory: Path) -> SuccessHead:
     return SuccessHead(config, unnamed(weights, like, directory), description["measured"])
 
 
-class _Begun(NamedTuple):
+class _EpisodeState(NamedTuple):
     """The B episodes of one simulator."""
 
     first: np.ndarray  # frames in which they began, uint8 [B, H, W, 3]
@@ -254,21 +254,21 @@ class HeadJudge:
 
     def __init__(self, head: Head, hold: int = 1):
         self.head, self.hold = head, hold
-        self._begun: WeakKeyDictionary[AnySimulator, _Begun] = WeakKeyDictionary()
+        self._states: WeakKeyDictionary[AnySimulator, _EpisodeState] = WeakKeyDictionary()
 
     def begin(self, simulator: AnySimulator, episodes: Sequence[int]) -> None:
         """These episodes begin with the simulator's present frames."""
         images, which = simulator.images, list(episodes)
-        if simulator not in self._begun:
-            self._begun[simulator] = _Begun(images.copy(), np.zeros(len(images), int))
-        begun = self._begun[simulator]
-        begun.first[which], begun.count[which] = images[which], 0
+        if simulator not in self._states:
+            self._states[simulator] = _EpisodeState(images.copy(), np.zeros(len(images), int))
+        state = self._states[simulator]
+        state.first[which], state.count[which] = images[which], 0
 
     def __call__(self, simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:
         """Raises ConfigError before the first `begin` of this simulator."""
-        require(simulator in self._begun, "no episode has begun: call `begin` after the simulator's reset")
-        begun = self._begun[simulator]
-        reached = self.head.reached(simulator.images, begun.first)
-        begun.count[:] = np.where(reached, begun.count + 1, 0)
-        done = begun.count >= self.hold
+        require(simulator in self._states, "no episode has begun: call `begin` after the simulator's reset")
+        state = self._states[simulator]
+        reached = self.head.reached(simulator.images, state.first)
+        state.count[:] = np.where(reached, state.count + 1, 0)
+        done = state.count >= self.hold
         return done.astype(float), done

@@ -1,4 +1,4 @@
-"""The policies that are judged: from hopeless to as good as they get, all of them on images."""
+"""The policies that are judged, a ladder from random to fully trained, all of them acting on images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, tr
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
 from experiments.applications.policies.files import DESCRIPTION, load_policy, save_policy
-from experiments.applications.policies.learning import FitConfig, Report, ladder
+from experiments.applications.policies.learning import FitConfig, Report, log_spaced_steps
 from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
@@ -40,19 +40,19 @@ class LadderConfig:
 
     def __post_init__(self):
         for kind in ("cloned", "diffusion"):
-            rungs = getattr(self, kind)
-            require(rungs >= 0, f"--{kind} must not be negative, got {rungs}")
+            count = getattr(self, kind)
+            require(count >= 0, f"--{kind} must not be negative, got {count}")
 
-    def fit(self, rungs: int) -> FitConfig:
-        keep = ladder(self.steps, rungs, self.first) if rungs > 1 else (self.steps,)
+    def fit(self, count: int) -> FitConfig:
+        keep = log_spaced_steps(self.steps, count, self.first) if count > 1 else (self.steps,)
         return FitConfig(steps=self.steps, batch=self.batch, learning_rate=self.learning_rate, keep=keep)
 
 
 def names(config: LadderConfig) -> list[str]:
     """Of all policies, in the order of their training."""
     found = [RANDOM]
-    for kind, rungs in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
-        found += [f"{kind}-{step}" for step in config.fit(rungs).keep] if rungs else []
+    for kind, count in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
+        found += [f"{kind}-{step}" for step in config.fit(count).keep] if count else []
     return found
 
 
@@ -66,12 +66,12 @@ def train_ladder(
 ) -> None:
     """Trains what is not in `directory` yet: all checkpoints of a kind, or none. `demos` are recorded if needed."""
     recorded: Demonstrations | None = None
-    for kind, rungs in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
-        steps: Sequence[int] = config.fit(rungs).keep if rungs else ()
+    for kind, count in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
+        steps: Sequence[int] = config.fit(count).keep if count else ()
         if all((directory / f"{kind}-{step}" / DESCRIPTION).exists() for step in steps):
             continue
         recorded = demos() if recorded is None else recorded
-        scale, fit = scale_of(recorded), config.fit(rungs)
+        scale, fit = scale_of(recorded), config.fit(count)
         if kind == ClonedPolicy.kind:
             bc = BcConfig(frames=config.frames, encoder=config.encoder, fit=fit)
             params = train_bc(recorded, bc, seed, reports(kind))

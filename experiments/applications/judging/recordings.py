@@ -23,8 +23,8 @@ from experiments.applications.judging.ground_truth import Reconstruct
 from experiments.applications.judging.head import Head, SuccessHead, balanced_error, fit_heads, worth_of
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.learning import Report, ladder
-from experiments.applications.policies.network import shrink_bytes
+from experiments.applications.policies.learning import Report, log_spaced_steps
+from experiments.applications.policies.network import downsample_uint8
 from experiments.applications.policies.tasks import RecordedTask, held
 from experiments.applications.simulators import START_FRAMES
 from hma_jax.config import ConfigError, require
@@ -150,7 +150,7 @@ class RecordedTruth:
             [np.concatenate(x) for x in zip(*(read[i] for i in self.learnt if (i in tuned_on) == tunes), strict=True)]
             for tunes in (False, True)
         )
-        keep = ladder(fit.steps, CHECKPOINTS, FIRST) if fit.steps > FIRST else ()
+        keep = log_spaced_steps(fit.steps, CHECKPOINTS, FIRST) if fit.steps > FIRST else ()
         kept = replace(config, fit=replace(fit, keep=keep))
         with self._step("train the success head") as report:
             heads = fit_heads(*learnt, kept, self.config.seed, report, round(SHIFT * config.encoder.size))
@@ -173,7 +173,7 @@ class RecordedTruth:
         decoded = rng.permutation(len(chosen))[: len(chosen) // 2]
         flat = seen[decoded].reshape(-1, *images.shape[1:])
         seen[decoded] = reconstruct(flat).reshape(seen[decoded].shape)
-        return shrink_bytes(seen, self.config.head.encoder.size), label
+        return downsample_uint8(seen, self.config.head.encoder.size), label
 
     def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
         """From first to last frame of the recordings that are held out; also as the model's tokenizer shows them, which

@@ -30,9 +30,11 @@ class UserSuccess:
         """See `Head`. Raises ConfigError for anything but a number between 0 and 1, or a truth value, for each
         image."""
         shape = images.shape[-3:]
-        seen, begun = (x.reshape(-1, *shape) for x in (images, np.broadcast_to(first, images.shape)))
-        pieces = [slice(at, at + PIECE) for at in range(0, len(seen), PIECE)]
-        return np.concatenate([self._call(seen[piece], begun[piece]) for piece in pieces]).reshape(images.shape[:-3])
+        present, starts = (x.reshape(-1, *shape) for x in (images, np.broadcast_to(first, images.shape)))
+        pieces = [slice(at, at + PIECE) for at in range(0, len(present), PIECE)]
+        return np.concatenate([self._call(present[piece], starts[piece]) for piece in pieces]).reshape(
+            images.shape[:-3]
+        )
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         return self.probabilities(images, first) > self.threshold

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.network import as_floats, shrink_bytes
+from experiments.applications.policies.network import as_floats, downsample_uint8
 from experiments.applications.policies.policy import Counts
 
 STILL = 1e-4
@@ -49,7 +49,7 @@ def make_examples(demos: Demonstrations, frames: int, chunk: int, size: int) -> 
     at = np.minimum(steps[:, 1:] + np.arange(chunk), demos.lengths[steps[:, 0]][:, None] - 1)
     actions = scale_of(demos).normalise(demos.actions[steps[:, :1], at])
     return {
-        "images": shrink_bytes(demos.images, size),
+        "images": downsample_uint8(demos.images, size),
         "episode": steps[:, 0],
         "seen": np.maximum(steps[:, 1:] - np.arange(frames)[::-1], 0),
         "chunk": actions.reshape(len(steps), -1),

@@ -21,12 +21,12 @@ from experiments.applications.policies.network import (
     EncoderConfig,
     Params,
     as_floats,
-    beside,
     encode,
     init_encoder,
     init_mlp,
-    lit,
+    jitter_colour,
     mlp,
+    stack_frames,
 )
 from hma_jax.config import require
 from hma_jax.kernels.random import key_of
@@ -62,20 +62,20 @@ def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
 
 def apply_bc(params: Params, config: BcConfig, frames: jax.Array) -> jax.Array:
     """Normalised actions [B, chunk * A] after frames [B, frames, H, W, 3] in [-1, 1]."""
-    return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames)))
+    return mlp(params["mlp"], encode(params["encoder"], config.encoder, stack_frames(frames)))
 
 
 def train_bc(
     demos: Demonstrations, config: BcConfig, seed: int = 0, report: Report = lambda done, total, note: None
 ) -> dict[int, Params]:
-    """{step: parameters} for `config.fit.keep` and the last step: a ladder from hopeless to as good as it gets.
+    """{step: parameters} for `config.fit.keep` and the last step: policies from hardly trained to fully trained.
 
     A function of its arguments; minutes on one core.
     """
     data = make_examples(demos, config.frames, config.chunk, config.encoder.size)
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
-        planned = apply_bc(params, config, lit(frames_of(data, index), key, config.light))
+        planned = apply_bc(params, config, jitter_colour(frames_of(data, index), key, config.light))
         return jnp.mean((planned - data["chunk"][index]) ** 2)
 
     start = init_bc(config, demos.actions.shape[-1], seed)

@@ -22,12 +22,12 @@ from experiments.applications.policies.network import (
     EncoderConfig,
     Params,
     as_floats,
-    beside,
     encode,
     init_encoder,
     init_mlp,
-    lit,
+    jitter_colour,
     mlp,
+    stack_frames,
 )
 from hma_jax.config import require
 from hma_jax.kernels.random import key_of
@@ -87,7 +87,7 @@ def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array
 def draw(params: Params, config: DiffusionConfig, frames: jax.Array, start: jax.Array) -> jax.Array:
     """Normalised chunks [B, chunk * A] from Gaussian `start` of that shape, by DDIM without new noise."""
     kept = jnp.asarray(signal(config.levels))
-    seen = encode(params["encoder"], config.encoder, beside(frames))
+    seen = encode(params["encoder"], config.encoder, stack_frames(frames))
     visited = np.linspace(config.levels - 1, 0, config.samples).round().astype(int)
     following = np.append(visited[1:], -1)
 
@@ -111,8 +111,8 @@ def train_diffusion(
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
         light, level_key, noise_key = jax.random.split(key, 3)
-        frames = lit(frames_of(data, index), light, config.light)
-        seen = encode(params["encoder"], config.encoder, beside(frames))
+        frames = jitter_colour(frames_of(data, index), light, config.light)
+        seen = encode(params["encoder"], config.encoder, stack_frames(frames))
         chunk = jnp.clip(data["chunk"][index], -CLIP, CLIP)
         level = jax.random.randint(level_key, (len(index),), 0, config.levels, jnp.int32)
         noise = jax.random.normal(noise_key, chunk.shape, jnp.float32)

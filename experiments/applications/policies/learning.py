@@ -89,8 +89,8 @@ def fit(
     return kept
 
 
-def ladder(steps: int, rungs: int, first: int = 20) -> tuple[int, ...]:
-    """`rungs` steps of training from `first` to `steps`, each the same factor after the one before."""
-    require(rungs >= 2, f"a ladder from {first} to {steps} steps needs at least 2 rungs, got {rungs}")
+def log_spaced_steps(steps: int, count: int, first: int = 20) -> tuple[int, ...]:
+    """`count` steps of training from `first` to `steps`, evenly spaced in the logarithm."""
+    require(count >= 2, f"checkpoints from {first} to {steps} steps are at least 2, got {count}")
     require(steps > first, f"the first checkpoint is that of {first} steps: training must be longer, not {steps} steps")
-    return tuple(sorted({round(first * (steps / first) ** (i / (rungs - 1))) for i in range(rungs)}))
+    return tuple(sorted({round(first * (steps / first) ** (i / (count - 1))) for i in range(count)}))

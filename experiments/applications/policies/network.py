@@ -20,8 +20,8 @@ from hma_jax.config import require
 Params = dict[str, Any]
 
 
-HALVING = 2
-"""Convolutions that halve the map; those after them do not."""
+STRIDED_LAYERS = 2
+"""Convolutions of stride 2, which come first; those after them have stride 1."""
 
 SHARPNESS = 3.0
 """What a map's values are multiplied by before the softmax, at the beginning of training."""
@@ -37,8 +37,8 @@ class EncoderConfig:
 
     def __post_init__(self):
         require(
-            len(self.channels) >= HALVING and self.size % 2**HALVING == 0,
-            f"an encoder needs {HALVING} convolutions and a size that {2**HALVING} divides, got {self.size}",
+            len(self.channels) >= STRIDED_LAYERS and self.size % 2**STRIDED_LAYERS == 0,
+            f"an encoder needs {STRIDED_LAYERS} convolutions and a size that {2**STRIDED_LAYERS} divides, got {self.size}",
         )
 
     @property
@@ -87,16 +87,16 @@ def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
 
 def encode(params: Params, config: EncoderConfig, images: jax.Array) -> jax.Array:
     """Features [B, 3 K] of images [B, H, W, C] in [-1, 1]; H and W are multiples of `config.size`."""
-    x = shrink(images, config.size)
+    x = downsample(images, config.size)
     for i, layer in enumerate(params["convolutions"]):
-        by = 2 if i < HALVING else 1
+        by = 2 if i < STRIDED_LAYERS else 1
         x = jax.nn.relu(x) if i else x
         x = jax.lax.conv_general_dilated(x, layer["w"], (by, by), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
         x = x + layer["b"]
-    return points(x, params["sharpness"])
+    return spatial_softmax(x, params["sharpness"])
 
 
-def points(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
+def spatial_softmax(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
     """[B, 3 K] of maps [B, h, w, K]: mean column and row under a softmax of each map, and its mean under it."""
     batch, height, width, count = maps.shape
     flat = maps.reshape(batch, height * width, count)
@@ -116,7 +116,7 @@ def require_multiples(height: int, width: int, size: int) -> None:
     )
 
 
-def shrink(images: jax.Array, size: int) -> jax.Array:
+def downsample(images: jax.Array, size: int) -> jax.Array:
     """[B, size, size, C]: means of squares of pixels. Raises ConfigError where they do not divide."""
     batch, height, width, channels = images.shape
     require_multiples(height, width, size)
@@ -125,23 +125,24 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
     return images.reshape(batch, size, height // size, size, width // size, channels).mean((2, 4))
 
 
-def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
-    """`shrink` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
+def downsample_uint8(images: np.ndarray, size: int) -> np.ndarray:
+    """`downsample` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
     height, width = images.shape[-3:-1]
     require_multiples(height, width, size)
     parts = images.reshape(*images.shape[:-3], size, height // size, size, width // size, images.shape[-1])
     return np.round(parts.mean((-4, -2), dtype=np.float32)).astype(np.uint8)
 
 
-def lit(frames: jax.Array, key: jax.Array, strength: float) -> jax.Array:
-    """Frames [B, n, H, W, 3] in [-1, 1] of episodes each under another light: colours scaled and moved a little."""
+def jitter_colour(frames: jax.Array, key: jax.Array, strength: float) -> jax.Array:
+    """Colour jitter: frames [B, n, H, W, 3] in [-1, 1] with a random gain and offset of each example's colours."""
     shape = (len(frames), 1, 1, 1, 3)
     gain, offset = strength * jax.random.normal(key, (2, *shape), frames.dtype)
     return frames * (1 + gain) + offset
 
 
-def moved(frames: jax.Array, key: jax.Array, most: int) -> jax.Array:
-    """Frames [B, n, H, W, 3] of episodes each moved by up to `most` pixels, the same for its n; edges are repeated."""
+def random_shift(frames: jax.Array, key: jax.Array, most: int) -> jax.Array:
+    """Random shifts: frames [B, n, H, W, 3], of each example all n moved alike by up to `most` pixels; edges are
+    repeated."""
     if not most:
         return frames
     wide = jnp.pad(frames, ((0, 0), (0, 0), (most, most), (most, most), (0, 0)), mode="edge")
@@ -155,8 +156,9 @@ def as_floats(images: jax.Array) -> jax.Array:
     return images.astype(jnp.float32) / 127.5 - 1
 
 
-def beside(frames: jax.Array) -> jax.Array:
-    """[B, H, W, 3 n] of the last n frames [B, n, H, W, 3]: the newest, then how each before it differs from it."""
+def stack_frames(frames: jax.Array) -> jax.Array:
+    """The last n frames [B, n, H, W, 3] stacked along channels, [B, H, W, 3 n]: the newest, then its difference from
+    each frame before it."""
     newest = frames[:, -1:]
     stacked = jnp.concatenate([newest, newest - frames[:, :-1]], 1)
     return jnp.moveaxis(stacked, 1, 3).reshape(*stacked.shape[:1], *stacked.shape[2:4], -1)

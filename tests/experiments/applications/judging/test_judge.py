@@ -266,7 +266,7 @@ def test_a_head_looks_at_a_few_frames_without_looking_at_many(judged):
         return apply(params, frames)
 
     head._apply = looking
-    few, one, many = head.on_pairs(pairs[:3]), head.on_pairs(pairs[:1]), head.on_pairs(pairs)
+    few, one, many = head.predict_pairs(pairs[:3]), head.predict_pairs(pairs[:1]), head.predict_pairs(pairs)
     assert looked_at == [4, 1, PIECE, PIECE] and len(many) == PIECE + 1
     np.testing.assert_allclose(few, many[:3], rtol=1e-5)
     np.testing.assert_allclose(one, many[:1], rtol=1e-5)

@@ -19,7 +19,7 @@ from experiments.applications.judging.page import describe_control, describe_hea
 from experiments.applications.judging.real import read_real
 from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
-from experiments.applications.policies.network import EncoderConfig, moved
+from experiments.applications.policies.network import EncoderConfig, random_shift
 from experiments.cli.main import main
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
@@ -282,7 +282,7 @@ def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():
 
 def test_a_pair_of_frames_is_moved_as_one():
     frames = np.random.default_rng(0).random((32, 1, 8, 8, 3)).repeat(2, 1)
-    found = np.asarray(moved(frames, jax.random.key(0), 2))
+    found = np.asarray(random_shift(frames, jax.random.key(0), 2))
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     same = (found[:, 0, 2:6, 2:6] == frames[:, 0, 2:6, 2:6].astype(np.float32)).all((1, 2, 3))
     inside = [
@@ -292,14 +292,14 @@ def test_a_pair_of_frames_is_moved_as_one():
         for x in range(5)
     ]
     assert same.mean() < 0.3 and sum(inside) == 32
-    assert moved(frames, jax.random.key(0), 0) is frames
+    assert random_shift(frames, jax.random.key(0), 0) is frames
 
 
 def test_the_head_of_the_step_that_is_best_on_other_recordings_is_taken():
     """Not the last one, which knows its own by heart."""
     seen, labels = np.zeros((4, 2, 8, 8, 3), np.uint8), np.array([True, False, False, False])
     heads = {
-        step: SimpleNamespace(on_pairs=lambda pairs, p=p: np.array(p, np.float32))
+        step: SimpleNamespace(predict_pairs=lambda pairs, p=p: np.array(p, np.float32))
         for step, p in ((50, (0.5, 0.5, 0.5, 0.5)), (60, (0.8, 0.3, 0.2, 0.1)), (70, (0.0, 0.0, 0.0, 0.0)))
     }
     errors = {step: balanced_error(head, seen, labels) for step, head in heads.items()}

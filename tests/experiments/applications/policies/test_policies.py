@@ -19,8 +19,8 @@ from experiments.applications.policies.diffusion import (
     init_diffusion,
     train_diffusion,
 )
-from experiments.applications.policies.learning import FitConfig, ladder
-from experiments.applications.policies.network import EncoderConfig, as_floats, moved
+from experiments.applications.policies.learning import FitConfig, log_spaced_steps
+from experiments.applications.policies.network import EncoderConfig, as_floats, random_shift
 from experiments.applications.policies.scripted import ScriptedPolicy
 from experiments.applications.policies.tasks import held
 from hma_jax.config import ConfigError
@@ -103,7 +103,7 @@ def test_settings_of_jax_change_no_policy(setting, demos):
 
     def trained() -> tuple[list[np.ndarray], np.ndarray]:
         params = train_diffusion(demos, config, 1)[2]
-        shown = moved(as_floats(images[:, None]), key_of(1), 2)
+        shown = random_shift(as_floats(images[:, None]), key_of(1), 2)
         return [*jax.tree.leaves(params), shown], DiffusionPolicy(config, params, scale_of(demos)).act(images)
 
     usual, acted = trained()
@@ -174,9 +174,9 @@ def test_denoising_with_the_true_noise_gives_the_chunk(monkeypatch, demos):
 
 
 def test_a_ladder_has_its_first_and_last_rung():
-    assert ladder(1000, 4, 1) == (1, 10, 100, 1000)
+    assert log_spaced_steps(1000, 4, 1) == (1, 10, 100, 1000)
     with pytest.raises(ConfigError, match="that of 60 steps: training must be longer, not 50 steps"):
-        ladder(50, 4, 60)
+        log_spaced_steps(50, 4, 60)
 
 
 @pytest.mark.parametrize("name", ["reach", "hover"])
