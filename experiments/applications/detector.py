@@ -5,10 +5,10 @@ Cost: about ten minutes of one core for eight robots, half an hour for forty.
 Expected: it finds tools and visible objects of held-out true frames within 2 pixels of 64 in nearly all of them, most
           also as the run's tokenizer shows them.
 
-The suite says where everything is; half of the frames it learns from are as RUN's tokenizer shows them, and in some an
-object is missing, so that it learns what nothing looks like. It sees frames of 64 pixels; those of a run that has fewer
-are enlarged.
-Writes detector.npz (half precision) and errors.csv, its own errors on held-out episodes. The same command goes on where
+The suite gives the true positions. Half of the training frames are reconstructions by RUN's tokenizer, and in some an
+object is missing, so that absence is learnt, too. It sees frames of 64 pixels; those of a run that has fewer are
+enlarged.
+Writes detector.npz (half precision) and errors.csv, its errors on held-out episodes. The same command goes on where
 it was stopped (its frames are drawn again, in a minute or two), and keeps a detector that is there.
 """
 
@@ -49,49 +49,49 @@ from hma_jax.tokenizers.shared import BaseTokenizer
 COMMITTED, OUT = Path("experiments/results/detector"), Path("runs/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
 UNFINISHED = f"{WEIGHTS}.unfinished"
-EPISODES, FEWEST, PER_EPISODE, HELD_OUT = 1920, 48, 16, (24, 16)
-"""Of all robots together, but so many of each, from the suite's training split, and frames of each episode; of each
-robot the same of the held-out split."""
+EPISODES, MIN_EPISODES, PER_EPISODE, HELD_OUT = 1920, 48, 16, (24, 16)
+"""Training episodes of all robots together, at least so many of each robot, frames per episode; held-out episodes of
+each robot and their frames."""
 
-STEPS, MORE, BATCH, RATE = 1000, 125, 32, 2e-3
-"""Steps, and how many more for each robot."""
+STEPS, STEPS_PER_ROBOT, BATCH, LEARNING_RATE = 1000, 125, 32, 2e-3
+"""Training steps: so many, and more for each robot."""
 
-KEEP_EVERY = 100
-"""Steps after which what is trained is kept."""
+SAVE_EVERY = 100
+"""Steps between saves of the unfinished training."""
 
-MISSING = 0.2
-NOISE = 16.0
-"""Grey levels of noise that frames are given at most."""
+MISSING_PROBABILITY = 0.2
+MAX_NOISE = 16.0
+"""Standard deviation, in grey levels, of the strongest noise added to training frames."""
 
-SURE = 0.15
-"""Confidence from which a point counts as found."""
+MIN_CONFIDENCE = 0.15
+"""Confidence above which a point counts as detected."""
 
-NEAR = (2.0, 4.0)
-"""Pixels of a 64-pixel frame that its own errors are counted within."""
+WITHIN_PX = (2.0, 4.0)
+"""Distances, in pixels of a 64-pixel frame, within which the share of detections is reported."""
 
-CLOSE = NEAR[1]
-"""2 pixels of a frame of 32: what is found within them of the truth is where it should be."""
+CLOSE_PX = WITHIN_PX[1]
+"""2 pixels of a frame of 32: a detection this near to the true position counts as in place."""
 
 BLOCK = 64
-"""Frames that are watched in one call."""
+"""Frames per call."""
 
 
 class Detector:
-    """Trained weights and the robots that they know, in the order of the weights."""
+    """Trained weights, and the robots they were trained on, in the order of the weights."""
 
     def __init__(self, weights: Weights, robots: Sequence[str]):
         self.weights, self.robots = weights, tuple(robots)
         self._watch = jax.jit(watch)
 
-    def watch(self, robot: str, film: np.ndarray) -> Found:
-        """Its P points in frames uint8 [n, H, W, 3]. Raises ConfigError for a robot that it was not trained on."""
+    def detect(self, robot: str, frames: np.ndarray) -> Found:
+        """The robot's P points in frames uint8 [n, H, W, 3]. Raises ConfigError for one it was not trained on."""
         require(robot in self.robots, f"the detector was not trained on {robot}; it knows {', '.join(self.robots)}")
-        index, points, parts = self.robots.index(robot), len(point_names(SPECS[robot])), []
-        for first in range(0, len(film), BLOCK):
-            part = film[first : first + BLOCK]
+        index, count, parts = self.robots.index(robot), len(point_names(SPECS[robot])), []
+        for first in range(0, len(frames), BLOCK):
+            part = frames[first : first + BLOCK]
             filled = np.concatenate([part, np.repeat(part[-1:], BLOCK - len(part), 0)])
             found = self._watch(self.weights, filled, index)
-            parts.append([np.asarray(x)[: len(part), :points] for x in found])
+            parts.append([np.asarray(x)[: len(part), :count] for x in found])
         return Found(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     def save(self, path: Path) -> None:
@@ -109,17 +109,17 @@ class Detector:
 
 def batches(scenes: Sequence[Scenes], rng: np.random.Generator, size: int) -> Iterator[tuple]:
     """What `points_loss` takes, of random frames of random robots, with noise; without end."""
-    points, side = max(own.there.shape[-1] for own in scenes), scenes[0].images.shape[1]
+    points, side = max(own.visible.shape[-1] for own in scenes), scenes[0].images.shape[1]
     while True:
         images, robots = np.zeros((size, side, side, 3), np.float32), rng.integers(len(scenes), size=size)
         position, known = np.zeros((size, points, 2), np.float32), np.zeros((size, points), np.float32)
-        there = np.zeros((size, points), np.float32)
+        visible = np.zeros((size, points), np.float32)
         for i, robot in enumerate(robots):
             own = scenes[robot]
-            k, p = rng.integers(len(own.images)), own.there.shape[-1]
-            images[i] = own.images[k] + rng.uniform(0, NOISE) * rng.standard_normal((side, side, 3), np.float32)
-            position[i, :p], there[i, :p], known[i, :p] = own.position[k], own.there[k], 1
-        yield images, robots, position, there, known
+            k, p = rng.integers(len(own.images)), own.visible.shape[-1]
+            images[i] = own.images[k] + rng.uniform(0, MAX_NOISE) * rng.standard_normal((side, side, 3), np.float32)
+            position[i, :p], visible[i, :p], known[i, :p] = own.position[k], own.visible[k], 1
+        yield images, robots, position, visible, known
 
 
 def train_detector(
@@ -130,12 +130,12 @@ def train_detector(
     size: int = BATCH,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Detector:
-    """Goes on from the file `unfinished`, where a process that was killed has left it, and comes out as if it never had
-    been. Raises ConfigError without scenes, for a damaged file, or where training diverges."""
+    """Trains a detector, resuming from the file `unfinished` if a killed process left it; the result is the same as
+    without the kill. Raises ConfigError without scenes, for a damaged file, or where training diverges."""
     require(bool(scenes), "there is no robot to train a detector on")
     own, rng = list(scenes.values()), np.random.default_rng(0)
-    weights = init_detector(key_of(0), len(own), max(x.there.shape[-1] for x in own))
-    schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, min(100, steps // 4), steps)
+    weights = init_detector(key_of(0), len(own), max(x.visible.shape[-1] for x in own))
+    schedule = optax.warmup_cosine_decay_schedule(0.0, LEARNING_RATE, min(100, steps // 4), steps)
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(schedule, weight_decay=1e-3))
 
     @partial(jax.jit, donate_argnums=(0, 1))
@@ -144,28 +144,28 @@ def train_detector(
         change, state = optimizer.update(gradient, state, weights)
         return optax.apply_updates(weights, change), state, loss
 
-    state, begun = optimizer.init(weights), 0
+    state, first_step = optimizer.init(weights), 0
     if unfinished.exists():
-        begun, (weights, state) = _go_on(unfinished, (weights, state), rng)
-    for done, batch in enumerate(islice(batches(own, rng, size), steps - begun), begun + 1):
+        first_step, (weights, state) = _resume(unfinished, (weights, state), rng)
+    for done, batch in enumerate(islice(batches(own, rng, size), steps - first_step), first_step + 1):
         weights, state, loss = update(weights, state, batch)
-        if done < steps and done % KEEP_EVERY == 0 and jnp.isfinite(loss):
-            _keep(unfinished, done, (weights, state), rng)
+        if done < steps and done % SAVE_EVERY == 0 and jnp.isfinite(loss):
+            _save_progress(unfinished, done, (weights, state), rng)
         progress(done, steps)
     if not jnp.isfinite(loss):
-        unfinished.unlink(missing_ok=True)  # from there it would come to the same
-        raise ConfigError("the detector's loss is not finite; lower RATE")
+        unfinished.unlink(missing_ok=True)  # resuming would diverge again
+        raise ConfigError("the detector's loss is not finite; lower LEARNING_RATE")
     return Detector(weights, list(scenes))
 
 
-def _keep(path: Path, done: int, trained: Any, rng: np.random.Generator) -> None:
-    """All that the steps after `done` ones depend on, besides the scenes."""
+def _save_progress(path: Path, done: int, trained: Any, rng: np.random.Generator) -> None:
+    """Writes all that the steps after the first `done` depend on, besides the scenes."""
     leaves = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(trained))}
     write_arrays(path, {"done": done, "rng": json.dumps(rng.bit_generator.state)} | leaves, compressed=False)
 
 
-def _go_on(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]:
-    """(steps, what is trained) as `_keep` left them, in the structure of `fresh`; `rng` stands there again."""
+def _resume(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]:
+    """(steps done, training state) as `_save_progress` wrote them, in the structure of `fresh`; restores `rng`."""
     leaves, structure = jax.tree.flatten(fresh)
     with reading_arrays(path, "remove it, the same command trains anew") as arrays:
         kept = [jnp.asarray(arrays[f"leaf/{i}"]) for i in range(len(leaves))]
@@ -173,22 +173,22 @@ def _go_on(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]:
         return int(arrays["done"]), jax.tree.unflatten(structure, kept)
 
 
-def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
-    """How far off it is on each kind of point of a robot, and how often it sees what is not there."""
-    position, confidence = detector.watch(robot, scenes.images)
-    off = np.linalg.norm(position - scenes.position, axis=-1)
+def detection_errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
+    """Position errors for each kind of point of a robot, detection rates, and false detections (`ghosts`)."""
+    position, confidence = detector.detect(robot, scenes.images)
+    error = np.linalg.norm(position - scenes.position, axis=-1)
     names, rows = point_names(SPECS[robot]), []
     for kind, prefix in (("tool", "tool"), ("object", "colour")):
-        mine = [i for i, name in enumerate(names) if name.startswith(prefix)]
-        there, sure = scenes.there[:, mine], confidence[:, mine] >= SURE
-        if not there.any():
+        kind_points = [i for i, name in enumerate(names) if name.startswith(prefix)]
+        visible, confident = scenes.visible[:, kind_points], confidence[:, kind_points] >= MIN_CONFIDENCE
+        if not visible.any():
             continue  # a robot that touches nothing
-        far = off[:, mine][there]
-        near = {f"within_{r:g}px": float(np.mean((far <= r) & sure[there])) for r in NEAR}
+        distances = error[:, kind_points][visible]
+        within = {f"within_{r:g}px": float(np.mean((distances <= r) & confident[visible])) for r in WITHIN_PX}
         rows.append({
-            "robot": robot, "what": kind, "frames": int(there.sum()), "median_px": float(np.median(far)),
-            "p90_px": float(np.quantile(far, 0.9)), **near, "found": float(np.mean(sure[there])),
-            "ghosts": float(np.mean(sure[~there])) if (~there).any() else float("nan"),
+            "robot": robot, "what": kind, "frames": int(visible.sum()), "median_px": float(np.median(distances)),
+            "p90_px": float(np.quantile(distances, 0.9)), **within, "found": float(np.mean(confident[visible])),
+            "ghosts": float(np.mean(confident[~visible])) if (~visible).any() else float("nan"),
         })  # fmt: skip
     return rows
 
@@ -200,13 +200,13 @@ def enlarged(images: np.ndarray) -> np.ndarray:
     return images.repeat(times, axis=1).repeat(times, axis=2)
 
 
-def as_given(tokenizer: BaseTokenizer, scenes: Scenes) -> Scenes:
-    """With frames as small as a tokenizer takes them."""
+def resized(tokenizer: BaseTokenizer, scenes: Scenes) -> Scenes:
+    """The scenes with frames resized to the tokenizer's size, then enlarged to the detector's."""
     return scenes._replace(images=enlarged(fit_images(scenes.images, tokenizer.image_size)))
 
 
-def shown_by(tokenizer: BaseTokenizer, images: np.ndarray) -> np.ndarray:
-    """Frames uint8 [n, H, W, 3] as a tokenizer shows them."""
+def reconstruct(tokenizer: BaseTokenizer, images: np.ndarray) -> np.ndarray:
+    """Frames uint8 [n, H, W, 3] encoded and decoded by a tokenizer, enlarged to the detector's size."""
     images = fit_images(images, tokenizer.image_size)
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
     filled = np.concatenate([images, np.repeat(images[-1:], -len(images) % BLOCK, 0)])
@@ -214,21 +214,21 @@ def shown_by(tokenizer: BaseTokenizer, images: np.ndarray) -> np.ndarray:
     return enlarged(np.concatenate(parts)[: len(images)])
 
 
-def as_shown(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> Scenes:
-    """The same with every n-th frame as the tokenizer shows it."""
-    given = as_given(tokenizer, scenes)
-    given.images[::every] = shown_by(tokenizer, scenes.images[::every])
+def reconstructed(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> Scenes:
+    """The scenes `resized`, every n-th frame encoded and decoded by the tokenizer."""
+    given = resized(tokenizer, scenes)
+    given.images[::every] = reconstruct(tokenizer, scenes.images[::every])
     return given
 
 
-def known_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
-    """Those whose truth the suite knows. Raises ConfigError if there are none."""
+def suite_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
+    """Those of the suite, whose true positions are known. Raises ConfigError if there are none."""
     known = {name: robot for name, robot in robots.items() if name in SPECS}
     require(bool(known), "no robot of the suite: nobody knows where its tools are")
     return known
 
 
-def chosen(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
+def select_robots(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
     """Those of `names`, or all. Raises ConfigError for one that is not there."""
     unknown = sorted(set(names) - set(robots))
     require(not unknown, f"--robots: {', '.join(unknown)} cannot be watched; there are {', '.join(robots)}")
@@ -236,27 +236,27 @@ def chosen(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
 
 
 def make_detector(robots: Sequence[str], tokenizer: BaseTokenizer, out: Path) -> Detector:
-    """Trains one on frames as `tokenizer` takes and shows them; writes it and its own errors into `out`."""
-    episodes = max(EPISODES // len(robots), FEWEST)
+    """Trains a detector on frames resized and reconstructed by `tokenizer`; writes it and its errors into `out`."""
+    episodes = max(EPISODES // len(robots), MIN_EPISODES)
     with step("true frames") as update:
         train, held = {}, {}
         for i, name in enumerate(robots):
-            drawn = draw_scenes(SPECS[name], "train", episodes, PER_EPISODE, 0, MISSING)
-            train[name] = as_shown(tokenizer, drawn, every=2)
+            drawn = draw_scenes(SPECS[name], "train", episodes, PER_EPISODE, 0, MISSING_PROBABILITY)
+            train[name] = reconstructed(tokenizer, drawn, every=2)
             held[name] = draw_scenes(SPECS[name], "val", *HELD_OUT, 1)
             update(i + 1, len(robots), name)
     out.mkdir(parents=True, exist_ok=True)
-    unfinished, steps = out / UNFINISHED, STEPS + MORE * len(robots)
+    unfinished, steps = out / UNFINISHED, STEPS + STEPS_PER_ROBOT * len(robots)
     with step("train the detector") as update:
         detector = train_detector(train, unfinished, steps=steps, progress=lambda done, total: update(done, total, ""))
     aside = out / f".{WEIGHTS}"
     detector.save(aside)
     detector, rows = Detector.load(aside), []  # as it was saved
     for name, scenes in held.items():
-        for frames, given in (("true", as_given), ("tokenizer", as_shown)):
-            rows += [{"frames_of": frames} | row for row in errors(detector, name, given(tokenizer, scenes))]
+        for frames, given in (("true", resized), ("tokenizer", reconstructed)):
+            rows += [{"frames_of": frames} | row for row in detection_errors(detector, name, given(tokenizer, scenes))]
     write_rows(out / ERRORS, rows)
-    aside.replace(out / WEIGHTS)  # last: whoever finds the weights does not measure them again
+    aside.replace(out / WEIGHTS)  # last: where the weights exist, errors.csv does
     unfinished.unlink(missing_ok=True)
     return detector
 
@@ -267,20 +267,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     args = parser.parse_args()
     simulator, weights, table = load_simulator(args.run), args.out / WEIGHTS, args.out / ERRORS
-    robots = list(known_robots(simulator.robots))
+    robots = list(suite_robots(simulator.robots))
     require(
         not weights.exists() or (args.out / FILE).exists(),
         f"{weights} is there already, and nothing says of which run; choose another --out or remove it",
     )
     pin_settings(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
-    if there := weights.exists():
-        said = f"{short(weights)} of this run is there already; remove it to have it made again"
-        say(said)
+    if existing := weights.exists():
+        note = f"{short(weights)} of this run is there already; remove it to have it made again"
+        say(note)
     else:
         make_detector(robots, simulator.tokenizer, args.out)
     print(table.read_text())
     then = f"python -m experiments.applications.endurance {args.run} --detector {weights}"
-    wrote(*(() if there else (weights, table)), then=then)
+    wrote(*(() if existing else (weights, table)), then=then)
 
 
 if __name__ == "__main__":

@@ -22,15 +22,15 @@ import numpy as np
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.detector import (
-    CLOSE,
-    SURE,
+    CLOSE_PX,
+    MIN_CONFIDENCE,
     WEIGHTS,
     Detector,
-    chosen,
     enlarged,
-    known_robots,
     make_detector,
-    shown_by,
+    reconstruct,
+    select_robots,
+    suite_robots,
 )  # fmt: skip
 from experiments.applications.endurance.tables import Row, over_robots
 from experiments.applications.scenes import Points, point_names, points_of
@@ -47,13 +47,13 @@ from hma_jax.simulator.simulator import Simulator
 EPISODES = 8
 TABLE = "in_place.csv"
 VIEWS = ("model", "true", "tokens", "still")
-"""Whose last frame the detector looks at: the model's, the true one (what it misses there is its own error), the true
-one as the tokenizer shows it (which a model of its tokens can hardly exceed), and the last one of the prompt, which is
-what copying shows."""
+"""The last frames that the detector is applied to: the model's; the true one (misses there are the detector's own
+error); the true one reconstructed by the tokenizer (an upper bound for a model of its tokens); and the last one of the
+prompt, which is what copying gives."""
 
 
-def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[Row]:
-    """A row for each point of a robot that is seen in the true last frame; none where its episodes are too short.
+def measure_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[Row]:
+    """A row for each point of a robot that is visible in the true last frame; [] where its episodes are too short.
 
     `simulator` has `EPISODES` episodes.
     """
@@ -65,41 +65,44 @@ def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[R
     true = true_simulator(simulator, [robot], EPISODES)
     for one in (simulator, true):
         one.reset([starts[i] for i in filled])
-    still, before = true.images.copy(), _points(true, robot, len(starts))
+    still, prompt_points = true.images.copy(), _points(true, robot, len(starts))
     for t in range(ahead):
         for one in (simulator, true):
             one.step([chunks[i, t] for i in filled])
-    after = _points(true, robot, len(starts))
-    as_tokens = shown_by(simulator.tokenizer, true.images)
+    end_points = _points(true, robot, len(starts))
+    as_tokens = reconstruct(simulator.tokenizer, true.images)
     seen = {"model": simulator.images, "true": true.images, "tokens": as_tokens, "still": still}
-    found = {view: detector.watch(robot.name, enlarged(images[: len(starts)])) for view, images in seen.items()}
+    detections = {view: detector.detect(robot.name, enlarged(images[: len(starts)])) for view, images in seen.items()}
     rows = []
-    for episode, point in zip(*np.nonzero(after.there), strict=True):
-        at, was = after.position[episode, point], before.position[episode, point]
-        moved = np.linalg.norm(at - was) if before.there[episode, point] else np.nan
+    for episode, point in zip(*np.nonzero(end_points.visible), strict=True):
+        true_position, prompt_position = end_points.position[episode, point], prompt_points.position[episode, point]
+        moved = np.linalg.norm(true_position - prompt_position) if prompt_points.visible[episode, point] else np.nan
         what = point_names(SPECS[robot.name])[point]
         row = {"robot": robot.name, "episode": episode, "what": what, "moved_px": moved}
         for view in VIEWS:
-            off = np.linalg.norm(found[view].position[episode, point] - at)
-            row |= {f"{view}_px": off, f"{view}_confidence": found[view].confidence[episode, point]}
+            off = np.linalg.norm(detections[view].position[episode, point] - true_position)
+            row |= {f"{view}_px": off, f"{view}_confidence": detections[view].confidence[episode, point]}
         rows.append({name: float(x) if isinstance(x, np.floating) else x for name, x in row.items()})
     return rows
 
 
 def _points(true: TrueSimulator, robot: Robot, episodes: int) -> Points:
-    """Of the true state of some episodes."""
+    """The points of the true state of the first `episodes`."""
     states = [true.state(b) for b in range(episodes)]
     q, objects, seeds = (np.concatenate([getattr(s, name) for s in states]) for name in ("q", "objects", "seeds"))
     return points_of(SPECS[robot.name], seeds, q, objects)
 
 
 def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
-    """(share, half of its 95 % interval, robots): of what moved by more than `CLOSE`, how much is found as near its
-    true place, by robot, then over robots (Student's t)."""
+    """(share, half-width of its 95 % interval, robots): of the points that moved by more than `CLOSE_PX`, how many are
+    detected within that distance of their true position; averaged by robot, then over robots (Student's t)."""
     near = [
-        {"robot": row["robot"], "near": float(row[f"{view}_px"]) <= CLOSE and float(row[f"{view}_confidence"]) >= SURE}
+        {
+            "robot": row["robot"],
+            "near": float(row[f"{view}_px"]) <= CLOSE_PX and float(row[f"{view}_confidence"]) >= MIN_CONFIDENCE,
+        }
         for row in rows
-        if float(row["moved_px"]) > CLOSE  # not of what came into view
+        if float(row["moved_px"]) > CLOSE_PX  # not of what came into view
     ]
     return over_robots(near, "near")
 
@@ -112,7 +115,7 @@ def main() -> None:
     args = parser.parse_args()
     options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
     simulator = load_simulator(args.run, **options)
-    robots, weights = chosen(known_robots(simulator.robots), args.robots), args.out / WEIGHTS
+    robots, weights = select_robots(suite_robots(simulator.robots), args.robots), args.out / WEIGHTS
     settings = {"robots": sorted(robots)} if args.robots else {}
     pin_settings(args.out, args.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
     if not weights.exists():
@@ -120,7 +123,7 @@ def main() -> None:
     detector, rows, short = Detector.load(weights), [], []
     with step("held-out episodes") as update:
         for i, robot in enumerate(robots.values()):
-            new = watch_ends(simulator, detector, robot)
+            new = measure_ends(simulator, detector, robot)
             short += [] if new else [robot.name]
             rows += new
             update(i + 1, len(robots), robot.name)

@@ -1,4 +1,4 @@
-"""True frames of the suite's robots with what is to be seen in them: where tools and objects are, these by colour."""
+"""True frames of the suite's robots, labelled with the positions of tools and objects, objects by colour."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import IMAGE_SIZE, EmbodimentSpec
 from data_pipelines.suite.visible import object_colours, visible_shares
 
-SEEN = 0.25
-"""Share of a thing that must be seen for it to be there."""
+VISIBLE_SHARE = 0.25
+"""Share of a tool or object that must be in view for it to count as visible."""
 
-AWAY = 9.0
-"""Where an object is put that is to be missing, world units."""
+OUT_OF_VIEW = 9.0
+"""Coordinate, in world units, at which an object is out of view."""
 
 
 class Points(NamedTuple):
     """P points in F frames: tools, then objects by colour of the palette.
 
-    position float32 [F, P, 2] in pixels (column, row), 0 where there is none; share float32 [F, P] of it that is seen.
+    position float32 [F, P, 2] in pixels (column, row), 0 where there is none; share float32 [F, P] of it in view.
     """
 
     position: np.ndarray
     share: np.ndarray
 
     @property
-    def there(self) -> np.ndarray:
-        return self.share >= SEEN
+    def visible(self) -> np.ndarray:
+        return self.share >= VISIBLE_SHARE
 
 
 class Scenes(NamedTuple):
-    """n true frames and what is in them."""
+    """n true frames with the positions of their points."""
 
     images: np.ndarray  # uint8 [n, H, W, 3]
     position: np.ndarray  # float32 [n, P, 2]
-    there: np.ndarray  # bool [n, P]
+    visible: np.ndarray  # bool [n, P]
 
 
 def point_names(spec: EmbodimentSpec) -> tuple[str, ...]:
@@ -69,9 +69,12 @@ def draw_scenes(
     seeds = episode_seeds(spec, episodes, 0, split)
     rollout, rng = simulate(spec, seeds), np.random.default_rng([seed, *map(ord, spec.name)])
     episode = np.repeat(np.arange(episodes), per_episode)
-    when = (rng.random(len(episode)) * rollout.lengths[episode]).astype(int)
-    gone = rng.random((len(episode), rollout.objects.shape[2])) < missing
-    q, objects = rollout.q[episode, when], np.where(gone[..., None], AWAY, rollout.objects[episode, when])
+    moments = (rng.random(len(episode)) * rollout.lengths[episode]).astype(int)
+    hidden = rng.random((len(episode), rollout.objects.shape[2])) < missing
+    q, objects = (
+        rollout.q[episode, moments],
+        np.where(hidden[..., None], OUT_OF_VIEW, rollout.objects[episode, moments]),
+    )
     points = points_of(spec, seeds[episode], q, objects)
     images = render_frames(spec, draw_appearance(spec, seeds), rollout.goals, q, objects, episode)
-    return Scenes(images, points.position, points.there)
+    return Scenes(images, points.position, points.visible)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.suite.simulator import SPECS
-from experiments.applications.detector import COMMITTED, WEIGHTS, Detector, chosen
+from experiments.applications.detector import COMMITTED, WEIGHTS, Detector, select_robots
 from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
@@ -110,7 +110,7 @@ def main() -> None:
         f"{args.minutes:g} are {60 * args.minutes:g}; give fewer",
     )
     detector, simulator, rows = Detector.load(args.detector), load_simulator(args.run), []
-    robots = chosen(native_robots(simulator.robots), args.robots)
+    robots = select_robots(native_robots(simulator.robots), args.robots)
     starts = true_starts_of(simulator, robots, args.starts)
     pin_name(args.out, args.name, args.run, simulator, args.detector)
     for kind in args.drives:

@@ -18,7 +18,7 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
-from experiments.applications.detector import known_robots
+from experiments.applications.detector import suite_robots
 from experiments.applications.scenes import Points, points_of
 from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
@@ -63,7 +63,7 @@ class Drive:
 def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
     """Those that the detector knows, if they are driven as often as their behaviour acts. Raises ConfigError if there
     are none."""
-    native = {name: robot for name, robot in known_robots(robots).items() if robot.stride == 1}
+    native = {name: robot for name, robot in suite_robots(robots).items() if robot.stride == 1}
     require(bool(native), "no robot of the suite at its native rate: drives have an action for every frame")
     return native
 

@@ -108,7 +108,7 @@ def _measured(
     """Of frames begin .. begin + n of both, the first of which was measured before."""
     name, n = drive.robot.name, len(film) - 1
     now, film, true = slice(begin + 1, begin + n + 1), film[1:], true[1:]
-    own, seen = detector.watch(name, film), detector.watch(name, true)
+    own, seen = detector.detect(name, film), detector.detect(name, true)
     grey, true_grey = film.astype(np.float64), true.astype(np.float64)
     kept = [t - begin - 1 for t in SHOWN if begin < t <= begin + n]
     return {

@@ -25,11 +25,11 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
-from experiments.applications.detector import CLOSE, COMMITTED, SURE, WEIGHTS, Detector
+from experiments.applications.detector import CLOSE_PX, COMMITTED, MIN_CONFIDENCE, WEIGHTS, Detector
 from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row
-from experiments.applications.scenes import SEEN, points_of
+from experiments.applications.scenes import VISIBLE_SHARE, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
@@ -95,7 +95,7 @@ def _of(share: np.ndarray, episode: int, point: int) -> list[Event]:
             back = next((s for s in range(t + 1, min(t + 1 + HORIZON, len(share))) if share[s] >= WHOLE), None)
             if back is None:
                 break
-            gone = int((share[t:back] < SEEN).sum())
+            gone = int((share[t:back] < VISIBLE_SHARE).sum())
             if gone >= LEAST:
                 events.append(Event("hidden", episode, t, point, gone, back - t))
             t = back
@@ -126,11 +126,15 @@ def judge(
     for b, (e, (image, points)) in enumerate(zip(events, true, strict=True)):
         row: Row = {"robot": spec.name, "kind": e.kind, "gone": e.gone, "lag": e.lag}
         for name, seen in (("", film[e.lag, b]), ("true_", image)):
-            found = detector.watch(spec.name, seen[None])
+            found = detector.detect(spec.name, seen[None])
             off = float(np.linalg.norm(found.position[0, e.point] - points.position[-1, e.point]))
             sure = float(found.confidence[0, e.point])
-            row |= {f"{name}confidence": sure, f"{name}px": off, f"{name}close": float(sure >= SURE and off <= CLOSE)}
-            row |= {f"{name}found": float(sure >= SURE)}
+            row |= {
+                f"{name}confidence": sure,
+                f"{name}px": off,
+                f"{name}close": float(sure >= MIN_CONFIDENCE and off <= CLOSE_PX),
+            }
+            row |= {f"{name}found": float(sure >= MIN_CONFIDENCE)}
         rows.append(row)
     return rows
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.analysis.intervals import critical
-from experiments.applications.detector import CLOSE, SURE
+from experiments.applications.detector import CLOSE_PX, MIN_CONFIDENCE
 from experiments.applications.endurance.films import Film
-from experiments.applications.scenes import SEEN
+from experiments.applications.scenes import VISIBLE_SHARE
 
 STILL = 1e-3
 """Pixels: what varies less does not move."""
@@ -31,17 +31,17 @@ MEASURES = (
 def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
     """`MEASURES` of the frames `part` of a film whose first `tools` points are tools, of what is seen in truth."""
     found: dict[str, float] = {"psnr": film.psnr[part].mean(), "psnr_still": film.still[part].mean()}
-    there = film.true_share[part] >= SEEN
+    there = film.true_share[part] >= VISIBLE_SHARE
     for name, position, confidence in (
         ("", film.position, film.confidence), ("true_", film.seen_position, film.seen_confidence),
     ):  # fmt: skip
         off = np.linalg.norm(position[part] - film.true_position[part], axis=-1)
-        sure = confidence[part] >= SURE
+        sure = confidence[part] >= MIN_CONFIDENCE
         for kind, which in (("tool", slice(None, tools)), ("object", slice(tools, None))):
             mine = there[:, which]
             far, known = off[:, which][mine], sure[:, which][mine]
             found |= {
-                f"{name}{kind}_found": known.mean(), f"{name}{kind}_close": (known & (far <= CLOSE)).mean(),
+                f"{name}{kind}_found": known.mean(), f"{name}{kind}_close": (known & (far <= CLOSE_PX)).mean(),
                 f"{name}{kind}_px": np.median(far),
             }  # fmt: skip
     for name, position in (("", film.position), ("true_", film.seen_position)):

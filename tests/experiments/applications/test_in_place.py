@@ -16,15 +16,15 @@ from experiments.applications import in_place as in_place_module
 from experiments.applications import simulators
 from experiments.applications.detector import (
     Detector,
-    as_given,
-    as_shown,
-    chosen,
     enlarged,
     make_detector,
-    shown_by,
+    reconstruct,
+    reconstructed,
+    resized,
+    select_robots,
     train_detector,
 )  # fmt: skip
-from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, in_place, watch_ends
+from experiments.applications.in_place import CLOSE_PX, EPISODES, VIEWS, in_place, measure_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
@@ -46,7 +46,7 @@ class Oracle(Detector):
     def __init__(self, found: list[Found]):
         self.found, self.films = found, []
 
-    def watch(self, robot, film):
+    def detect(self, robot, film):
         self.films.append(film)
         return self.found[len(self.films) - 1]
 
@@ -57,25 +57,25 @@ def test_places_at_the_end_are_those_of_the_true_simulator(simulator):
     points = len(point_names(SPECS[robot.name]))
     nowhere = Found(np.zeros((EPISODES, points, 2), np.float32), np.ones((EPISODES, points), np.float32))
     oracle = Oracle([nowhere] * len(VIEWS))
-    rows = watch_ends(simulator, oracle, robot)
+    rows = measure_ends(simulator, oracle, robot)
     assert [film.shape for film in oracle.films] == [(EPISODES, 64, 64, 3)] * len(VIEWS)
     model, true, tokens, still = oracle.films
     assert (true != still).any(), "the true last frame, and the prompt's"
     larger = 64 // simulator.tokenizer.image_size
-    np.testing.assert_array_equal(tokens, shown_by(simulator.tokenizer, true[:, ::larger, ::larger]))
+    np.testing.assert_array_equal(tokens, reconstruct(simulator.tokenizer, true[:, ::larger, ::larger]))
     assert {row["what"] for row in rows} <= set(point_names(SPECS[robot.name]))
     tools = [row for row in rows if row["what"] == "tool_0"]
-    assert len(tools) == EPISODES and np.mean([row["moved_px"] > CLOSE for row in tools]) > 0.3
+    assert len(tools) == EPISODES and np.mean([row["moved_px"] > CLOSE_PX for row in tools]) > 0.3
     # From the corner it is as far as the tool is.
     assert all(len({row[f"{view}_px"] for view in VIEWS}) == 1 and row["true_px"] > 0 for row in tools)
 
 
 def test_a_part_of_the_robots_is_watched_by_name():
     robots = {name: object() for name in ("arm_sand", "pusher_sand")}
-    assert chosen(robots, ()) == robots
-    assert list(chosen(robots, ["pusher_sand"])) == ["pusher_sand"]
+    assert select_robots(robots, ()) == robots
+    assert list(select_robots(robots, ["pusher_sand"])) == ["pusher_sand"]
     with pytest.raises(ConfigError, match="--robots: pusher_sad cannot be watched; there are arm_sand, pusher_sand"):
-        chosen(robots, ["pusher_sad"])
+        select_robots(robots, ["pusher_sad"])
 
 
 def test_the_share_is_of_what_moved_and_a_mean_over_robots():
@@ -104,11 +104,11 @@ def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monk
 
     for name, value in (("EPISODES", 1), ("FEWEST", 1), ("HELD_OUT", (1, 1)), ("train_detector", untrained)):
         monkeypatch.setattr(detector_module, name, value)
-    monkeypatch.setattr(detector_module, "errors", stopped)
+    monkeypatch.setattr(detector_module, "detection_errors", stopped)
     with pytest.raises(KeyboardInterrupt):
         make_detector(["pusher_sand"], simulator.tokenizer, tmp_path)
     assert not (tmp_path / detector_module.WEIGHTS).exists()
-    monkeypatch.setattr(detector_module, "errors", lambda *_: [{"found": 1.0}])
+    monkeypatch.setattr(detector_module, "detection_errors", lambda *_: [{"found": 1.0}])
     made = make_detector(["pusher_sand"], simulator.tokenizer, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [detector_module.WEIGHTS, detector_module.ERRORS]
     assert Detector.load(tmp_path / detector_module.WEIGHTS).robots == made.robots == ("pusher_sand",)
@@ -117,9 +117,9 @@ def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monk
 def test_where_all_episodes_are_too_short_that_is_said(tmp_path, monkeypatch, capsys):
     known = SimpleNamespace(model=SimpleNamespace(params={}), decode=DecodeConfig(), robots={"r": ROBOTS[0]})
     monkeypatch.setattr(in_place_module, "load_simulator", lambda *_, **__: known)
-    monkeypatch.setattr(in_place_module, "known_robots", lambda robots: robots)
+    monkeypatch.setattr(in_place_module, "suite_robots", lambda robots: robots)
     monkeypatch.setattr(in_place_module.Detector, "load", lambda path: None)
-    monkeypatch.setattr(in_place_module, "watch_ends", lambda *_: [])
+    monkeypatch.setattr(in_place_module, "measure_ends", lambda *_: [])
     monkeypatch.setattr(sys, "argv", ["in_place", "RUN", "--out", str(tmp_path)])
     (tmp_path / "detector.npz").touch()
     with pytest.raises(ConfigError, match="no robot is left to look at"):
@@ -170,7 +170,7 @@ def test_a_detector_takes_no_other_one_s_place(ask, tmp_path, monkeypatch, capsy
 
 
 def test_a_detector_whose_training_was_killed_comes_out_as_if_it_had_not_been(tmp_path, monkeypatch):
-    monkeypatch.setattr(detector_module, "KEEP_EVERY", 2)
+    monkeypatch.setattr(detector_module, "SAVE_EVERY", 2)
     scenes = {name: draw_scenes(SPECS[name], "train", 2, 2, 0) for name in ("pusher_sand", "gripper_wood")}
     made, unfinished = [], tmp_path / "unfinished"
 
@@ -226,12 +226,12 @@ def test_a_detector_is_made_of_a_run_s_robots(simulator, tmp_path, monkeypatch):
 
 def test_a_detector_sees_frames_as_small_as_the_run_s():
     tokenizer, scenes = parts()[1], draw_scenes(SPECS["pusher_sand"], "train", 2, 2, 0)
-    given, shown = (f(tokenizer, scenes) for f in (as_given, as_shown))
+    given, shown = (f(tokenizer, scenes) for f in (resized, reconstructed))
     size = tokenizer.image_size
     assert given.images.shape == scenes.images.shape
     np.testing.assert_array_equal(given.images[:, :: 64 // size, :: 64 // size], fit_images(scenes.images, size))
     assert (shown.images != given.images).any()
-    half = as_shown(tokenizer, scenes, every=2).images
+    half = reconstructed(tokenizer, scenes, every=2).images
     np.testing.assert_array_equal(half[::2], shown.images[::2])
     np.testing.assert_array_equal(half[1::2], given.images[1::2])
     with pytest.raises(ConfigError, match="cannot be enlarged"):

@@ -55,4 +55,4 @@ def test_an_object_is_the_point_of_its_colour(start):
 def test_a_missing_object_is_not_there():
     spec, q = SPECS["gripper_wood"], np.zeros((1, 4))
     points = points_of(spec, np.array([5]), q, np.full((1, 2, 2), 9.0))
-    assert not points.there[:, 1:].any() and points.there[:, 0].all()
+    assert not points.visible[:, 1:].any() and points.visible[:, 0].all()

@@ -47,7 +47,7 @@ def test_films_that_a_kill_cut_short_go_on_and_come_out_the_same(slide, tmp_path
 
     def make(path, progress=lambda done, total: None) -> dict[str, Film]:
         one = simulator(episodes=2, decode=decode, history=1)
-        return make_films(one, SimpleNamespace(watch=watch), [Driven(0, 10), Driven(1, 6)], path, progress)
+        return make_films(one, SimpleNamespace(detect=watch), [Driven(0, 10), Driven(1, 6)], path, progress)
 
     killed, whole = tmp_path / "films" / "a.npz.unfinished", make(tmp_path / "b.npz.unfinished")
     with pytest.raises(InterruptedError):
