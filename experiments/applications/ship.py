@@ -81,16 +81,16 @@ def ship(
     require(shipped, f"--out {out} holds no {REPORT}, so that it is no shipped model; all of it would be removed")
     run = load_run(source, "auto")
     simulator = load_simulator(source)
-    strange = [name for name, robot in simulator.robots.items() if not in_suite(robot)]
-    require(not strange, f"{', '.join(strange)}: not of the suite, so that there is no truth to compare with")
+    foreign = [name for name, robot in simulator.robots.items() if not in_suite(robot)]
+    require(not foreign, f"{', '.join(foreign)}: not of the suite, so that there is no truth to compare with")
     aside = out.with_name(f".{out.name}.making")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
     try:
         described = describe_run(run.model, run.train, run.table, run.provenance)
         with Checkpoints(aside / CHECKPOINTS, described) as checkpoints:
-            checkpoints.save(run.step, Shipped(halved(run.params)))
-        forget_places(aside / CHECKPOINTS / str(run.step))
+            checkpoints.save(run.step, Shipped(to_half_precision(run.params)))
+        strip_machine_paths(aside / CHECKPOINTS / str(run.step))
         save_beside(simulator, aside, decode)
         add(aside)
         size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())
@@ -100,7 +100,7 @@ def ship(
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def halved(params: Params) -> Params:
+def to_half_precision(params: Params) -> Params:
     """In float16, half of the bytes; what reads them makes them float32 again. Raises ConfigError for a weight that is
     too large for it."""
     half = jax.tree.map(lambda x: np.asarray(x, np.float16), params)
@@ -108,14 +108,14 @@ def halved(params: Params) -> Params:
     return half
 
 
-def forget_places(checkpoint: Path) -> None:
+def strip_machine_paths(checkpoint: Path) -> None:
     """Orbax marks what it finished by files that name the directory on this machine; the marks alone are shipped."""
     for mark in checkpoint.rglob("commit_success.txt"):
         write_file(mark, "finished\n")
     write_list(checkpoint)
 
 
-class Seen(NamedTuple):
+class Rollouts(NamedTuple):
     """Frames under held-out actions, uint8 [1 + FRAMES, EPISODES, H, W, 3]: the first ones, and one after each
     chunk."""
 
@@ -124,16 +124,16 @@ class Seen(NamedTuple):
     shuffled: np.ndarray  # of the model under the actions of the episode before
 
 
-def look(simulator: Simulator, robot: Robot) -> Seen:
+def roll_out(simulator: Simulator, robot: Robot) -> Rollouts:
     starts, futures = held_out(robot, simulator.tokenizer.image_size, FRAMES, EPISODES)
     longest = SPECS[robot.name].seconds[1]
     require(len(starts) == EPISODES, f"{robot.name}: too few of its episodes (at most {longest:g} s) are long enough")
     others = np.roll(futures, 1, axis=0)
     runs = (true_simulator(simulator, [robot], len(starts)), futures), (simulator, futures), (simulator, others)
-    return Seen(*(np.stack([image.copy() for image in rolled(by, starts, chunks)]) for by, chunks in runs))
+    return Rollouts(*(np.stack([image.copy() for image in frames_of(by, starts, chunks)]) for by, chunks in runs))
 
 
-def report_on(run: Path, simulator: Simulator, seen: Mapping[str, Seen]) -> dict[str, Any]:
+def make_report(run: Path, simulator: Simulator, rollouts: Mapping[str, Rollouts]) -> dict[str, Any]:
     """What report.json says."""
     return {
         "step": simulator.model.step,
@@ -141,27 +141,27 @@ def report_on(run: Path, simulator: Simulator, seen: Mapping[str, Seen]) -> dict
         "pixels": simulator.tokenizer.image_size,
         "episodes": EPISODES,
         "frames": FRAMES,
-        "robots": {name: compare(one) for name, one in seen.items()},
+        "robots": {name: psnr_by_frame(one) for name, one in rollouts.items()},
         "frames_per_second": round(time_simulator(run, 1, TIMED).frames_per_second, 1),
         "machine": describe_machine(jax.devices()),
     }
 
 
-def compare(seen: Seen) -> dict[str, list[float]]:
+def psnr_by_frame(rollouts: Rollouts) -> dict[str, list[float]]:
     """Mean PSNR in dB by frame after the start, against the true simulator under the same held-out actions."""
 
     def against_truth(images: np.ndarray) -> list[float]:
-        return [round(float(np.mean(psnr(a, b))), 2) for a, b in zip(images[1:], seen.true[1:], strict=True)]
+        return [round(float(np.mean(psnr(a, b))), 2) for a, b in zip(images[1:], rollouts.true[1:], strict=True)]
 
-    still = np.broadcast_to(seen.true[:1], seen.true.shape)
-    kinds = {"model": seen.model, "still": still, "shuffled": seen.shuffled}
+    still = np.broadcast_to(rollouts.true[:1], rollouts.true.shape)
+    kinds = {"model": rollouts.model, "still": still, "shuffled": rollouts.shuffled}
     return {kind: against_truth(images) for kind, images in kinds.items()}
 
 
-def write_clip(seen: Mapping[str, Seen], path: Path, hz: float) -> None:
+def write_clip(rollouts: Mapping[str, Rollouts], path: Path, hz: float) -> None:
     """A GIF of the first episode of every robot, `hz` frames per second, a column each: the truth above, below it the
     model."""
-    columns = [np.concatenate([one.true[:, 0], one.model[:, 0]], axis=1) for one in seen.values()]
+    columns = [np.concatenate([one.true[:, 0], one.model[:, 0]], axis=1) for one in rollouts.values()]
     film = np.concatenate(columns, axis=2)
     size = (ZOOM * film.shape[2], ZOOM * film.shape[1])
     smooth = [Image.fromarray(frame).resize(size, Image.Resampling.BICUBIC) for frame in film]  # as the page shows them
@@ -172,7 +172,7 @@ def write_clip(seen: Mapping[str, Seen], path: Path, hz: float) -> None:
     write_file(path, content.getvalue())
 
 
-def rolled(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futures: np.ndarray):
+def frames_of(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futures: np.ndarray):
     """The frames of all episodes [B, H, W, 3], the first ones and those after each chunk."""
     yield simulator.reset(starts)
     for t in range(futures.shape[1]):
@@ -182,10 +182,10 @@ def rolled(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futur
 def describe(run: Path) -> None:
     """Writes report.json and clip.gif beside a model that is about to be shipped, and prints what they say."""
     simulator = load_simulator(run, episodes=EPISODES)
-    seen = {name: look(simulator, robot) for name, robot in simulator.robots.items()}
-    report = report_on(run, simulator, seen)
+    rollouts = {name: roll_out(simulator, robot) for name, robot in simulator.robots.items()}
+    report = make_report(run, simulator, rollouts)
     write_file(run / REPORT, json.dumps(report, indent=1) + "\n")
-    write_clip(seen, run / CLIP, min(robot.hz / robot.stride for robot in simulator.robots.values()))
+    write_clip(rollouts, run / CLIP, min(robot.hz / robot.stride for robot in simulator.robots.values()))
     for name, by in report["robots"].items():
         means = ", ".join(f"{kind} {np.mean(values):.2f}" for kind, values in by.items())
         print(f"{name:16s} PSNR over {FRAMES} frames: {means} dB")

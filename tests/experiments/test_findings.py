@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from experiments.analysis.preregistered import FILE, Expected, read_expected
-from experiments.applications.detector import CLOSE
+from experiments.applications.detector import CLOSE_PX
 from experiments.applications.in_place import in_place
 from experiments.report.findings import read_findings
 from experiments.rows import OVERALL, CurvePoint, all_series, curve, difference
@@ -83,7 +83,7 @@ def test_robots_that_do_not_stay_robots_are_as_findings_say():
                 share, half, robots = in_place(mine, view)
                 assert robots == 36
                 shares[steps, kind, view] = f"{share:.1%} ± {half:.1%}".replace("% ±", " ±").replace("%", " %")
-        moved = [r for r in rows if float(r["moved_px"]) > CLOSE]
+        moved = [r for r in rows if float(r["moved_px"]) > CLOSE_PX]
         off = [[float(r[f"{view}_px"]) for r in moved] for view in ("model", "still")]
         medians[steps] = [f"{np.median(pixels) / 2:.1f}" for pixels in off]
     said = (

@@ -1,5 +1,5 @@
-"""How long a learned simulator holds: minutes under the same actions as the true one, and what becomes of the picture.
+"""How long a learned simulator stays close to the true one under the same actions, over minutes (drift of rollouts).
 
-`drives` what is commanded and what truly happens then, `films` frames of both and what is measured in each, `hidden`
-things that come back into view, `tables` what the measures come to, `figures` their pictures.
+`drives` makes actions and true rollouts, `films` measures the frames of both simulators, `hidden` tests objects that
+come back into view, `tables` and `figures` summarise the measures.
 """

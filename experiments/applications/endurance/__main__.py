@@ -45,15 +45,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "steps_2": {"unmask_steps": 2},
     "steps_16": {"unmask_steps": 16},
 }
-"""What is changed of the way in which RUN/decode.json fills frames."""
+"""Changes of the decoding settings in RUN/decode.json."""
 
 KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
 TABLE = "endurance.csv"
-SAID = (
+PRINTED = (
     "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves",
     "steers", "true_follows", "true_steers", "true_tool_close", "true_object_close", "histogram",
 )  # fmt: skip
-"""Measures that are printed."""
+"""The measures that the command prints; the table has all."""
 
 
 def film_path(
@@ -128,7 +128,7 @@ def main() -> None:
                 films = load_films(path)
                 hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
                 new += rows_of(f"{args.name}/{variant}", kind, which, films, hz, tools, args.every)
-            show(new)
+            print_rows(new)
             rows += new
             draw_sheet(films, args.out / f"{'-'.join([args.name, variant, kind, *args.robots])}.png")
             console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
@@ -138,14 +138,14 @@ def main() -> None:
     wrote(table, curves)
 
 
-def show(rows: list[Row]) -> None:
+def print_rows(rows: list[Row]) -> None:
     """Means over robots of the first part, the last one, and some between."""
     parts = sorted({row["part"] for row in rows})
     for part in dict.fromkeys([parts[0], parts[len(parts) // 2], parts[-1]]):
-        mine = [row for row in rows if row["part"] == part]
-        found = {name: over_robots(mine, name) for name in SAID}
-        words = [f"{name} {mean:.3f}±{half:.3f}" if n else f"{name} –" for name, (mean, half, n) in found.items()]
-        console.print(f"{mine[0]['variant']} {mine[0]['drive']} part {part}: " + ", ".join(words), soft_wrap=True)
+        own = [row for row in rows if row["part"] == part]
+        means = {name: over_robots(own, name) for name in PRINTED}
+        texts = [f"{name} {mean:.3f}±{half:.3f}" if n else f"{name} –" for name, (mean, half, n) in means.items()]
+        console.print(f"{own[0]['variant']} {own[0]['drive']} part {part}: " + ", ".join(texts), soft_wrap=True)
 
 
 if __name__ == "__main__":

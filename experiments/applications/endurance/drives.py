@@ -1,7 +1,7 @@
-"""What a robot is told for minutes, and what truly happens then: from one start, in the true simulator alone.
+"""Long sequences of actions for a robot, and the true rollout under them, from one start, in the true simulator.
 
-The suite's behaviour sees the true state, and the model gets the same actions; two other kinds are unlike anything that
-was recorded.
+Actions come from the suite's behaviour, which sees the true state, or are of two kinds unlike anything that was
+recorded; the model is then given the same ones.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 Kind = Literal["behaviour", "extremes", "alternation"]
-"""`behaviour`: as recorded, begun anew every `AGAIN` seconds; `extremes`: one action value after the other held at an
-end of its range for `HOLD` seconds, the others at rest; `alternation`: all values jump from end to end every frame."""
+"""`behaviour`: as recorded, restarted every `RESTART_SECONDS`; `extremes`: one action value after the other held at an
+end of its range for `HOLD_SECONDS`, the others at rest; `alternation`: all values jump from end to end every frame."""
 
-AGAIN, HOLD = 12.0, 2.0
+RESTART_SECONDS, HOLD_SECONDS = 12.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -61,28 +61,27 @@ class Drive:
 
 
 def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
-    """Those that the detector knows, if they are driven as often as their behaviour acts. Raises ConfigError if there
-    are none."""
+    """The suite's robots that the model runs at their native rate (stride 1). Raises ConfigError if there are none."""
     native = {name: robot for name, robot in suite_robots(robots).items() if robot.stride == 1}
     require(bool(native), "no robot of the suite at its native rate: drives have an action for every frame")
     return native
 
 
 def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -> Drive:
-    """A function of its arguments. `start` must have the seed of its episode."""
+    """The true rollout of `frames` actions of a kind. Deterministic; `start` must have the seed of its episode."""
     spec = SPECS[robot.name]
     world = World(spec, [start.seed])
     for action in start.actions:
         world.step(action[None].astype(np.float64))
     q, objects, actions, behaviour = [world.q.copy()], [world.objects.copy()], [], None
-    again = max(round(AGAIN * spec.hz), 1)
+    restart = max(round(RESTART_SECONDS * spec.hz), 1)
     for t in range(frames):
         if kind == "behaviour":
-            if t % again == 0:
+            if t % restart == 0:
                 behaviour = Behaviour(world, np.random.default_rng([seed, t]))
             command = behaviour.act()[0]
         else:
-            command = _unlike(robot, kind, t)
+            command = _extreme_action(robot, kind, t)
         action = np.clip(np.asarray(command, np.float32), np.float32(robot.low), np.float32(robot.high))
         world.step(action[None].astype(np.float64))
         actions.append(action)
@@ -91,11 +90,11 @@ def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -
     return Drive(robot, start, np.stack(actions), np.concatenate(q), np.concatenate(objects), world.goals)
 
 
-def _unlike(robot: Robot, kind: Kind, t: int) -> np.ndarray:
+def _extreme_action(robot: Robot, kind: Kind, t: int) -> np.ndarray:
     if kind == "alternation":
         return np.array(robot.high if t % 2 else robot.low)
-    turn = t // max(round(HOLD * robot.hz), 1)
-    which, end = turn // 2 % robot.action_dim, (robot.high, robot.low)[turn % 2]
+    turn = t // max(round(HOLD_SECONDS * robot.hz), 1)
+    dimension, end = turn // 2 % robot.action_dim, (robot.high, robot.low)[turn % 2]
     action = np.array(robot.rest)
-    action[which] = end[which]
+    action[dimension] = end[dimension]
     return action

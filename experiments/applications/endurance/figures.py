@@ -21,7 +21,7 @@ PANELS = {
     "follows": ("motion follows commands (correlation)", "true_follows", "true simulator"),
     "histogram": ("colours differ from the truth's (share)", "", ""),
 }
-"""Measure -> its words, and what it is drawn beside."""
+"""Measure -> title, and the reference measure in the same panel with its label."""
 
 
 def draw_curves(rows: Sequence[Row], path: Path) -> None:
@@ -29,15 +29,15 @@ def draw_curves(rows: Sequence[Row], path: Path) -> None:
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(2, 3, figsize=(11, 6), layout="constrained")
         variants = list(dict.fromkeys(str(row["variant"]) for row in rows))
-        for panel, (name, (words, beside, its_words)) in zip(panels.flat, PANELS.items(), strict=True):
+        for panel, (name, (title, reference, reference_label)) in zip(panels.flat, PANELS.items(), strict=True):
             for variant in variants:
                 t, mean, half = _curve([row for row in rows if row["variant"] == variant], name)
                 (line,) = panel.plot(t, mean, marker="o", markersize=3, label=variant)
                 panel.fill_between(t, mean - half, mean + half, color=line.get_color(), alpha=0.12, linewidth=0)
-            if beside:
-                t, mean, _ = _curve([row for row in rows if row["variant"] == variants[0]], beside)
-                panel.plot(t, mean, **CONTROL_LINE, label=its_words)
-            panel.set(title=words, xlabel="minutes of simulated time", xlim=(0, None))
+            if reference:
+                t, mean, _ = _curve([row for row in rows if row["variant"] == variants[0]], reference)
+                panel.plot(t, mean, **CONTROL_LINE, label=reference_label)
+            panel.set(title=title, xlabel="minutes of simulated time", xlim=(0, None))
             if name != "psnr":
                 panel.set_ylim(0, 1.02)
         for panel in (panels[0, 0], panels[0, 1]):

@@ -1,7 +1,7 @@
-"""Frames of the learned simulator beside those of the true one, under the same actions, and what is measured in each.
+"""Rollouts of the learned and the true simulator under the same actions, and what is measured in their frames.
 
-All robots advance in one batch. Frames themselves are not kept, but for a few of each to look at. What there is after
-every `BLOCK` of frames is kept in a file until the films are whole: half an hour of work survives its process.
+All robots advance in one batch. Frames are not kept, but for a few of each to look at. Progress is saved after every
+`BLOCK` of frames until the films are complete, since they take half an hour.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.simulator import Simulator
 
 BLOCK = 64
-"""Frames that are measured, and kept, together."""
+"""Frames that are measured together, and after which progress is saved."""
 
 SHOWN = (1, 12, 24, 48, 120, 240, 600, 1200, 1800, 2400, 3600)
 """Frames that are kept to look at, where they are reached."""
 
 BINS = 8
-"""Of a colour histogram, per channel."""
+"""Bins of a colour histogram, per channel."""
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Film:
-    """One robot's n frames, each [n, ...]; P points."""
+    """Measures of one robot's n frames, each [n, ...]; P points."""
 
     psnr: np.ndarray  # dB, the model's against the true frame
     still: np.ndarray  # dB, the start's last frame against the true one
-    true_position: np.ndarray  # [n, P, 2], where everything is
-    true_share: np.ndarray  # [n, P], how much of it is seen
-    position: np.ndarray  # [n, P, 2], where the detector finds it in the model's frames
+    true_position: np.ndarray  # [n, P, 2], by the true state
+    true_share: np.ndarray  # [n, P], how much of the point is in view
+    position: np.ndarray  # [n, P, 2], detected in the model's frames
     confidence: np.ndarray  # [n, P]
-    seen_position: np.ndarray  # the same in the true frames
+    seen_position: np.ndarray  # [n, P, 2], detected in the true frames
     seen_confidence: np.ndarray
     level: np.ndarray  # mean grey level of the model's frame less that of the true one
     variance: np.ndarray  # of the model's frame over that of the true one
@@ -56,74 +56,76 @@ def make_films(
     unfinished: Path,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Film]:
-    """One film for each drive, named by its robot: `simulator` has as many episodes. Goes on from the file
-    `unfinished`, where a process that was killed has left it, and comes out as if it never had been."""
+    """One film for each drive, by the name of its robot; `simulator` has as many episodes. Resumes from the file
+    `unfinished` if a killed process left it; the films are the same as without the kill."""
     simulator.reset([drive.start for drive in drives], seeds=0)
-    begun, parts = _go_on(simulator, drives, unfinished) if unfinished.exists() else (0, [[] for _ in drives])
+    first_frame, parts = _resume(simulator, drives, unfinished) if unfinished.exists() else (0, [[] for _ in drives])
     images, longest = [simulator.images.copy()], max(map(len, drives))
     points = [drive.points() for drive in drives]
-    first = [drive.frames(0, 1)[0] for drive in drives]
-    for begin in range(begun, longest, BLOCK):
-        stop = min(begin + BLOCK, longest)
-        for t in range(begin, stop):
+    start_frames = [drive.frames(0, 1)[0] for drive in drives]
+    for start in range(first_frame, longest, BLOCK):
+        stop = min(start + BLOCK, longest)
+        for t in range(start, stop):
             images.append(simulator.step([d.actions[t] if t < len(d) else None for d in drives]).copy())
             progress(t + 1, longest)
         block = np.stack(images)
         for i, drive in enumerate(drives):
             end = min(stop, len(drive))
-            if end > begin:
-                film, true = block[: end - begin + 1, i], drive.frames(begin, end + 1)
-                parts[i].append(_measured(detector, drive, points[i], begin, film, true, first[i]))
+            if end > start:
+                film, true = block[: end - start + 1, i], drive.frames(start, end + 1)
+                parts[i].append(_measure_block(detector, drive, points[i], start, film, true, start_frames[i]))
         images = images[-1:]
-        _keep(simulator, parts, stop, unfinished)
-    return {drive.robot.name: Film(**_joined(mine)) for drive, mine in zip(drives, parts, strict=True)}
+        _save_progress(simulator, parts, stop, unfinished)
+    return {drive.robot.name: Film(**_join(blocks)) for drive, blocks in zip(drives, parts, strict=True)}
 
 
-def _joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _join(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {f.name: np.concatenate([part[f.name] for part in parts], int(f.name == "shown")) for f in fields(Film)}
 
 
-def _keep(simulator: Simulator, parts: Sequence[Sequence[Mapping[str, np.ndarray]]], frames: int, path: Path) -> None:
-    """All that there is of the films after so many frames."""
+def _save_progress(
+    simulator: Simulator, parts: Sequence[Sequence[Mapping[str, np.ndarray]]], frames: int, path: Path
+) -> None:
+    """Writes the state of the simulator and the measures of the first `frames` frames."""
     arrays = as_arrays(simulator.snapshot()) | {"made": np.array(frames)}
-    arrays |= {f"film/{i}/{name}": array for i, mine in enumerate(parts) for name, array in _joined(mine).items()}
+    arrays |= {f"film/{i}/{name}": array for i, blocks in enumerate(parts) for name, array in _join(blocks).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_arrays(path, arrays, compressed=False)
 
 
-def _go_on(
+def _resume(
     simulator: Simulator, drives: Sequence[Drive], path: Path
 ) -> tuple[int, list[list[Mapping[str, np.ndarray]]]]:
-    """(frames, parts) as `_keep` left them; the simulator, whose episodes have begun, stands there again. ConfigError
-    for a damaged file."""
+    """(frames done, measures of each film) as `_save_progress` wrote them; restores the simulator, which has been
+    reset. ConfigError for a damaged file."""
     with reading_arrays(path, "remove it, the same command films from the start") as arrays:
         parts = [[{f.name: arrays[f"film/{i}/{f.name}"] for f in fields(Film)}] for i in range(len(drives))]
         simulator.restore(from_arrays(arrays, simulator.snapshot()))
         return int(arrays["made"]), parts
 
 
-def _measured(
-    detector: Detector, drive: Drive, points, begin: int, film: np.ndarray, true: np.ndarray, first: np.ndarray
+def _measure_block(
+    detector: Detector, drive: Drive, points, start: int, film: np.ndarray, true: np.ndarray, start_frame: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Of frames begin .. begin + n of both, the first of which was measured before."""
+    """The measures of frames start + 1 .. start + n; `film` and `true` have the frame before them, too."""
     name, n = drive.robot.name, len(film) - 1
-    now, film, true = slice(begin + 1, begin + n + 1), film[1:], true[1:]
-    own, seen = detector.detect(name, film), detector.detect(name, true)
+    now, film, true = slice(start + 1, start + n + 1), film[1:], true[1:]
+    detected, detected_true = detector.detect(name, film), detector.detect(name, true)
     grey, true_grey = film.astype(np.float64), true.astype(np.float64)
-    kept = [t - begin - 1 for t in SHOWN if begin < t <= begin + n]
+    kept = [t - start - 1 for t in SHOWN if start < t <= start + n]
     return {
-        "psnr": psnr(film, true), "still": psnr(np.broadcast_to(first, true.shape), true),
+        "psnr": psnr(film, true), "still": psnr(np.broadcast_to(start_frame, true.shape), true),
         "true_position": points.position[now], "true_share": points.share[now],
-        "position": own.position, "confidence": own.confidence,
-        "seen_position": seen.position, "seen_confidence": seen.confidence,
+        "position": detected.position, "confidence": detected.confidence,
+        "seen_position": detected_true.position, "seen_confidence": detected_true.confidence,
         "level": grey.mean((1, 2, 3)) - true_grey.mean((1, 2, 3)),
         "variance": grey.var((1, 2, 3)) / true_grey.var((1, 2, 3)),
-        "histogram": np.full(n, 0.5 * np.abs(colours_of(film) - colours_of(true)).sum()),
+        "histogram": np.full(n, 0.5 * np.abs(colour_histogram(film) - colour_histogram(true)).sum()),
         "shown": np.stack([true[kept], film[kept]]),
     }  # fmt: skip
 
 
-def colours_of(images: np.ndarray) -> np.ndarray:
+def colour_histogram(images: np.ndarray) -> np.ndarray:
     """Histogram [BINS^3] of the colours of frames uint8 [n, H, W, 3], adding up to 1."""
     levels = (images // (256 // BINS)).reshape(-1, 3).astype(np.int64) @ np.array([BINS**2, BINS, 1])
     return np.bincount(levels, minlength=BINS**3) / len(levels)

@@ -1,4 +1,4 @@
-"""Objects that are hidden or out of view for a while and come back: are they still what and where they were?
+"""Object permanence: are objects that were occluded or out of view still what and where they were?
 
 Command: python -m experiments.applications.endurance.hidden RUN --name NAME --out DIR
 Cost: two minutes of one core, three for the model that is served.
@@ -40,13 +40,13 @@ from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 EPISODES, HORIZON = 400, 30
-"""Of each robot that are searched, and frames after the start in which the object must be back."""
+"""Episodes of each robot that are searched, and frames after the start within which the object must be back."""
 
-WHOLE = 0.6
-"""Share of an object that is seen before and after."""
+WHOLE_SHARE = 0.6
+"""Share of an object that must be in view before and after."""
 
-LEAST = 2
-"""Frames that it is not seen at least."""
+MIN_HIDDEN = 2
+"""Frames that it must be out of view at least."""
 
 PER_ROBOT = 6
 """Events of each robot, and as many controls."""
@@ -72,7 +72,7 @@ def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.rand
     hidden: list[Event] = []
     for episode in rng.permutation(len(share)):
         own = share[episode, : lengths[episode]]
-        found = [e for p in range(tools, share.shape[2]) for e in _of(own[:, p], int(episode), p)]
+        found = [e for p in range(tools, share.shape[2]) for e in _hidden_spans(own[:, p], int(episode), p)]
         if found:
             hidden.append(max(found, key=lambda e: e.gone))  # the longest are the rarest
     hidden = hidden[:PER_ROBOT]
@@ -80,7 +80,7 @@ def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.rand
     for event in hidden:
         for episode in rng.permutation(len(share)):
             start, stop = START_FRAMES - 1, START_FRAMES + event.lag
-            whole = (share[episode, :stop] >= WHOLE).all(0)
+            whole = (share[episode, :stop] >= WHOLE_SHARE).all(0)
             points = [p for p in range(tools, share.shape[2]) if whole[p]]
             if points and lengths[episode] >= stop:
                 controls.append(Event("control", int(episode), start, points[0], 0, event.lag))
@@ -88,16 +88,16 @@ def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.rand
     return hidden + controls
 
 
-def _of(share: np.ndarray, episode: int, point: int) -> list[Event]:
+def _hidden_spans(share: np.ndarray, episode: int, point: int) -> list[Event]:
     events, t = [], START_FRAMES - 1
     while t < len(share) - 1:
-        if share[t] >= WHOLE and share[t + 1] < WHOLE:
-            back = next((s for s in range(t + 1, min(t + 1 + HORIZON, len(share))) if share[s] >= WHOLE), None)
+        if share[t] >= WHOLE_SHARE and share[t + 1] < WHOLE_SHARE:
+            back = next((s for s in range(t + 1, min(t + 1 + HORIZON, len(share))) if share[s] >= WHOLE_SHARE), None)
             if back is None:
                 break
-            gone = int((share[t:back] < VISIBLE_SHARE).sum())
-            if gone >= LEAST:
-                events.append(Event("hidden", episode, t, point, gone, back - t))
+            hidden = int((share[t:back] < VISIBLE_SHARE).sum())
+            if hidden >= MIN_HIDDEN:
+                events.append(Event("hidden", episode, t, point, hidden, back - t))
             t = back
         else:
             t += 1
@@ -115,9 +115,9 @@ def judge(
         q, objects = rollout.q[e.episode, part], rollout.objects[e.episode, part]
         goals = rollout.goals[e.episode : e.episode + 1]
         images = render_frames(spec, draw_appearance(spec, seeds), goals, q, objects, np.zeros(len(q), int))
-        told = rollout.actions[e.episode]
-        starts.append(Start(spec.name, images[: e.start + 1], told[: e.start], int(seeds[0])))
-        actions.append(np.clip(told[e.start : e.start + last], np.float32(robot.low), np.float32(robot.high)))
+        recorded = rollout.actions[e.episode]
+        starts.append(Start(spec.name, images[: e.start + 1], recorded[: e.start], int(seeds[0])))
+        actions.append(np.clip(recorded[e.start : e.start + last], np.float32(robot.low), np.float32(robot.high)))
         true.append((images[-1], points_of(spec, np.repeat(seeds, len(q)), q, objects)))
     films = [simulator.reset(starts, seeds=0).copy()]
     for t in range(last):  # all of them until the last is judged: other numbers of episodes would be compiled anew
@@ -128,13 +128,13 @@ def judge(
         for name, seen in (("", film[e.lag, b]), ("true_", image)):
             found = detector.detect(spec.name, seen[None])
             off = float(np.linalg.norm(found.position[0, e.point] - points.position[-1, e.point]))
-            sure = float(found.confidence[0, e.point])
+            confidence = float(found.confidence[0, e.point])
             row |= {
-                f"{name}confidence": sure,
+                f"{name}confidence": confidence,
                 f"{name}px": off,
-                f"{name}close": float(sure >= MIN_CONFIDENCE and off <= CLOSE_PX),
+                f"{name}close": float(confidence >= MIN_CONFIDENCE and off <= CLOSE_PX),
             }
-            row |= {f"{name}found": float(sure >= MIN_CONFIDENCE)}
+            row |= {f"{name}found": float(confidence >= MIN_CONFIDENCE)}
         rows.append(row)
     return rows
 
@@ -166,10 +166,10 @@ def main() -> None:
     require(bool(rows), f"no object is hidden and comes back in held-out episodes of {', '.join(robots)}")
     write_rows(table, rows)
     for kind in ("hidden", "control"):
-        mine = [row for row in rows if row["kind"] == kind]
+        own = [row for row in rows if row["kind"] == kind]
         names = ("gone", "lag", "found", "close", "true_found", "true_close")
-        means = {k: np.mean([float(r[k]) for r in mine]) for k in names}
-        console.print(f"{kind}: {len(mine)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
+        means = {k: np.mean([float(r[k]) for r in own]) for k in names}
+        console.print(f"{kind}: {len(own)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
     wrote(table)
 
 

@@ -1,4 +1,4 @@
-"""What films come to: a row per robot and minute, and their means over robots with intervals."""
+"""Tables of films: a row of measures per robot and minute, and means over robots with intervals."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from experiments.applications.detector import CLOSE_PX, MIN_CONFIDENCE
 from experiments.applications.endurance.films import Film
 from experiments.applications.scenes import VISIBLE_SHARE
 
-STILL = 1e-3
-"""Pixels: what varies less does not move."""
+MIN_MOTION = 1e-3
+"""Pixels: a displacement whose standard deviation is less counts as no motion."""
 
-STEP = 1.0
-"""Pixels: where a tool goes by less from a frame to the next, its direction is not told."""
+MIN_STEP = 1.0
+"""Pixels: the direction of a shorter displacement is not used."""
 
 Row = dict[str, object]
 
@@ -29,45 +29,45 @@ MEASURES = (
 
 
 def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
-    """`MEASURES` of the frames `part` of a film whose first `tools` points are tools, of what is seen in truth."""
-    found: dict[str, float] = {"psnr": film.psnr[part].mean(), "psnr_still": film.still[part].mean()}
-    there = film.true_share[part] >= VISIBLE_SHARE
+    """`MEASURES` of the frames `part` of a film whose first `tools` points are tools, over truly visible points."""
+    measures: dict[str, float] = {"psnr": film.psnr[part].mean(), "psnr_still": film.still[part].mean()}
+    visible = film.true_share[part] >= VISIBLE_SHARE
     for name, position, confidence in (
         ("", film.position, film.confidence), ("true_", film.seen_position, film.seen_confidence),
     ):  # fmt: skip
-        off = np.linalg.norm(position[part] - film.true_position[part], axis=-1)
-        sure = confidence[part] >= MIN_CONFIDENCE
+        error = np.linalg.norm(position[part] - film.true_position[part], axis=-1)
+        confident = confidence[part] >= MIN_CONFIDENCE
         for kind, which in (("tool", slice(None, tools)), ("object", slice(tools, None))):
-            mine = there[:, which]
-            far, known = off[:, which][mine], sure[:, which][mine]
-            found |= {
-                f"{name}{kind}_found": known.mean(), f"{name}{kind}_close": (known & (far <= CLOSE_PX)).mean(),
-                f"{name}{kind}_px": np.median(far),
+            kind_visible = visible[:, which]
+            distances, detected = error[:, which][kind_visible], confident[:, which][kind_visible]
+            measures |= {
+                f"{name}{kind}_found": detected.mean(), f"{name}{kind}_close": (detected & (distances <= CLOSE_PX)).mean(),
+                f"{name}{kind}_px": np.median(distances),
             }  # fmt: skip
     for name, position in (("", film.position), ("true_", film.seen_position)):
-        found |= motion(film.true_position[part, :tools], position[part, :tools], there[:, :tools], name)
-    found |= {name: getattr(film, name)[part].mean() for name in ("level", "variance", "histogram")}
-    return {name: float(found[name]) for name in MEASURES}
+        measures |= motion(film.true_position[part, :tools], position[part, :tools], visible[:, :tools], name)
+    measures |= {name: getattr(film, name)[part].mean() for name in ("level", "variance", "histogram")}
+    return {name: float(measures[name]) for name in MEASURES}
 
 
-def motion(true: np.ndarray, seen: np.ndarray, there: np.ndarray, prefix: str) -> dict[str, float]:
-    """How the motion of tools [n, M, 2] that is seen follows what the commands do in the true simulator, from frame to
-    frame where a tool is in view. Pearson's correlations: `follows`, of displacements across and down, their mean;
-    `moves`, of how far they go alone; `steers`, of displacements along and aside of the one before, their mean. The
-    last two do not mind that a robot is turned otherwise than in truth, as one whose commands are velocities in its own
-    frame will be after the first error; `steers` minds where it goes from there."""
-    both = there[1:] & there[:-1]
+def motion(true: np.ndarray, seen: np.ndarray, visible: np.ndarray, prefix: str) -> dict[str, float]:
+    """Pearson's correlations of detected displacements of tools [n, M, 2] with the true ones, from frame to frame where
+    a tool is in view: `follows`, mean over image axes; `moves`, of their lengths; `steers`, mean over the components
+    along and across the previous displacement. The last two do not depend on the robot's heading, which differs from
+    the true one after the first error if commands are velocities in the robot's own frame."""
+    both = visible[1:] & visible[:-1]
     true_moves, seen_moves = np.diff(true, axis=0), np.diff(seen, axis=0)
     pairs = {"follows": [(true_moves[both][:, a], seen_moves[both][:, a]) for a in (0, 1)]}
     pairs["moves"] = [(np.linalg.norm(true_moves[both], axis=-1), np.linalg.norm(seen_moves[both], axis=-1))]
-    turns = both[1:] & both[:-1] & (np.linalg.norm(true_moves[:-1], axis=-1) >= STEP)
-    true_turned, seen_turned = _from_the_one_before(true_moves)[turns], _from_the_one_before(seen_moves)[turns]
+    turns = both[1:] & both[:-1] & (np.linalg.norm(true_moves[:-1], axis=-1) >= MIN_STEP)
+    true_turned, seen_turned = _relative_to_previous(true_moves)[turns], _relative_to_previous(seen_moves)[turns]
     pairs["steers"] = [(true_turned.real, seen_turned.real), (true_turned.imag, seen_turned.imag)]
     return {prefix + name: float(np.mean([_correlation(*pair) for pair in some])) for name, some in pairs.items()}
 
 
-def _from_the_one_before(displacements: np.ndarray) -> np.ndarray:
-    """Complex [n - 1, M]: displacements [n, M, 2] along and aside of the direction of the one before, 0 without any."""
+def _relative_to_previous(displacements: np.ndarray) -> np.ndarray:
+    """Complex [n - 1, M]: displacements [n, M, 2] along (real) and across (imaginary) the previous one; 0 after
+    none."""
     z = displacements[..., 0] + 1j * displacements[..., 1]
     length = np.abs(z[:-1])
     return z[1:] * z[:-1].conj() / np.where(length > 0, length, 1.0)
@@ -76,9 +76,9 @@ def _from_the_one_before(displacements: np.ndarray) -> np.ndarray:
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Pearson's correlation of true and seen motion, in pixels; nan where the true tool rests, 0 where the seen one
     does."""
-    if len(a) < 3 or a.std() < STILL:
+    if len(a) < 3 or a.std() < MIN_MOTION:
         return float("nan")
-    return float(np.corrcoef(a, b)[0, 1]) if b.std() >= STILL else 0.0
+    return float(np.corrcoef(a, b)[0, 1]) if b.std() >= MIN_MOTION else 0.0
 
 
 def rows_of(

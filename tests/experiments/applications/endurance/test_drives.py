@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
-from experiments.applications.endurance.drives import HOLD, make_drive
+from experiments.applications.endurance.drives import HOLD_SECONDS, make_drive
 from experiments.applications.scenes import point_names, points_of
 
 ROBOT = suite_robot("gripper_wood", (-0.3, -0.3, -1.5, 0.0), (0.3, 0.3, 1.5, 1.0), (0.0,) * 4, 1)
@@ -29,7 +29,7 @@ def test_the_true_simulator_shows_the_same_frames(start, kind):
 
 def test_actions_unlike_the_data(start):
     extremes = make_drive(ROBOT, start, 80, "extremes", seed=0).actions
-    hold = round(HOLD * ROBOT.hz)
+    hold = round(HOLD_SECONDS * ROBOT.hz)
     assert (extremes[:hold, 0] == np.float32(0.3)).all() and (extremes[hold : 2 * hold, 0] == np.float32(-0.3)).all()
     assert set(np.flatnonzero((extremes != np.float32(ROBOT.rest)).any(0))) == {0, 1, 2, 3}
     jumps = np.diff(make_drive(ROBOT, start, 6, "alternation", seed=0).actions, axis=0)

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.applications.endurance.__main__ import main, show, true_starts_of
-from experiments.applications.endurance.films import Film, colours_of, load_films, save_films
-from experiments.applications.endurance.hidden import LEAST, find_events
+from experiments.applications.endurance.__main__ import main, print_rows, true_starts_of
+from experiments.applications.endurance.films import Film, colour_histogram, load_films, save_films
+from experiments.applications.endurance.hidden import MIN_HIDDEN, find_events
 from experiments.applications.endurance.tables import MEASURES, measure, motion, over_robots, read_rows, rows_of
 from experiments.applications.tables import write_rows
 from hma_jax.config import ConfigError
@@ -114,20 +114,20 @@ def test_starts_that_there_are_not_are_missed_before_anything_is_filmed():
 def test_a_measure_that_no_robot_has_is_not_a_number_of_none(recwarn, capsys):
     row = {"variant": "v", "drive": "d", "robot": "a", "start": 0, "part": 1} | dict.fromkeys(MEASURES, 0.5)
     assert over_robots([row | {"steers": float("nan")}], "steers")[2] == 0
-    show([row | {"steers": float("nan")}])
+    print_rows([row | {"steers": float("nan")}])
     assert "steers –" in capsys.readouterr().out and not recwarn
 
 
 def test_histograms_are_of_colours():
     red, blue = (np.broadcast_to(np.uint8(c), (2, 4, 4, 3)) for c in ([255, 0, 0], [0, 0, 255]))
-    assert colours_of(red).sum() == 1 and 0.5 * np.abs(colours_of(red) - colours_of(blue)).sum() == 1
+    assert colour_histogram(red).sum() == 1 and 0.5 * np.abs(colour_histogram(red) - colour_histogram(blue)).sum() == 1
 
 
 def test_events_are_of_what_vanishes_and_comes_back():
     share = np.ones((4, 20, 2), np.float32)
     share[0, 6:11, 1] = 0.0  # gone for five frames
     share[1, 6:, 1] = 0.0  # never back
-    share[2, 6 : 6 + LEAST - 1, 1] = 0.0  # too short
+    share[2, 6 : 6 + MIN_HIDDEN - 1, 1] = 0.0  # too short
     events = find_events(share, np.array([20, 20, 20, 20]), 1, np.random.default_rng(0))
     hidden = [e for e in events if e.kind == "hidden"]
     assert [(e.episode, e.start, e.gone, e.lag) for e in hidden] == [(0, 5, 5, 6)]

@@ -298,4 +298,4 @@ def test_simulators_that_share_a_judge_do_not_disturb_each_other():
     judge.begin(evaluated.show(0), [0])
     assert judge(trained)[1].tolist() == [True, False]
     del evaluated
-    assert len(judge._begun) == 1, "what is kept of a simulator goes with it"
+    assert len(judge._states) == 1, "what is kept of a simulator goes with it"
