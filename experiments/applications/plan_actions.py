@@ -40,13 +40,13 @@ from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
-from experiments.applications.planning.goals import to_picture
+from experiments.applications.planning.goals import goal_image_cost
 from experiments.applications.planning.models import CONTEXT, LearnedModel, Model, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
 from experiments.applications.planning.search import SearchConfig
 from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.cloning import BcConfig, clone
-from experiments.applications.policies.closed_loop import gap, run_policy, start_seeds
+from experiments.applications.policies.closed_loop import goal_distance, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import record
 from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.policy import Policy, RandomPolicy
@@ -109,8 +109,8 @@ class Settings:
         return start_seeds(self.make_task(), self.skip + self.starts)[self.skip :]
 
 
-def goal_picture(task: Task, seed: int, size: int) -> np.ndarray:
-    """uint8 [H, W, 3]: what is seen where an expert without imprecision ends, from this start on."""
+def goal_image(task: Task, seed: int, size: int) -> np.ndarray:
+    """uint8 [H, W, 3]: the frame in which an expert without noise ends, from this start."""
     spec = noisy(task, 0.0)
     world, seen = World(spec, [seed]), Environment(spec)
     expert = make_expert(world, 0)
@@ -122,35 +122,37 @@ def goal_picture(task: Task, seed: int, size: int) -> np.ndarray:
 
 def run_planner(search: Search, model: Model, robot: Robot, settings: Settings, seed: int, size: int) -> dict:
     """One episode, until it is decided: {success, distance then, seconds of a plan}."""
-    task, seen = settings.make_task(), Environment(settings.make_task().spec)
-    seen.reset(seed)
-    cost = to_picture(goal_picture(task, seed, size))
+    task, environment = settings.make_task(), Environment(settings.make_task().spec)
+    environment.reset(seed)
+    cost = goal_image_cost(goal_image(task, seed, size))
     planner = Planner(search, settings.search, model, robot, cost, seed % 2**32)
-    images, actions, reached, seconds = [fit_image(seen.render(), size)], [], [seen.success()], []
-    left: list[np.ndarray] = []
+    images, actions, reached, seconds = [fit_image(environment.render(), size)], [], [environment.success()], []
+    remaining: list[np.ndarray] = []
     while not decided(reached, task):
-        if not left:
+        if not remaining:
             began = time.perf_counter()
-            model.begin(images[-CONTEXT:], actions[len(actions) + 1 - min(len(images), CONTEXT) :], seen.get_state())
-            left = list(planner.plan(settings.execute))
+            model.observe(
+                images[-CONTEXT:], actions[len(actions) + 1 - min(len(images), CONTEXT) :], environment.get_state()
+            )
+            remaining = list(planner.plan(settings.execute))
             seconds.append(time.perf_counter() - began)
-        actions.append(left.pop(0))
+        actions.append(remaining.pop(0))
         for _ in range(robot.stride):
-            seen.step(actions[-1])
-        images.append(fit_image(seen.render(), size))
-        reached.append(seen.success())
+            environment.step(actions[-1])
+        images.append(fit_image(environment.render(), size))
+        reached.append(environment.success())
     success = bool(held(np.array([reached]), task.hold).any())
-    return {"success": success, "distance": distance_of(task.spec, seen), "seconds": float(np.median(seconds))}
+    return {"success": success, "distance": distance_of(task.spec, environment), "seconds": float(np.median(seconds))}
 
 
 def decided(reached: Sequence[bool], task: Task) -> bool:
-    """Whether the goal was held long enough, or there is no time left for that."""
+    """Whether the goal was held long enough, or too few frames are left to hold it."""
     run = next((i for i, done in enumerate(reversed(reached)) if not done), len(reached))
     return run >= task.hold or task.frames - len(reached) < task.hold - run
 
 
 def distance_of(spec: EmbodimentSpec, seen: Environment) -> float:
-    return float(gap(world_of(spec, [seen.get_state()]))[0])
+    return float(goal_distance(world_of(spec, [seen.get_state()]))[0])
 
 
 def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report: Report) -> list[dict]:
@@ -168,8 +170,8 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     ]
 
 
-def kept(out: Path, way: str, starts: int) -> list[Path]:
-    """Where outcomes are kept: one file for a start where somebody plans, otherwise one for all."""
+def outcome_paths(out: Path, way: str, starts: int) -> list[Path]:
+    """The files of the outcomes: of a planner one for each start, otherwise one for all."""
     name = out / "trials" / way.replace(" ", "_")
     return [Path(f"{name}-{k}.json") for k in range(starts)] if way in PLANNERS else [Path(f"{name}.json")]
 
@@ -261,7 +263,7 @@ def main() -> None:
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
     pin_settings(out, run, simulator, asdict(settings))
     (out / "trials").mkdir(exist_ok=True)
-    places = {way: kept(out, way, settings.starts) for way in WAYS}
+    places = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
     wanted = [way for way in WAYS if way in wanted or all(path.exists() for path in places[way])]  # tables are of all
     trials: dict[str, list[dict]] = {}
     for way in (name for name in (*CLONED, RANDOM) if name in wanted):

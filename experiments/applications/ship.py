@@ -58,7 +58,7 @@ FRAMES = 24
 """Frames after the start that are compared."""
 
 TIMED = 60
-"""Frames by which frames per second are measured."""
+"""Frames over which frames per second are measured."""
 
 ZOOM, COLOURS = 2, 128  # of the clip
 
@@ -101,22 +101,22 @@ def ship(
 
 
 def to_half_precision(params: Params) -> Params:
-    """In float16, half of the bytes; what reads them makes them float32 again. Raises ConfigError for a weight that is
-    too large for it."""
+    """The parameters in float16, which `load_model` reads as float32. Raises ConfigError for a weight that is too large
+    for it."""
     half = jax.tree.map(lambda x: np.asarray(x, np.float16), params)
     require(all(np.isfinite(x).all() for x in jax.tree.leaves(half)), "a weight is too large for half precision")
     return half
 
 
 def strip_machine_paths(checkpoint: Path) -> None:
-    """Orbax marks what it finished by files that name the directory on this machine; the marks alone are shipped."""
+    """Removes paths of this machine from the marker files by which orbax marks a finished checkpoint."""
     for mark in checkpoint.rglob("commit_success.txt"):
         write_file(mark, "finished\n")
     write_list(checkpoint)
 
 
 class Rollouts(NamedTuple):
-    """Frames under held-out actions, uint8 [1 + FRAMES, EPISODES, H, W, 3]: the first ones, and one after each
+    """Rollouts under held-out actions, uint8 [1 + FRAMES, EPISODES, H, W, 3]: the first frames, and one after each
     chunk."""
 
     true: np.ndarray
@@ -134,7 +134,7 @@ def roll_out(simulator: Simulator, robot: Robot) -> Rollouts:
 
 
 def make_report(run: Path, simulator: Simulator, rollouts: Mapping[str, Rollouts]) -> dict[str, Any]:
-    """What report.json says."""
+    """The content of report.json."""
     return {
         "step": simulator.model.step,
         "parameters": simulator.model.declared.count(),

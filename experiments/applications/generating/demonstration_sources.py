@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.applications.generating.source import confined
 from experiments.applications.generating.trajectories import Trajectories, Trajectory, describe
-from experiments.applications.policies.closed_loop import MOST_TRIED, away_at_start, run_policy, start_seeds
+from experiments.applications.policies.closed_loop import MOST_TRIED, run_policy, start_distances, start_seeds
 from experiments.applications.policies.demonstrations import Demonstrations, record
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, find_task
@@ -103,7 +103,7 @@ class ScriptedSource:
         count = MOST_TRIED * settings.trajectories
         how = {"noise": settings.noise, "only_successes": True, "stride": self.robot.stride, "image_size": self._size}
         made = record(task, count, seed=seed, **how)
-        far = np.flatnonzero(away_at_start(task, made.seeds) >= settings.least)[: settings.trajectories]
+        far = np.flatnonzero(start_distances(task, made.seeds) >= settings.least)[: settings.trajectories]
         enough = len(far) == settings.trajectories
         require(enough, f"{task.robot}: hardly an episode begins {settings.least:g} from its goal")
         return made.take(far)

@@ -5,19 +5,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.applications.planning.search import Best, Found, Score, SearchConfig, draw
+from experiments.applications.planning.search import BestPlan, Score, SearchConfig, SearchResult, draw
 
 
-def plan_cem(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> Found:
+def plan_cem(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> SearchResult:
     """The cheapest sequence seen, from `mean` [K, A] on. The best of a batch is among the candidates of the next."""
-    std, best = np.full(mean.shape, config.spread), Best()
+    std, best = np.full(mean.shape, config.spread), BestPlan()
     for i in range(config.iterations):
         candidates = draw(rng, mean, std, config.candidates)
         if i:
             candidates[-1] = best.plan
         costs = score(candidates)
-        best.see(candidates, costs)
+        best.update(candidates, costs)
         elites = candidates[np.argsort(costs, kind="stable")[: config.elites]]
         mean = config.momentum * mean + (1 - config.momentum) * elites.mean(0)
         std = np.maximum(config.momentum * std + (1 - config.momentum) * elites.std(0), config.least)
-    return best.found()
+    return best.result()

@@ -1,4 +1,4 @@
-"""What a picture is worth: how near it is to a picture of the goal."""
+"""The cost of a rollout: how far its frames are from an image of the goal."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from collections.abc import Callable
 import numpy as np
 
 Cost = Callable[[np.ndarray], np.ndarray]
-"""What each of B futures costs, float [B], by its frames uint8 [B, F, H, W, C]: less is better. The judgement of a
-success head is another such function."""
+"""The cost of each of B rollouts, float [B], by its frames uint8 [B, F, H, W, C]: less is better. The probabilities of
+a success head make another such function."""
 
 CELLS = 16
-"""Cells along a side that a picture is averaged to before it is compared: speckle does not count, places do."""
+"""Cells along a side to which an image is averaged before it is compared, so that positions count and noise does
+not."""
 
 
-def coarse(images: np.ndarray) -> np.ndarray:
+def block_means(images: np.ndarray) -> np.ndarray:
     """float32 [..., rows, columns, C] in [0, 1]: means over equal parts of uint8 [..., H, W, C], CELLS along each
     side or as many of them as divide it."""
     *lead, height, width, channels = images.shape
@@ -25,11 +26,11 @@ def coarse(images: np.ndarray) -> np.ndarray:
 
 
 def distance(images: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """float [...]: mean squared difference of coarse pictures uint8 [..., H, W, C] from one goal."""
-    return ((coarse(images) - coarse(goal)) ** 2).mean((-3, -2, -1))
+    """float [...]: mean squared difference of `block_means` of images uint8 [..., H, W, C] from those of the goal."""
+    return ((block_means(images) - block_means(goal)) ** 2).mean((-3, -2, -1))
 
 
-def to_picture(goal: np.ndarray) -> Cost:
-    """The mean distance from a picture uint8 [H, W, C] over the second half of the horizon: being there early counts,
-    and staying."""
+def goal_image_cost(goal: np.ndarray) -> Cost:
+    """The mean distance from an image uint8 [H, W, C] over the second half of the horizon, which rewards to arrive
+    early and to stay."""
     return lambda frames: distance(frames[:, frames.shape[1] // 2 :], goal).mean(1)

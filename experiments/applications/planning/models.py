@@ -1,4 +1,4 @@
-"""What would be seen under many sequences of actions at once: in the learned simulator, or in the true one."""
+"""Rollouts under many sequences of actions at once, in the learned simulator or in the true one."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 CONTEXT = START_FRAMES
-"""Frames that a plan begins with."""
+"""Frames that a rollout is conditioned on."""
 
 
 class Model(Protocol):
-    """Where a planner looks ahead."""
+    """A dynamics model that a planner can roll out."""
 
-    def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:
-        """The present, after frames uint8 [H, W, 3] and the actions between them, [A] or whole chunks. A model takes of
-        all this what a robot could know, or, the true one, the `state` itself."""
+    def observe(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:
+        """Sets the state to roll out from: after frames uint8 [H, W, 3] with the actions between them, [A] or whole
+        chunks. A learned model uses these, the true one the `state`."""
         ...
 
     def imagine(self, actions: np.ndarray) -> np.ndarray:
         """uint8 [B, F, H, W, 3]: the frames that follow under actions [B, F, A], each held for a frame, in raw units.
-        May be asked again from the same present."""
+        May be called again, from the same observed state."""
         ...
 
 
 class LearnedModel:
     """A simulator of B episodes, all of them copies of one that has seen the last `CONTEXT` frames.
 
-    Candidates share their seed: what differs between them, their actions have done. So do plans that see as many
-    frames: what a planner does depends on what it sees alone.
+    All candidates use the same seed (common random numbers), so that they differ by their actions alone. The seed
+    depends on the number of frames alone, so that a plan is a function of what was observed.
     """
 
     def __init__(self, simulator: Simulator, robot: Robot):
         self._simulator, self._robot = simulator, robot
         self._present = None
 
-    def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State | None) -> None:
+    def observe(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State | None) -> None:
         del state
         seen = np.stack(images[-CONTEXT:])
         chunks = [self._robot.chunk(action) for action in actions[len(actions) + 1 - len(seen) :]]
@@ -60,13 +60,13 @@ class LearnedModel:
 
 
 class TrueModel:
-    """The robot itself, which no planner outside of a simulator has: the ceiling of what a model can give."""
+    """The true dynamics, which no planner has outside of a simulator: an upper bound for learned models."""
 
     def __init__(self, spec: EmbodimentSpec, robot: Robot, image_size: int):
         self._spec, self._robot, self._size = spec, robot, image_size
         self._state: State | None = None
 
-    def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:
+    def observe(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:
         del images, actions
         self._state = state
 

@@ -10,7 +10,7 @@ import numpy as np
 from hma_jax.config import require
 
 Score = Callable[[np.ndarray], np.ndarray]
-"""What sequences [B, K, A] would cost, float [B]: one batch of the model, always of the same size. Less is better."""
+"""The cost of sequences [B, K, A], float [B], by one batch of the model, always of the same size. Less is better."""
 
 
 @dataclass(frozen=True)
@@ -45,22 +45,22 @@ class SearchConfig:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The end of a search."""
+class SearchResult:
+    """The plan that a search returns."""
 
     plan: np.ndarray  # [K, A]
-    cost: float  # that the model said of it
-    costs: np.ndarray  # [iterations]: the least of each batch
+    cost: float  # by the model
+    costs: np.ndarray  # [iterations]: the lowest of each batch
 
 
-class Best:
+class BestPlan:
     """The cheapest sequence so far."""
 
     def __init__(self) -> None:
         self.plan, self.cost = np.zeros(0), np.inf
         self.costs: list[float] = []
 
-    def see(self, candidates: np.ndarray, costs: np.ndarray) -> None:
+    def update(self, candidates: np.ndarray, costs: np.ndarray) -> None:
         """Raises ConfigError for costs that are not finite."""
         require(bool(np.isfinite(costs).all()), "the score of a candidate is not finite")
         i = int(costs.argmin())
@@ -68,8 +68,8 @@ class Best:
         if costs[i] < self.cost:
             self.plan, self.cost = candidates[i].copy(), float(costs[i])
 
-    def found(self) -> Found:
-        return Found(self.plan, self.cost, np.array(self.costs))
+    def result(self) -> SearchResult:
+        return SearchResult(self.plan, self.cost, np.array(self.costs))
 
 
 def draw(rng: np.random.Generator, mean: np.ndarray, std: np.ndarray, count: int) -> np.ndarray:
@@ -79,14 +79,14 @@ def draw(rng: np.random.Generator, mean: np.ndarray, std: np.ndarray, count: int
     return np.clip(drawn, -1.0, 1.0)
 
 
-def shifted(plan: np.ndarray, config: SearchConfig, frames: int) -> np.ndarray:
-    """The mean to begin the next search with, after the first `frames` of `plan` [K, A] were carried out: what is left
-    of it, then its last action."""
+def warm_start(plan: np.ndarray, config: SearchConfig, frames: int) -> np.ndarray:
+    """The warm start of the next search after the first `frames` of `plan` [K, A] were executed: the rest of it, then
+    its last action repeated."""
     each = np.repeat(plan, config.hold, axis=0)
     rest = np.concatenate([each[frames:], np.repeat(each[-1:], frames, 0)])[: config.frames]
     return rest[:: config.hold]
 
 
-def over_frames(plans: np.ndarray, config: SearchConfig) -> np.ndarray:
+def repeat_knots(plans: np.ndarray, config: SearchConfig) -> np.ndarray:
     """[..., K, A] to an action for each frame, [..., K hold, A]."""
     return np.repeat(plans, config.hold, axis=-2)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.applications.planning.search import Best, Found, Score, SearchConfig
+from experiments.applications.planning.search import BestPlan, Score, SearchConfig, SearchResult
 
 
-def plan_shooting(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> Found:
+def plan_shooting(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> SearchResult:
     """The cheapest of `iterations` x B sequences that are uniform over the range. `mean` gives their shape alone."""
-    best = Best()
+    best = BestPlan()
     for candidates in rng.uniform(-1.0, 1.0, (config.iterations, config.candidates, *mean.shape)):
-        best.see(candidates, score(candidates))
-    return best.found()
+        best.update(candidates, score(candidates))
+    return best.result()

@@ -33,14 +33,14 @@ def start_seeds(task: Task, count: int, least: float = 0.0) -> np.ndarray:
     """int64 [count]: of starts that no recording has, at least so far from the goal. More of them begin with the same
     ones. Raises ConfigError where there are hardly any."""
     seeds = episode_seeds(task.spec, MOST_TRIED * count, 0, SPLIT)
-    far = seeds[away_at_start(task, seeds) >= least][:count]
+    far = seeds[start_distances(task, seeds) >= least][:count]
     require(len(far) == count, f"{task.robot}: hardly a start is {least:g} away from its goal")
     return far
 
 
-def away_at_start(task: Task, seeds: np.ndarray) -> np.ndarray:
-    """float [n]: how far from the goal the episodes with these seeds begin."""
-    return gap(World(task.spec, seeds))
+def start_distances(task: Task, seeds: np.ndarray) -> np.ndarray:
+    """float [n]: the distance from the goal at which the episodes with these seeds begin."""
+    return goal_distance(World(task.spec, seeds))
 
 
 def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, stride: int = 1) -> Outcome:
@@ -57,12 +57,12 @@ def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, s
         actions = policy.act(fit_images(images, image_size)).astype(np.float64)
         for _ in range(stride):
             world.step(actions)
-    return Outcome(held(np.stack(reached, 1), task.hold).any(1), gap(world))
+    return Outcome(held(np.stack(reached, 1), task.hold).any(1), goal_distance(world))
 
 
-def gap(world: World) -> np.ndarray:
-    """float [n]: how far from the goal, of a robot's own task how far the farthest tool is from its mark."""
+def goal_distance(world: World) -> np.ndarray:
+    """float [n]: the distance from the goal; of a robot's own task, that of the farthest tool from its mark."""
     task = world.spec.task
     if isinstance(task, ReachMark):
-        return task.away(world)
+        return task.distance(world)
     return np.linalg.norm(world.tools - world.goals, axis=-1).max(1)

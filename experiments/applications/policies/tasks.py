@@ -37,9 +37,9 @@ class ReachMark(Reach):
     within: float = RADIUS
 
     def done(self, scene: Scene) -> np.ndarray:
-        return self.away(scene) < self.within
+        return self.distance(scene) < self.within
 
-    def away(self, scene: Scene) -> np.ndarray:
+    def distance(self, scene: Scene) -> np.ndarray:
         """float [n]: how far the farthest tool is from its mark."""
         return np.linalg.norm(scene.tools - scene.goals, axis=-1).max(1)
 
@@ -56,7 +56,7 @@ class HoverPuck(ReachMark):
         target[:, 0] += move * np.minimum(self.step / np.maximum(np.linalg.norm(move, axis=-1), 1e-9), 1.0)[:, None]
         return target, np.ones(target.shape[:2])
 
-    def away(self, scene: Scene) -> np.ndarray:
+    def distance(self, scene: Scene) -> np.ndarray:
         """float [n]: how far the tool is from the nearest puck."""
         return np.linalg.norm(self._move(scene), axis=-1)
 

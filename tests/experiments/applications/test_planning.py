@@ -13,11 +13,11 @@ from data_pipelines.suite.environment import Environment
 from experiments.applications import plan_actions
 from experiments.applications.plan_actions import draw, summarise
 from experiments.applications.planning.cem import plan_cem
-from experiments.applications.planning.control import Planner, Units
-from experiments.applications.planning.goals import to_picture
+from experiments.applications.planning.control import ActionRange, Planner
+from experiments.applications.planning.goals import goal_image_cost
 from experiments.applications.planning.models import LearnedModel, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
-from experiments.applications.planning.search import SearchConfig, over_frames, shifted
+from experiments.applications.planning.search import SearchConfig, repeat_knots, warm_start
 from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.tasks import find_task
 from hma_jax.config import ConfigError
@@ -58,15 +58,15 @@ def test_a_cost_that_is_not_finite_is_no_plan():
 
 def test_the_next_search_begins_with_what_is_left_of_the_plan():
     plan = np.array([[1.0], [2.0], [3.0]])
-    np.testing.assert_array_equal(shifted(plan, CONFIG, 2), [[2.0], [3.0], [3.0]])
-    np.testing.assert_array_equal(shifted(plan, CONFIG, 6), [[3.0], [3.0], [3.0]])
-    np.testing.assert_array_equal(over_frames(plan, CONFIG)[:, 0], [1, 1, 2, 2, 3, 3])
+    np.testing.assert_array_equal(warm_start(plan, CONFIG, 2), [[2.0], [3.0], [3.0]])
+    np.testing.assert_array_equal(warm_start(plan, CONFIG, 6), [[3.0], [3.0], [3.0]])
+    np.testing.assert_array_equal(repeat_knots(plan, CONFIG)[:, 0], [1, 1, 2, 2, 3, 3])
 
 
 def test_units_span_the_recorded_range():
-    units = Units.of(Robot("r", 1, (0.0, -3.0), (4.0, 1.0), (0.0, 0.0)))
-    np.testing.assert_allclose(units.raw(np.array([[-1.0, -1.0], [1.0, 1.0]])), [[0.0, -3.0], [4.0, 1.0]])
-    np.testing.assert_allclose(units.raw(units.rest), [0.0, 0.0])
+    units = ActionRange.of(Robot("r", 1, (0.0, -3.0), (4.0, 1.0), (0.0, 0.0)))
+    np.testing.assert_allclose(units.denormalise(np.array([[-1.0, -1.0], [1.0, 1.0]])), [[0.0, -3.0], [4.0, 1.0]])
+    np.testing.assert_allclose(units.denormalise(units.rest), [0.0, 0.0])
 
 
 def test_the_true_model_sees_what_the_robot_would():
@@ -76,7 +76,7 @@ def test_the_true_model_sees_what_the_robot_would():
     model = TrueModel(task.spec, robot, 64)
     seen.reset(5)
     began = seen.get_state()
-    model.begin([], [], began)
+    model.observe([], [], began)
     imagined = model.imagine(actions)
     for b in range(2):
         seen.set_state(began)
@@ -96,10 +96,10 @@ def test_a_planner_in_the_true_simulator_goes_where_the_picture_says():
     goal, there = seen.render(), seen.positions()[0]
     seen.set_state(began)
     model = TrueModel(task.spec, robot, 64)
-    planner = Planner(plan_cem, SearchConfig(), model, robot, to_picture(goal), seed=1)
+    planner = Planner(plan_cem, SearchConfig(), model, robot, goal_image_cost(goal), seed=1)
     away = np.linalg.norm(seen.positions()[0] - there)
     for _ in range(4):
-        model.begin([], [], seen.get_state())
+        model.observe([], [], seen.get_state())
         for action in planner.plan(2):
             seen.step(action)
     assert np.linalg.norm(seen.positions()[0] - there) < 0.2 * away
@@ -112,12 +112,12 @@ def test_the_learned_model_imagines_again_from_the_same_present():
     given = list(rng.uniform(robot.low, robot.high, (4, robot.action_dim)).astype(np.float32))
     first, other = rng.uniform(robot.low, robot.high, (2, 2, 3, robot.action_dim)).astype(np.float32)
     first[1] = first[0]
-    model.begin(images, given, None)
+    model.observe(images, given, None)
     imagined = model.imagine(first)
     np.testing.assert_array_equal(imagined[0], imagined[1])  # candidates share their seed
     assert (model.imagine(other) != imagined).any()
     np.testing.assert_array_equal(model.imagine(first), imagined)
-    assert (to_picture(imagined[0, -1])(imagined) < to_picture(255 - imagined[0, -1])(imagined)).all()
+    assert (goal_image_cost(imagined[0, -1])(imagined) < goal_image_cost(255 - imagined[0, -1])(imagined)).all()
 
 
 @pytest.mark.slow
