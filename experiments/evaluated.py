@@ -13,20 +13,20 @@ from hma_jax.config import ConfigError, EvalConfig
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from experiments.running.run_trial import Materials
+    from experiments.running.run_trial import PreparedData
     from hma_jax.training.runs import Run
 
 STAMP = "evaluation.made_from.json"
 
 
-def describe_evaluation(trained: Run, names: Sequence[str], materials: Materials, config: EvalConfig) -> MadeFrom:
+def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedData, config: EvalConfig) -> MadeFrom:
     """The stamp of an evaluation on the windows of the datasets `names`. The step is recorded only: of a run that
     trains on, later results replace earlier ones. So is the seed, for whoever compares; it names the model as well."""
     train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
-    chosen = {d.dataset: d.windows for d in materials.manifest.datasets}
+    chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {
         name: {
-            "tokens": materials.store.hash((name,)),
+            "tokens": prepared.store.hash((name,)),
             "windows": len(chosen[name]),
             "chosen": stable_hash(chosen[name]),
         }
@@ -35,9 +35,9 @@ def describe_evaluation(trained: Run, names: Sequence[str], materials: Materials
     inputs = {
         "model": stable_hash({"model": trained.model, "train": train, "provenance": trained.provenance}),
         "weights": trained.weights,
-        "tokenizer": materials.tokenizer.identity,
-        "frames": materials.manifest.frames,
-        "rate": materials.manifest.rate,
+        "tokenizer": prepared.tokenizer.identity,
+        "frames": prepared.manifest.frames,
+        "rate": prepared.manifest.rate,
         "eval": _protocol(to_dict(config)),
         "datasets": sorted(names),
         "data": data,

@@ -13,7 +13,7 @@ from experiments.report.draw import draw
 from experiments.running.attempts import RESULT, State, read_states
 from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
 from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
@@ -39,7 +39,7 @@ def run_study(
     axes: Sequence[str],
     *,
     again: str,
-    launcher: Launching,
+    launcher_options: LauncherOptions,
     retry_failed: bool,
     accept_code: bool,
     replace: Step | None,
@@ -60,9 +60,9 @@ def run_study(
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
-    require_trainable(study, sweeps, launcher)
+    require_trainable(study, sweeps, launcher_options)
     # Without the place every trial would fail, once all is prepared.
-    with launcher.launcher(workspace.root) as place, workspace.locked():
+    with launcher_options.launcher(workspace.root) as launcher, workspace.locked():
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
         provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
@@ -83,7 +83,7 @@ def run_study(
         former = find_trained(workspace.trials, trials, provenance, None if accept_code else sources)
         jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common, former)
         say_trained(jobs, former, workspace)
-        states = run_jobs(jobs, workspace, place, retry_failed)
+        states = run_jobs(jobs, workspace, launcher, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
 

@@ -7,17 +7,17 @@ from collections.abc import Sequence
 
 from experiments.cost import declared_table
 from experiments.done import UNKNOWN
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from experiments.words import few
 from hma_jax.config import MeshConfig, TrainConfig, require
 
 
-def require_trainable(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
+def require_trainable(study: Study, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> None:
     """Raises ConfigError for a trial that would fail once all is prepared (`check_trials`)."""
-    share = launching.share()
-    if share is None and launching.name == "local":  # no accelerator was found: they have what JAX finds here
+    share = launcher_options.share()
+    if share is None and launcher_options.name == "local":  # no accelerator was found: they have what JAX finds here
         import jax
 
         share = float(jax.device_count())

@@ -15,7 +15,7 @@ from data_pipelines.sampling.splits import count_held_out
 from data_pipelines.tokens.manifest import JobSettings
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches, spread
-from experiments.running.run_trial import Materials, open_materials
+from experiments.running.run_trial import PreparedData, open_prepared_data
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
 from experiments.words import few
@@ -31,23 +31,23 @@ AT_LEAST = 8
 """Episodes that `store.min_val` is to hold out, where there are enough."""
 
 
-def open_study(workspace: Workspace) -> Materials:
+def open_study(workspace: Workspace) -> PreparedData:
     """Tokenizer, tokens and windows of a study. Raises ConfigError where they are not there."""
     needed = (workspace.store, workspace.tokenizer, workspace.manifest)
     missing = [str(path) for path in needed if not path.exists()]
     require(not missing, f"{', '.join(missing)}: not made yet; give the --out of the study that has the robots' tokens")
-    return open_materials(workspace)
+    return open_prepared_data(workspace)
 
 
 def choose_robots(
-    run: Path, model: Model, materials: Materials, robots: Sequence[str], windows: int, out: Path
+    run: Path, model: Model, prepared: PreparedData, robots: Sequence[str], windows: int, out: Path
 ) -> tuple[list[str], dict[str, str]]:
     """(robots to be checked, why each of the others has too few episodes) of those that are asked for, () for all of
     the study in `out`, whose tokens are the model's.
 
     Raises ConfigError where the study does not know a robot, or none is left.
     """
-    store, manifest = materials.store, materials.manifest
+    store, manifest = prepared.store, prepared.manifest
     frozen = [d.dataset for d in manifest.datasets]
     there = [r.name for r in find_robots(run, model.table) if r.name in frozen]
     names = list(robots) or there
@@ -66,14 +66,14 @@ def choose_robots(
 def check_run(
     run: Path,
     model: Model,
-    materials: Materials,
+    prepared: PreparedData,
     robots: Sequence[str],
     windows: int,
 ) -> dict[str, list[Effect]]:
     """Effects of each robot's dimensions, on so many held-out windows of each."""
     known = {r.name: r for r in find_robots(run, model.table)}
     loss = jax.jit(make_loss(model.config, model.table, model.run.train.masking.setting, model.execution))
-    return {name: _check(model, loss, materials.store, materials.manifest, known[name], windows) for name in robots}
+    return {name: _check(model, loss, prepared.store, prepared.manifest, known[name], windows) for name in robots}
 
 
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:

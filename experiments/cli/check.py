@@ -46,13 +46,13 @@ def check(
     with step(f"check {run}"):
         model = load_model(run)
         require_frames(model.run, "judge")
-        materials = open_study(workspace)
-        check_fits(model.run, materials)
-        chosen, left_out = choose_robots(run, model, materials, robots, windows, workspace.root)
+        prepared = open_study(workspace)
+        check_fits(model.run, prepared)
+        chosen, left_out = choose_robots(run, model, prepared, robots, windows, workspace.root)
         for why in left_out.values():
             say(f"not checked: {why}")
-        say_what_it_may_have_seen(model.run, chosen, materials.store)
-        found = check_run(run, model, materials, chosen, windows)
+        say_what_it_may_have_seen(model.run, chosen, prepared.store)
+        found = check_run(run, model, prepared, chosen, windows)
     names = {robot.name: robot.dimensions for robot in find_robots(run, model.table)}
     for robot, effects in found.items():
         table = tidy_table(robot, "dimension", "worth", "verdict")

@@ -24,7 +24,7 @@ from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
-    from experiments.running.run_trial import Materials
+    from experiments.running.run_trial import PreparedData
     from hma_jax.evaluation.summary import Summary
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.runs import Run
@@ -81,14 +81,14 @@ def evaluate_model(
 
 
 def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: bool) -> None:
-    from experiments.running.run_trial import evaluate_on, open_materials, write_evaluation
+    from experiments.running.run_trial import evaluate_on, open_prepared_data, write_evaluation
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
 
     require_prepared(setting)
-    materials = open_materials(setting.workspace)
-    check_fits(trained, materials)
-    frozen, untrained = set(materials.manifest.names), _not_trained_on(trained, materials)
+    prepared = open_prepared_data(setting.workspace)
+    check_fits(trained, prepared)
+    frozen, untrained = set(prepared.manifest.names), _not_trained_on(trained, prepared)
     masking = trained.train.masking
     if not masking.predicts_frames:
         console.print(
@@ -109,8 +109,8 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
-    say_what_it_may_have_seen(trained, names, materials.store)
-    made_from = describe_evaluation(trained, names, materials, setting.study.eval)
+    say_what_it_may_have_seen(trained, names, prepared.store)
+    made_from = describe_evaluation(trained, names, prepared, setting.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)
     with step(f"evaluate {short(run)}") as update:
@@ -119,7 +119,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             trained.params,
             trained.model,
             trained.table,
-            materials,
+            prepared,
             setting.study.eval,
             masking.setting,
             execution=setting.study.execution,
@@ -149,7 +149,7 @@ def table_of(summary: Summary, title: str) -> TidyTable:
     return table
 
 
-def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
+def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:
     """Datasets that a model was meant to be trained on and that gave it no window."""
     from data_pipelines.loading.selection import LoaderConfig, select_windows
 
@@ -157,9 +157,9 @@ def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
     if loader is None:  # it was converted
         return []
     config = from_dict(LoaderConfig, loader)
-    if not set(config.datasets) <= set(materials.store.names):
+    if not set(config.datasets) <= set(prepared.store.names):
         return []
-    return list(select_windows(materials.store, config).mixture.dropped)
+    return list(select_windows(prepared.store, config).mixture.dropped)
 
 
 def say_what_it_may_have_seen(trained: Run, names: Sequence[str], store: TokenStore) -> None:
@@ -194,15 +194,15 @@ def require_prepared(setting: Setting) -> None:
     require(not missing, f"{', '.join(missing)}: not made yet; run `{setting.command('tokenize')}`")
 
 
-def check_fits(trained: Run, materials: Materials) -> None:
+def check_fits(trained: Run, prepared: PreparedData) -> None:
     """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
-    frames, manifest = trained.model.frames, materials.manifest
+    frames, manifest = trained.model.frames, prepared.manifest
     tokens = windows = data = "; evaluate it with the --out it was trained in"
     if _converted(trained):  # it was trained in none
         tokens = "; prepare a study with --tokenizer and the directory of the one that it was trained with"
         windows = f"; prepare a study with --set model.frames={frames}"
         data = "; prepare a study with --data of one of them"
-    check_tokenizer(trained, materials.tokenizer, tokens)
+    check_tokenizer(trained, prepared.tokenizer, tokens)
     if frames != manifest.frames:
         raise ConfigError(
             f"the model sees windows of {frames} frames, those frozen for evaluation here have "

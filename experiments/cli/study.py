@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import Remake, RemakeOptions, RunningArguments, StudyOptions
 from experiments.progress import console
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.setting import StudyArguments, make_setting
 from experiments.sweeps.registry import AXES, is_file, plan_sweeps
 from hma_jax.config import ConfigError, require
@@ -75,14 +75,14 @@ def _run(
     require(bool(axes), "axes is empty: the study has nothing to run; name some, such as --set axes=width,datasets")
     if running.workers is not None and running.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
-    launching = Launching(running.launcher, running.workers, running.launcher_set)
+    launcher_options = LauncherOptions(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
         from experiments.done import find_done
         from experiments.plan_table import Devices, plan_table
         from experiments.trainable import check_trials
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
-        devices = Devices(check_trials(setting.study, sweeps, launching.share()), launching.at_once)
+        devices = Devices(check_trials(setting.study, sweeps, launcher_options.share()), launcher_options.at_once)
         done = find_done(setting, sweeps, running.retry_failed, running.accept_code)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))
         return
@@ -92,7 +92,7 @@ def _run(
         setting,
         axes,
         again=setting.command(*words, *running.words(), "--retry-failed", *["--accept-code"] * running.accept_code),
-        launcher=launching,
+        launcher_options=launcher_options,
         retry_failed=running.retry_failed,
         accept_code=running.accept_code,
         replace=remake.replace,

@@ -25,7 +25,7 @@ from hma_jax.config.json import diff
 from hma_jax.training.claim import CHECKPOINTS, require_plain
 
 if TYPE_CHECKING:
-    from experiments.running.run_trial import Materials
+    from experiments.running.run_trial import PreparedData
     from experiments.running.trial import Trial
     from hma_jax.training.runs import Run
 
@@ -139,8 +139,8 @@ def adapt_model(
     replace: Step | None = None,
 ) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
-    from experiments.running.newcomers import add_robots
-    from experiments.running.run_trial import open_materials
+    from experiments.running.initial_model import add_robots
+    from experiments.running.run_trial import open_prepared_data
     from experiments.trainable import require_only
     from hma_jax.training.runs import load_run
 
@@ -164,7 +164,7 @@ def adapt_model(
     _require_devices(setting)
     _prepare(setting, replace)
     trial = dataclasses.replace(_single_trial(setting, trajectories), train=train)
-    beginning = add_robots(trained, trial, open_materials(setting.workspace)) | {"origin": origin}
+    beginning = add_robots(trained, trial, open_prepared_data(setting.workspace)) | {"origin": origin}
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
     _train(setting, trial, run, options, **beginning)
@@ -291,12 +291,12 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
     many `processes` as this one."""
     from experiments.done import UNKNOWN, find_prepared, newest_step
     from experiments.plan_table import Devices, plan_table
-    from experiments.running.launchers.registry import Launching
+    from experiments.running.launchers.registry import LauncherOptions
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import Point, Sweep
     from experiments.trainable import check_trials
 
-    mesh, own = setting.study.execution.mesh, Launching().share()
+    mesh, own = setting.study.execution.mesh, LauncherOptions().share()
     share = own * processes if own else float(max(processes, mesh.least))
     model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
     devices = Devices(check_trials(setting.study, [model], share))
@@ -308,16 +308,16 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
 
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
-    from experiments.running.run_trial import open_materials, train_trial
+    from experiments.running.run_trial import open_prepared_data, train_trial
     from hma_jax.runtime.processes import is_writer
 
-    materials = open_materials(setting.workspace)
-    say_data(trial, materials)
+    prepared = open_prepared_data(setting.workspace)
+    say_data(trial, prepared)
     each = counted(trial.train.batch, "window")
     with step(f"train width {trial.model.width} for {counted(trial.train.steps, 'step')} of {each}") as update:
         result = train_trial(
             trial,
-            materials,
+            prepared,
             run,
             execution=setting.study.execution,
             options=options,
@@ -330,14 +330,14 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
     wrote(run, then=setting.command("evaluate", run.absolute()))
 
 
-def say_data(trial: Trial, materials: Materials) -> None:
+def say_data(trial: Trial, prepared: PreparedData) -> None:
     """What a model is trained on. Raises DataError if it is nothing."""
     from data_pipelines.loading.selection import select_windows
     from experiments.running.trial import loader_of
 
-    chosen = select_windows(materials.store, loader_of(trial))
+    chosen = select_windows(prepared.store, loader_of(trial))
     used = [chosen.sets[name] for name in chosen.mixture.names]
-    there = sum(len(materials.store.manifest(name).train.episodes) for name in trial.datasets)
+    there = sum(len(prepared.store.manifest(name).train.episodes) for name in trial.datasets)
     limit = "" if trial.max_trajectories is None else f" (at most {trial.max_trajectories:,} of each robot)"
     console.print(
         f"training on {len(used)} of {counted(len(trial.datasets), 'robot')}: {sum(len(s.episodes) for s in used):,} of "

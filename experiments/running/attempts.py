@@ -47,7 +47,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Ended:
+class AttemptEnd:
     """How the process of an attempt ended. `code` is as of `subprocess`, negative for a signal; None if nobody
     saw its end, and then `why` says how that is known."""
 
@@ -96,7 +96,7 @@ def _read(path: Path) -> dict[str, Any] | None:
         return None
 
 
-def outcome(directory: Path, ended: Ended) -> State:
+def outcome(directory: Path, ended: AttemptEnd) -> State:
     """How an attempt that has ended left its trial."""
     if (directory / RESULT).exists():
         return State(FINISHED)
@@ -137,5 +137,5 @@ def _state(directory: Path, record: dict[str, Any] | None) -> State:
     if record is None or record["event"] == FINISHED:  # its directory was deleted: run it again
         return State(MISSING)
     if record["event"] == RUNNING:  # whoever started it did not see its end
-        return outcome(directory, Ended(None, "its process is gone"))
+        return outcome(directory, AttemptEnd(None, "its process is gone"))
     return State(record["event"], record.get("message", ""))

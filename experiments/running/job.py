@@ -1,10 +1,10 @@
-"""What the process of one trial is told: job.json, as it is written today and as earlier versions wrote it."""
+"""job.json, the description from which a process runs one trial, as written today and by earlier versions."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from experiments.running.former import modernise
+from experiments.running.migration import migrate
 from experiments.running.shared_runs import Shared
 from experiments.running.trial import Trial
 from hma_jax.config import ConfigError, ExecutionConfig
@@ -18,7 +18,7 @@ def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, Shared]:
     Earlier versions counted how a trial is computed to the trial itself. Raises ConfigError for what is no job.
     """
     try:
-        trial, said = modernise(record["trial"])
+        trial, said = migrate(record["trial"])
         execution = record.get("execution") or {"mesh": record["mesh"]}
     except (KeyError, TypeError) as error:
         raise ConfigError(f"job.json: not a job of this project ({error!r}); run its study again") from error

@@ -27,7 +27,7 @@ from hma_jax.runtime.files import write_file
 
 FILE = "provenance.json"
 
-ROOTS = tuple(f"experiments.running.{name}" for name in ("trial_main", "run_trial", "shared_runs", "newcomers"))
+ROOTS = tuple(f"experiments.running.{name}" for name in ("trial_main", "run_trial", "shared_runs", "initial_model"))
 """The modules whose closure is what a trial runs."""
 
 

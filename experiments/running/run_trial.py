@@ -45,7 +45,7 @@ LAST = 0.1
 
 
 @dataclass(frozen=True)
-class Materials:
+class PreparedData:
     """What the pipeline prepared, opened."""
 
     store: TokenStore
@@ -54,14 +54,14 @@ class Materials:
     counterfactual: CounterfactualFrames | None = None  # of robots that are simulated
 
 
-def open_materials(workspace: Workspace) -> Materials:
+def open_prepared_data(workspace: Workspace) -> PreparedData:
     """Raises ConfigError or DataError for what is missing or damaged."""
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.tokenizers.io import load_tokenizer
 
-    return Materials(
+    return PreparedData(
         TokenStore(workspace.store),
         load_tokenizer(workspace.tokenizer),
         EvalManifest.load(workspace.manifest),
@@ -71,7 +71,7 @@ def open_materials(workspace: Workspace) -> Materials:
 
 def train_trial(
     trial: Trial,
-    materials: Materials,
+    prepared: PreparedData,
     run_dir: Path,
     *,
     execution: ExecutionConfig = ExecutionConfig(),
@@ -95,7 +95,7 @@ def train_trial(
     from hma_jax.training.train import train_model
     from hma_jax.training.validation import Validation
 
-    store, loader = materials.store, loader_of(trial)
+    store, loader = prepared.store, loader_of(trial)
     table = table or training_table(store, loader, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
     lost = {"lost": {name: store.manifest(name).skipped_count for name in trial.datasets}}  # damaged episodes, left out
@@ -119,7 +119,7 @@ def train_trial(
         run_dir=run_dir,
         provenance={
             "store": store.hash(trial.datasets),
-            "tokenizer": materials.tokenizer.identity,
+            "tokenizer": prepared.tokenizer.identity,
             "loader": to_dict(loader),
             **lost,
             **({"origin": origin} if origin else {}),
@@ -134,7 +134,7 @@ def train_trial(
             keep_steps=keep,
             skip_damaged=options.skip_damaged,
         ),
-        validation=Validation(validate_every, lambda: validation_batches(trial, materials, table, execution))
+        validation=Validation(validate_every, lambda: validation_batches(trial, prepared, table, execution))
         if validate_every
         else None,
         progress=report,
@@ -142,7 +142,7 @@ def train_trial(
 
 
 def validation_batches(
-    trial: Trial, materials: Materials, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+    trial: Trial, prepared: PreparedData, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
 ) -> Iterator[dict[str, Any]]:
     """Some frozen windows of each evaluated dataset, of as many episodes as can be: one batch as large as in training,
     this process's rows."""
@@ -150,9 +150,9 @@ def validation_batches(
     from hma_jax.runtime.rows import own_rows
 
     batch = trial.train.batch
-    own, some = own_rows(execution.mesh, batch), materials.manifest.thinned(batch)
+    own, some = own_rows(execution.mesh, batch), prepared.manifest.thinned(batch)
     for name in trial.evaluated:  # one without windows has no batch
-        for whole in eval_batches(materials.store, table, some, batch, (name,)):
+        for whole in eval_batches(prepared.store, table, some, batch, (name,)):
             yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
 
 
@@ -161,7 +161,7 @@ def evaluate_on(
     params: Any,
     model: ModelConfig,
     table: EmbodimentTable,
-    materials: Materials,
+    prepared: PreparedData,
     config: EvalConfig,
     setting: Setting = "forward",
     *,
@@ -178,12 +178,12 @@ def evaluate_on(
     from hma_jax.evaluation.evaluate import evaluate
     from hma_jax.evaluation.protocol import predicts_frames
 
-    manifest = materials.manifest
+    manifest = prepared.manifest
     config = config if predicts_frames(setting) else dataclasses.replace(config, other_actions=0)
-    counterfactual = materials.counterfactual if config.context == "generated" and config.other_actions else None
+    counterfactual = prepared.counterfactual if config.context == "generated" and config.other_actions else None
     counterfactual = counterfactual if counterfactual and counterfactual.prompt == config.prompt_frames else None
     batches = eval_batches(
-        materials.store,
+        prepared.store,
         table,
         manifest,
         config.batch,
@@ -198,7 +198,7 @@ def evaluate_on(
         params,
         model,
         table,
-        materials.tokenizer,
+        prepared.tokenizer,
         batches,
         config,
         setting=setting,
@@ -214,7 +214,7 @@ def run_trial(
     *,
     execution: ExecutionConfig = ExecutionConfig(),
     keep: tuple[int, ...] = (),
-    begin: Callable[[Materials], Mapping[str, Any]] | None = None,
+    begin: Callable[[PreparedData], Mapping[str, Any]] | None = None,
     progress: Progress = lambda *_: None,
 ) -> dict[str, Any]:
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
@@ -232,18 +232,18 @@ def run_trial(
     from hma_jax.runtime.processes import is_writer
 
     started = time.perf_counter()
-    materials = open_materials(workspace)
+    prepared = open_prepared_data(workspace)
     if begin is None:
-        beginning = {"table": training_table(materials.store, loader_of(trial), trial.train.action_scale)}
+        beginning = {"table": training_table(prepared.store, loader_of(trial), trial.train.action_scale)}
     else:
-        beginning = begin(materials)
+        beginning = begin(prepared)
     table = beginning["table"]
     declared = declare_model(trial.model, table)
     trained = train_trial(
-        trial, materials, directory / "run", execution=execution, keep=keep, progress=progress, **beginning
+        trial, prepared, directory / "run", execution=execution, keep=keep, progress=progress, **beginning
     )
 
-    subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
+    subject = (trial.model, table, prepared, trial.eval, trial.train.masking.setting)
     evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)
     untrained = None
     if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing

@@ -22,7 +22,7 @@ from experiments.running.attempts import (
     PROGRESS,
     RUN,
     STARTED,
-    Ended,
+    AttemptEnd,
     State,
     is_alive,
     outcome,
@@ -37,7 +37,7 @@ from hma_jax.runtime.files import write_file
 TRIES = 3
 """How often in one command a trial may be lost: what kills it may be its own size."""
 
-LOOK_EVERY = 5.0
+POLL_SECONDS = 5.0
 """Seconds between two checks of trials that an earlier runner started elsewhere."""
 
 
@@ -87,7 +87,7 @@ def run_missing(
     run.waiting = [(job, before[job.id].event) for job in jobs if before[job.id].event in again]
     run.elsewhere = [job for job in jobs if before[job.id].event == RUNNING]
     try:
-        run.to_the_end()
+        run.run_all()
     finally:
         run.stop()
     return read_states([job.id for job in jobs], trials, ledger)
@@ -113,15 +113,15 @@ class _Run:
         self.elsewhere: list[Job] = []
         self.running: list[_Attempt] = []
         self.lost = Counter[str]()
-        self.looked = -LOOK_EVERY
+        self.polled = -POLL_SECONDS
 
-    def to_the_end(self) -> None:
+    def run_all(self) -> None:
         while self.waiting or self.running or self.elsewhere:
             self._launch()
             time.sleep(self.launcher.pause)
             for attempt in list(self.running):
-                self._look_at(attempt)
-            self._look_elsewhere()
+                self._poll(attempt)
+            self._poll_elsewhere()
 
     def stop(self) -> None:
         """Trials that still run save their state; how each ended is recorded."""
@@ -135,24 +135,24 @@ class _Run:
 
     def _launch(self) -> None:
         room = max(self.launcher.at_once - len(self.running), 0)
-        chosen = self._ready()[:room]
+        chosen = self._runnable()[:room]
         if not chosen:
             return
         self.waiting = [entry for entry in self.waiting if entry not in chosen]
-        directories = [self._make_ready(job, state) for job, state in chosen]
+        directories = [self._prepare(job, state) for job, state in chosen]
         now = time.monotonic()
         for (job, state), directory, handle in zip(chosen, directories, self.launcher.launch(directories), strict=True):
             self.running.append(_Attempt(job, directory, handle, now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
-    def _ready(self) -> list[tuple[Job, str]]:
+    def _runnable(self) -> list[tuple[Job, str]]:
         """Those of `waiting` that wait for no other trial."""
         pending = (
             {job.id for job, _ in self.waiting} | {a.job.id for a in self.running} | {j.id for j in self.elsewhere}
         )
         return [(job, state) for job, state in self.waiting if not job.after & pending]
 
-    def _make_ready(self, job: Job, state: str) -> Path:
+    def _prepare(self, job: Job, state: str) -> Path:
         """The directory of a trial that was left in `state`, ready for the next attempt."""
         directory = self.trials / job.id
         directory.mkdir(parents=True, exist_ok=True)
@@ -163,7 +163,7 @@ class _Run:
         write_file(directory / JOB, json.dumps(job.record, indent=1))
         return directory
 
-    def _look_at(self, attempt: _Attempt) -> None:
+    def _poll(self, attempt: _Attempt) -> None:
         ended = self.launcher.ended(attempt.handle)  # first: what is read below was written before
         self._note_start(attempt)
         if ended is not None:
@@ -200,16 +200,16 @@ class _Run:
             self.waiting.insert(0, (job, state.event))
         return again
 
-    def _look_elsewhere(self) -> None:
+    def _poll_elsewhere(self) -> None:
         """What an earlier runner started and left: once its lock is free, it has ended or is ours to try."""
-        if time.monotonic() - self.looked < LOOK_EVERY:
+        if time.monotonic() - self.polled < POLL_SECONDS:
             return
-        self.looked = time.monotonic()
+        self.polled = time.monotonic()
         for job in list(self.elsewhere):
             if is_alive(self.trials / job.id):
                 continue
             self.elsewhere.remove(job)
-            state = outcome(self.trials / job.id, Ended(None, "its process is gone"))
+            state = outcome(self.trials / job.id, AttemptEnd(None, "its process is gone"))
             self.record(job.id, state)
             if state.event == LOST:
                 self.waiting.append((job, LOST))

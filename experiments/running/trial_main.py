@@ -20,7 +20,7 @@ from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, RUN, at
 from experiments.running.children import enter_child
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
 
-LOOK_EVERY = 30.0
+POLL_SECONDS = 30.0
 """Seconds between two checks that the trial is still ours."""
 
 
@@ -47,9 +47,9 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         return Exit.REFUSED
 
     from data_pipelines.errors import DataError
+    from experiments.running.initial_model import initial_from_trial
     from experiments.running.job import read_job
     from experiments.running.ledger import DIVERGED, FAILED, LOST
-    from experiments.running.newcomers import begin_from_trial
     from experiments.running.provenance import inputs_of, record_start
     from experiments.running.run_trial import run_trial
     from experiments.running.shared_runs import begin_shared
@@ -69,7 +69,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         begin = None
         if trial.source:
             source = directory.parent / trial_id(trial.source, inputs_of(job["provenance"])) / RUN
-            begin = partial(begin_from_trial, trial, source)
+            begin = partial(initial_from_trial, trial, source)
         workspace = Workspace(directory.parent.parent)
         run_trial(trial, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report)
         return Exit.DONE
@@ -120,13 +120,13 @@ class _ProgressFile:
     def __init__(self, path: Path, lost: Callable[[], bool]):
         self.path, self.lost = path, lost
         self.last = ("", 0.0)
-        self.looked = time.monotonic()
+        self.polled = time.monotonic()
 
     def __call__(self, phase: str, done: int, total: int) -> None:
         raise_lost_request()
         now = time.monotonic()
-        if now - self.looked >= LOOK_EVERY:
-            self.looked = now
+        if now - self.polled >= POLL_SECONDS:
+            self.polled = now
             if self.lost():
                 raise TakenOver(f"{self.path.parent}: another attempt at this trial has taken over")
         if phase == self.last[0] and now - self.last[1] < 0.3 and done < total:

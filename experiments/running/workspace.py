@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.program import PROGRAM
-from experiments.running.former import modernise
+from experiments.running.migration import migrate
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
 from hma_jax.config import ConfigError, require
@@ -192,7 +192,7 @@ def find_record(workspace: Workspace) -> Record | None:
     path = workspace.record
     try:
         values = json.loads(path.read_text())
-        study, execution = modernise(values["study"])
+        study, execution = migrate(values["study"])
         values["study"] = study | {"execution": study.get("execution", {}) | execution}
         if values.get("provenance"):
             values["provenance"] = to_dict(inputs_of(values["provenance"]))

@@ -15,7 +15,7 @@ from experiments.cli.main import main
 from experiments.preparing import pipeline, windows
 from experiments.presets import get_preset
 from experiments.running.attempts import read_states
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.setting import StudyArguments, make_setting
@@ -204,14 +204,14 @@ def instant_trials(monkeypatch):
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: PROVENANCE)
     monkeypatch.setattr(windows, "require_judged", lambda *_: None)
     monkeypatch.setattr(study_runs, "run_missing", run_missing)
-    monkeypatch.setattr(Launching, "launcher", lambda *_: nullcontext())
+    monkeypatch.setattr(LauncherOptions, "launcher", lambda *_: nullcontext())
 
 
 def test_a_place_without_its_engine_is_refused_before_anything_is_prepared(monkeypatch, tmp_path, capsys):
     def nowhere(*_):
         raise ConfigError("no Slurm here")
 
-    monkeypatch.setattr(Launching, "launcher", nowhere)
+    monkeypatch.setattr(LauncherOptions, "launcher", nowhere)
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: pytest.fail("hours were spent on preparing"))
     assert main(["study", "--preset", "smoke", "--out", str(tmp_path / "out")]) == 2
     assert "no Slurm here" in capsys.readouterr().err and not (tmp_path / "out").exists()
@@ -227,7 +227,7 @@ def test_the_place_where_trials_run_is_entered_once(instant_trials, tmp_path, mo
         yield place
         entered.append("out")
 
-    monkeypatch.setattr(Launching, "launcher", enter)
+    monkeypatch.setattr(LauncherOptions, "launcher", enter)
     real = study_runs.run_missing
     monkeypatch.setattr(
         study_runs, "run_missing", lambda *given, **more: entered.append(given[3] is place) or real(*given, **more)
@@ -368,7 +368,7 @@ def test_failed_trials_are_tried_again_by_the_command_that_is_printed(instant_tr
     monkeypatch.setattr(study_runs, "run_study", run_study)
     assert main(shlex.split(printed)[1:]) == 0
     assert asked["retry_failed"] and asked["axes"] == ("width",)
-    assert asked["launcher"] == Launching("slurm", 2, ("gpus=1", "partition=a b"))
+    assert asked["launcher_options"] == LauncherOptions("slurm", 2, ("gpus=1", "partition=a b"))
     assert asked["setting"] == make_setting(StudyArguments("smoke", tmp_path, set=("widths=8,32",)))
 
 

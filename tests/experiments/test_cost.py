@@ -12,7 +12,7 @@ from experiments.cost import checkpoint_bytes, estimate, evaluation_flops_per_wi
 from experiments.preparing_cost import describe, estimate_preparing
 from experiments.presets import ACCELERATOR, PAPER, SMOKE, SMOKE_CONTINUOUS
 from experiments.running.launchers import local
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import Accelerators
 from experiments.sweeps.registry import find_axis, plan_sweeps
 from experiments.sweeps.sweep import POINT, reference_trial
@@ -94,18 +94,18 @@ def test_the_plan_says_what_it_counts(capsys):
 @pytest.mark.parametrize(
     ("gpus", "launching", "mesh", "each", "at_once"),
     [
-        (0, Launching(), (-1, 1, 1), 1, 1),
-        (0, Launching(workers=8), (-1, 1, 1), 1, 8),
-        (0, Launching(), (8, 1, 1), 8, 1),
-        (0, Launching(workers=2), (2, -1, 2), 4, 2),
-        (8, Launching(), (-1, 1, 1), 8, 1),
-        (8, Launching(workers=2), (-1, 1, 1), 4, 2),
-        (8, Launching(workers=16), (-1, 1, 1), 0.5, 16),
-        (8, Launching("slurm"), (-1, 1, 1), 1, None),
-        (8, Launching("slurm", None, ("gpus=4",)), (-1, 1, 1), 4, None),
-        (0, Launching("slurm", 3, ("gpus=4",)), (1, -1, 1), 4, 3),
-        (0, Launching("ray", 4, ("tpus=4",)), (-1, 1, 1), 4, 4),
-        (0, Launching("ray", 2, ("gpus=0.5",)), (1, 1, 1), 0.5, 2),
+        (0, LauncherOptions(), (-1, 1, 1), 1, 1),
+        (0, LauncherOptions(workers=8), (-1, 1, 1), 1, 8),
+        (0, LauncherOptions(), (8, 1, 1), 8, 1),
+        (0, LauncherOptions(workers=2), (2, -1, 2), 4, 2),
+        (8, LauncherOptions(), (-1, 1, 1), 8, 1),
+        (8, LauncherOptions(workers=2), (-1, 1, 1), 4, 2),
+        (8, LauncherOptions(workers=16), (-1, 1, 1), 0.5, 16),
+        (8, LauncherOptions("slurm"), (-1, 1, 1), 1, None),
+        (8, LauncherOptions("slurm", None, ("gpus=4",)), (-1, 1, 1), 4, None),
+        (0, LauncherOptions("slurm", 3, ("gpus=4",)), (1, -1, 1), 4, 3),
+        (0, LauncherOptions("ray", 4, ("tpus=4",)), (-1, 1, 1), 4, 4),
+        (0, LauncherOptions("ray", 2, ("gpus=0.5",)), (1, 1, 1), 0.5, 2),
     ],
 )
 def test_every_launcher_says_which_devices_a_trial_runs_on(gpus, launching, mesh, each, at_once, monkeypatch):

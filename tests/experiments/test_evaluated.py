@@ -74,10 +74,10 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
 )
 def test_the_seed_of_the_training_is_recorded_where_the_run_knows_it(provenance, recorded):
     of = {"model": {}, "train": TrainConfig(seed=7), "provenance": provenance, "weights": "last", "step": 3}
-    materials = SimpleNamespace(
+    prepared = SimpleNamespace(
         manifest=SimpleNamespace(datasets=(), frames=4, rate=2.0), tokenizer=SimpleNamespace(identity="t")
     )
-    assert describe_evaluation(SimpleNamespace(**of), (), materials, EvalConfig()).recorded == recorded
+    assert describe_evaluation(SimpleNamespace(**of), (), prepared, EvalConfig()).recorded == recorded
 
 
 def test_a_setting_of_the_protocol_that_came_later_is_no_difference(tmp_path):

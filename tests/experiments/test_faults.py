@@ -18,7 +18,7 @@ from experiments.analysis.tables import read_side
 from experiments.cli.main import main
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
-from experiments.running.attempts import Ended, outcome
+from experiments.running.attempts import AttemptEnd, outcome
 from experiments.running.shared_runs import Shared
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
@@ -140,7 +140,7 @@ def test_a_trial_on_a_full_disk_is_lost_not_failed_so_that_the_same_command_goes
     write_job(tmp_path, monkeypatch)
     with full_disk(room):
         assert trial_main.main(tmp_path) == Exit.LOST  # its provenance.json takes more
-    state = outcome(tmp_path, Ended(Exit.LOST))
+    state = outcome(tmp_path, AttemptEnd(Exit.LOST))
     assert state.event == "lost"
     assert ("provenance.json" if room else "is the disk full?") in state.message
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from experiments.presets import SMOKE
-from experiments.running.former import modernise
 from experiments.running.job import read_job
+from experiments.running.migration import migrate
 from experiments.running.shared_runs import Shared
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MeshConfig
@@ -41,7 +41,7 @@ def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_i
 
 def test_fields_of_earlier_versions_are_read_as_what_they_are_called_today():
     before = {"model": {"remat": True, "width": 8}, "train": {"accumulate": 2}, "eval": {"unmask_steps": 7, "seed": 1}}
-    today, execution = modernise(before)
+    today, execution = migrate(before)
     assert today == {"model": {"width": 8}, "train": {}, "eval": {"decode": {"unmask_steps": 7}, "seed": 1}}
     assert execution == {"remat": "everything", "accumulate": 2} and before["eval"]["unmask_steps"] == 7
 

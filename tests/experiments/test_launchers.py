@@ -16,11 +16,11 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.cli.main import main
-from experiments.running.attempts import Ended, outcome
+from experiments.running.attempts import AttemptEnd, outcome
 from experiments.running.launchers import ray, slurm
-from experiments.running.launchers.far import Attempt
 from experiments.running.launchers.ray import RayLauncher, RaySettings
-from experiments.running.launchers.registry import LAUNCHERS, Launching, launcher_class
+from experiments.running.launchers.registry import LAUNCHERS, LauncherOptions, launcher_class
+from experiments.running.launchers.remote import Attempt
 from experiments.running.launchers.slurm import SlurmAttempt, SlurmLauncher, SlurmSettings
 from experiments.running.ledger import Ledger
 from experiments.running.runner import run_missing
@@ -165,7 +165,7 @@ def test_a_result_that_is_late_on_the_shared_disk_is_waited_for(submitted, monke
     fake.states["7_0"] = "COMPLETED"
     assert place.ended(handle) is None
     handle.paths.result_pickle.write_bytes(pickle.dumps(("success", 0)))
-    assert place.ended(handle) == Ended(0)
+    assert place.ended(handle) == AttemptEnd(0)
     handle.paths.result_pickle.unlink()
     monkeypatch.setattr(slurm, "LINGER", 0.0)
     assert place.ended(handle).code is None
@@ -174,7 +174,7 @@ def test_a_result_that_is_late_on_the_shared_disk_is_waited_for(submitted, monke
 def test_a_job_that_stopped_is_not_brought_back_by_slurm_beside_the_next_one(submitted):
     place, fake, handle = submitted
     handle.paths.result_pickle.write_bytes(pickle.dumps(("success", 130)))
-    assert place.ended(handle) == Ended(130)
+    assert place.ended(handle) == AttemptEnd(130)
     assert fake.cancelled == [["scancel", "7_0"]]
 
 
@@ -232,7 +232,7 @@ def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_pat
     attempt, thread, codes = start_attempt(tmp_path, SlurmAttempt)
     again = attempt.checkpoint()
     thread.join(20)
-    assert outcome(attempt.directory, Ended(codes[0])).event == "preempted"
+    assert outcome(attempt.directory, AttemptEnd(codes[0])).event == "preempted"
     copy = pickle.loads(pickle.dumps(again.function))
     assert (copy.directory, copy.cache) == (attempt.directory, attempt.cache)
 
@@ -242,7 +242,7 @@ def test_a_signal_to_the_engines_process_stops_its_trial_in_order(tmp_path, sent
     """SIGTERM of scancel, and SIGUSR2, on which submitit asks for a checkpoint in the signal's handler."""
     program = (
         "import signal, sys; from pathlib import Path\n"
-        "from experiments.running.launchers.far import Attempt; from tests.experiments import fake_trial\n"
+        "from experiments.running.launchers.remote import Attempt; from tests.experiments import fake_trial\n"
         "attempt = Attempt(Path(sys.argv[1]), Path('compiled'), fake_trial.command)\n"
         "def announced(*_): attempt.end(); sys.exit(77)\n"
         "signal.signal(signal.SIGUSR2, announced)\n"
@@ -315,7 +315,7 @@ def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):
 )
 def test_mistakes_in_launcher_settings_are_said_before_anything_runs(said, words):
     with pytest.raises(ConfigError) as error:
-        Launching(*said)
+        LauncherOptions(*said)
     assert words in str(error.value)
 
 
@@ -326,7 +326,7 @@ def test_the_command_line_refuses_a_launcher_that_is_not_there(capsys):
 
 def test_settings_are_read_as_what_they_are():
     said = ("partition=123", "gpus=2", "memory_gb=1.5", "sbatch=gres=gpu:h100:1", "sbatch=exclusive")
-    _, settings = Launching("slurm", None, said)._parsed()
+    _, settings = LauncherOptions("slurm", None, said)._parsed()
     assert settings == SlurmSettings(partition="123", gpus=2, memory_gb=1.5, sbatch=("gres=gpu:h100:1", "exclusive"))
 
 
@@ -334,7 +334,7 @@ def test_without_the_engine_the_message_says_what_to_install(tmp_path, monkeypat
     for name, package in (("slurm", "submitit"), ("ray", "ray")):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(ConfigError, match=rf"pip install 'hma-jax\[{name}\]'"):
-            Launching(name).launcher(tmp_path)
+            LauncherOptions(name).launcher(tmp_path)
 
 
 def test_without_the_engine_nothing_is_prepared(tmp_path, monkeypatch, capsys):

@@ -14,7 +14,7 @@ from experiments.override import override
 from experiments.preparing import counterfactual, windows
 from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
-from experiments.running.run_trial import open_materials
+from experiments.running.run_trial import open_prepared_data
 from experiments.running.workspace import Workspace
 
 
@@ -23,20 +23,20 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     study = override(get_preset("smoke-continuous"), ["dataset_counts=1"])
     workspace, model = Workspace(tmp_path), study.model
     prepare(study, workspace)
-    materials = open_materials(workspace)
-    store = materials.store
+    prepared = open_prepared_data(workspace)
+    store = prepared.store
     table = store.embodiment_table(study.dataset_names())
     loader = make_loader(store, table, LoaderConfig(frames=model.frames, batch=2))
     (train,) = itertools.islice(loader, 1)
-    validation = next(eval_batches(store, table, materials.manifest, 2))
+    validation = next(eval_batches(store, table, prepared.manifest, 2))
     for tokens in (train["tokens"], validation["tokens"]):
         assert tokens.dtype == np.float32
         assert tokens.shape == (2, model.frames, model.tokens, model.diffusion.token_channels)
-    assert materials.tokenizer.decode(validation["tokens"][0]).shape == validation["images"][0].shape
+    assert prepared.tokenizer.decode(validation["tokens"][0]).shape == validation["images"][0].shape
 
-    truth, prompt = materials.counterfactual, study.eval.prompt_frames
-    assert truth.prompt == prompt and set(truth.frames) == set(materials.manifest.names)
-    (batch,) = eval_batches(store, table, materials.manifest, 4, other_actions=3, counterfactual=truth)
+    truth, prompt = prepared.counterfactual, study.eval.prompt_frames
+    assert truth.prompt == prompt and set(truth.frames) == set(prepared.manifest.names)
+    (batch,) = eval_batches(store, table, prepared.manifest, 4, other_actions=3, counterfactual=truth)
     rows = np.flatnonzero(batch["valid"])
     assert batch["other_seen"][rows].all()
     np.testing.assert_array_equal(batch["other_images"][:, :prompt], batch["images"][:, :prompt])
@@ -46,7 +46,7 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     assert workspace.counterfactual.stat().st_mtime_ns == made  # it is there
     workspace.counterfactual.write_bytes(b"torn")
     counterfactual.make_counterfactual(study, workspace)
-    assert open_materials(workspace).counterfactual.frames.keys() == truth.frames.keys()
+    assert open_prepared_data(workspace).counterfactual.frames.keys() == truth.frames.keys()
     workspace.counterfactual.unlink()
     seed_of = counterfactual._seed_of
     monkeypatch.setattr(counterfactual, "_seed_of", lambda *args: seed_of(*args) + 1)
@@ -57,8 +57,8 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     monkeypatch.undo()
     monkeypatch.setattr(OtherWindows, "choose", lambda *args: [])  # as of episodes that are longer than all others
     counterfactual.make_counterfactual(study, workspace)
-    alone = open_materials(workspace).counterfactual
-    (batch,) = eval_batches(store, table, materials.manifest, 4, other_actions=3, counterfactual=alone)
+    alone = open_prepared_data(workspace).counterfactual
+    (batch,) = eval_batches(store, table, prepared.manifest, 4, other_actions=3, counterfactual=alone)
     assert not batch["other_seen"].any()
 
 

@@ -19,7 +19,7 @@ from experiments.running.agreement import check_finished, group_by_sources, requ
 from experiments.running.attempts import read_states
 from experiments.running.closure import ROOT, closure_hash, trace
 from experiments.running.launchers.local import LocalLauncher
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.machine import commit_of
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
@@ -325,7 +325,7 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
     setting = replace(make_setting(StudyArguments("smoke", tmp_path)), study=STUDY)
 
     def run():
-        study_runs.run_study(setting, SCALING, again="", launcher=Launching(), retry_failed=False,
+        study_runs.run_study(setting, SCALING, again="", launcher_options=LauncherOptions(), retry_failed=False,
                            accept_code=accept, replace=None)  # fmt: skip
 
     if accept:

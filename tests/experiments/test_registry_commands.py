@@ -23,7 +23,7 @@ from experiments import run_study
 from experiments.cli.data.registry import _write_entry
 from experiments.cli.main import main
 from experiments.contact_sheet import TILE, draw_sheet
-from experiments.running.launchers.registry import Launching
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.workspace import Workspace, load_record
 from experiments.setting import Setting, StudyArguments, find_directories, make_setting, use_entries
 from experiments.sweeps.registry import plan_sweeps
@@ -304,7 +304,7 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
     workspace = Workspace(tmp_path / "study")
     workspace.root.mkdir()
     run_study.run_study(
-        Setting(arguments, study, ("somewhere",), workspace), ("episodes",), again="", launcher=Launching(),
+        Setting(arguments, study, ("somewhere",), workspace), ("episodes",), again="", launcher_options=LauncherOptions(),
         retry_failed=False, accept_code=False, replace=None,
     )  # fmt: skip
     entries.unlink()

@@ -155,7 +155,7 @@ def test_monitor_hears_starts_and_ends(tmp_path):
 
 def test_a_trial_that_another_runner_left_running_is_waited_for(tmp_path, monkeypatch):
     """On another machine a trial outlives the runner that started it: it is neither started twice nor lost."""
-    monkeypatch.setattr(runner, "LOOK_EVERY", 0.05)
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.05)
     directory = tmp_path / "trials/a"
     directory.mkdir(parents=True)
     Ledger(tmp_path / "ledger.jsonl").append("a", "running", title="trial a")
@@ -173,7 +173,7 @@ def test_a_trial_that_another_runner_left_running_is_waited_for(tmp_path, monkey
 
 def test_a_lease_that_ran_out_lets_another_take_the_trial(tmp_path, monkeypatch):
     """A worker on another machine died: its lock file stays, unrenewed, and no lock of this kernel's is behind it."""
-    monkeypatch.setattr(runner, "LOOK_EVERY", 0.05)
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.05)
     directory = tmp_path / "trials/a"
     directory.mkdir(parents=True)
     Ledger(tmp_path / "ledger.jsonl").append("a", "running", title="trial a")
@@ -195,7 +195,7 @@ def test_a_child_uses_huge_pages_unless_the_user_said_otherwise(monkeypatch):
 
 def test_a_trial_that_lost_its_lease_stops_for_the_one_that_took_over(tmp_path, monkeypatch):
     """A machine that was cut off for longer than its lease finds out when it is back."""
-    monkeypatch.setattr(trial_main, "LOOK_EVERY", 0.0)
+    monkeypatch.setattr(trial_main, "POLL_SECONDS", 0.0)
     with attempt(tmp_path) as held:
         report = trial_main._ProgressFile(tmp_path / "progress.json", held.lost)
         report("training", 1, 2)

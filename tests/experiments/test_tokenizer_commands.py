@@ -13,7 +13,7 @@ from data_pipelines.windows.evalset import eval_batches
 from experiments.cli.main import main
 from experiments.override import override
 from experiments.presets import get_preset
-from experiments.running.run_trial import open_materials
+from experiments.running.run_trial import open_prepared_data
 from experiments.running.workspace import Workspace
 from experiments.study import on_tokenizer
 from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
@@ -87,13 +87,13 @@ def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind,
         tokenizer = imported(tmp_path, kind)
     common = ("--preset", "smoke-continuous", "--out", tmp_path / "out", "--data", arm)
     assert hma("tokenize", *common, "--tokenizer", tokenizer) == 0
-    materials = open_materials(Workspace(tmp_path / "out"))
-    assert materials.tokenizer.identity == load_tokenizer(tokenizer).identity
-    table = materials.store.embodiment_table([ARM.name])
-    batch = next(eval_batches(materials.store, table, materials.manifest, 2))
-    model = on_tokenizer(get_preset("smoke-continuous"), materials.tokenizer.config).model
+    prepared = open_prepared_data(Workspace(tmp_path / "out"))
+    assert prepared.tokenizer.identity == load_tokenizer(tokenizer).identity
+    table = prepared.store.embodiment_table([ARM.name])
+    batch = next(eval_batches(prepared.store, table, prepared.manifest, 2))
+    model = on_tokenizer(get_preset("smoke-continuous"), prepared.tokenizer.config).model
     assert batch["tokens"].shape == (2, 4, model.tokens, model.diffusion.token_channels)
-    frames = materials.tokenizer.decode(batch["tokens"][0])
+    frames = prepared.tokenizer.decode(batch["tokens"][0])
     assert frames.shape == batch["images"][0].shape
     if kind == "pixels":  # nothing is lost on the way through the store
         assert np.array_equal(frames, batch["images"][0])

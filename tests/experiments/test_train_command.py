@@ -49,9 +49,9 @@ def train(where, tmp_path, monkeypatch, capsys):
     """Runs `hma train`; returns what it said and how training was called."""
     calls, phases, real = [], [], trials.train_trial
 
-    def spy(trial, materials, run, **how):
+    def spy(trial, prepared, run, **how):
         calls.append((trial, how["options"]))
-        return real(trial, materials, run, **how | {"progress": lambda phase, *_: phases.append(phase)})
+        return real(trial, prepared, run, **how | {"progress": lambda phase, *_: phases.append(phase)})
 
     monkeypatch.setattr(trials, "train_trial", spy)
 
@@ -401,8 +401,8 @@ def test_held_out_loss_is_of_as_many_episodes_as_a_batch_takes(tmp_path):
     """Of the first windows it would be that of one long episode and its neighbours."""
     store = small_store(tmp_path, lengths=(40,) * 16, min_val=4)
     manifest, table = freeze_manifest(store, ("toy",), 4, 64, 0), store.embodiment_table(["toy"])
-    materials = SimpleNamespace(store=store, manifest=manifest)
+    prepared = SimpleNamespace(store=store, manifest=manifest)
     trial = SimpleNamespace(train=SimpleNamespace(batch=4), evaluated=("toy",))
-    (batch,) = trials.validation_batches(trial, materials, table)
+    (batch,) = trials.validation_batches(trial, prepared, table)
     assert batch["valid"].all()
     assert len(set((batch["tokens"][:, 0, 0] // 256).tolist())) == 4  # ids say which episode a frame is of

@@ -41,33 +41,33 @@ def quality(
     from experiments.bench.quality import DecodingQuality, decodings, judge, plot_quality, subject_of
     from experiments.cli.evaluate import check_fits, require_prepared
     from experiments.rows import write_csv
-    from experiments.running.run_trial import open_materials
+    from experiments.running.run_trial import open_prepared_data
     from hma_jax.training.runs import load_model, require_frames
 
     setting = make_setting(arguments)
     trained = load_model(run).run
     require_frames(trained, "judge")
     require_prepared(setting)
-    materials = open_materials(setting.workspace)
-    check_fits(trained, materials)
+    prepared = open_prepared_data(setting.workspace)
+    check_fits(trained, prepared)
     subject, config = subject_of(trained), setting.study.eval
     config = replace(config, batch=min(config.batch, windows))  # no rows of padding
     frames = frames or trained.model.frames
     if frames < trained.model.frames:
         raise ConfigError(f"--frames must be at least the model's window of {trained.model.frames}, got {frames}")
-    names = [d.dataset for d in materials.manifest.datasets if d.dataset in trained.table.names]
+    names = [d.dataset for d in prepared.manifest.datasets if d.dataset in trained.table.names]
     # Whole windows: what is timed are frames, all of them.
     frozen = freeze_manifest(
-        materials.store, names, frames, windows, materials.manifest.seed, rate=materials.manifest.rate
+        prepared.store, names, frames, windows, prepared.manifest.seed, rate=prepared.manifest.rate
     )
     settings = decodings(trained.model, config, frames)
 
     def batches():
-        return eval_batches(materials.store, trained.table, frozen, config.batch, frozen.names)
+        return eval_batches(prepared.store, trained.table, frozen, config.batch, frozen.names)
 
     with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
         rows, stages = judge(
-            subject, materials.tokenizer, batches, settings, frames, repeats, trained.train.masking.setting,
+            subject, prepared.tokenizer, batches, settings, frames, repeats, trained.train.masking.setting,
             lambda name, done: update(done, len(settings), name),
         )  # fmt: skip
     table = tidy_table(

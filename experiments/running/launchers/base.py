@@ -1,4 +1,4 @@
-"""What the runner asks of a place where trials run.
+"""The interface by which the runner starts and stops trials, wherever they run.
 
 A launcher starts processes, says when they have ended and stops them. It knows nothing of what they do: they
 leave results, failures and progress in the directories of their trials (`experiments.running.attempts`), which
@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from experiments.running.attempts import Ended
+from experiments.running.attempts import AttemptEnd
 
 GRACE_SECONDS = 60.0
 """How long a trial may take to save its state when it is asked to stop."""
@@ -28,7 +28,7 @@ def trial_command(directory: Path) -> list[str]:
 
 
 class Launcher(ABC):
-    """A place where trials run. `Settings` is a dataclass: what `--launcher-set` may say of it."""
+    """Starts trials on this machine, a cluster, ... `Settings` is a dataclass of what `--launcher-set` takes."""
 
     Settings: ClassVar[type]
     needs: ClassVar[str] = ""
@@ -53,7 +53,7 @@ class Launcher(ABC):
         """
 
     @abstractmethod
-    def ended(self, handle: Any) -> Ended | None:
+    def ended(self, handle: Any) -> AttemptEnd | None:
         """How the attempt ended; None while it is queued or runs."""
 
     @abstractmethod
@@ -64,14 +64,14 @@ class Launcher(ABC):
     def kill(self, handles: Sequence[Any]) -> None:
         """Ends attempts at once, those that have ended already too."""
 
-    def stop(self, handles: Sequence[Any], grace: float | None = None) -> list[Ended]:
+    def stop(self, handles: Sequence[Any], grace: float | None = None) -> list[AttemptEnd]:
         """Asks, waits until all have ended, kills the rest after the grace period. Returns how each ended."""
         self.ask_to_stop(handles)
         deadline = time.monotonic() + (GRACE_SECONDS if grace is None else grace)
         while time.monotonic() < deadline and any(self.ended(h) is None for h in handles):
             time.sleep(self.pause)
         self.kill([h for h in handles if self.ended(h) is None])
-        return [self.ended(h) or Ended(None, "it did not end when it was asked to") for h in handles]
+        return [self.ended(h) or AttemptEnd(None, "it did not end when it was asked to") for h in handles]
 
     def __enter__(self) -> Self:
         return self

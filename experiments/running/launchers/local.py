@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.running.attempts import OUTPUT, Ended
+from experiments.running.attempts import OUTPUT, AttemptEnd
 from experiments.running.children import child_environment
 from experiments.running.launchers.base import Command, Launcher, trial_command
 from experiments.running.slots import cut, find_accelerators
@@ -70,13 +70,13 @@ class LocalLauncher(Launcher):
             )
         return Child(process, slot)
 
-    def ended(self, handle: Child) -> Ended | None:
+    def ended(self, handle: Child) -> AttemptEnd | None:
         code = handle.process.poll()
         if code is None:
             return None
         if handle.slot not in self._free:
             self._free.append(handle.slot)
-        return Ended(code)
+        return AttemptEnd(code)
 
     def ask_to_stop(self, handles: Sequence[Child]) -> None:
         for handle in handles:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.running.attempts import Ended, is_alive
+from experiments.running.attempts import AttemptEnd, is_alive
 from experiments.running.launchers.base import Command, Launcher, trial_command
-from experiments.running.launchers.far import STOP, Attempt
+from experiments.running.launchers.remote import STOP, Attempt
 from hma_jax.config import ConfigError, require
 
 
@@ -85,16 +85,16 @@ class RayLauncher(Launcher):
         cache = self._root / "compiled"
         return [Task(d, self._run.remote(Attempt(d, cache, self._command))) for d in directories]
 
-    def ended(self, handle: Task) -> Ended | None:
+    def ended(self, handle: Task) -> AttemptEnd | None:
         done, _ = self._ray.wait([handle.reference], timeout=0)
         if not done:
             return None
         try:
-            return Ended(self._ray.get(handle.reference))
+            return AttemptEnd(self._ray.get(handle.reference))
         except self._ray.exceptions.TaskCancelledError:
-            return None if is_alive(handle.directory) else Ended(-signal.SIGTERM)
+            return None if is_alive(handle.directory) else AttemptEnd(-signal.SIGTERM)
         except self._ray.exceptions.RayError as error:
-            return Ended(None, f"Ray says: {str(error).strip().splitlines()[0]}")
+            return AttemptEnd(None, f"Ray says: {str(error).strip().splitlines()[0]}")
 
     def ask_to_stop(self, handles: Sequence[Task]) -> None:
         for handle in handles:

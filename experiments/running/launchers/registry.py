@@ -1,4 +1,4 @@
-"""The launchers by name, and one made from what the command line says."""
+"""The launchers by name, and the launcher that the options of the command line describe."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ LAUNCHERS = {
     "slurm": "experiments.running.launchers.slurm:SlurmLauncher",
     "ray": "experiments.running.launchers.ray:RayLauncher",
 }
-"""Where each is; imported when it is asked for."""
+"""Module and class of each; imported when it is used."""
 
 
 @dataclass(frozen=True)
-class Launching:
-    """What the command line says of it. Raises ConfigError for a launcher or setting that there is not."""
+class LauncherOptions:
+    """The launcher's options on the command line. Raises ConfigError for an unknown launcher or setting."""
 
     name: str = "local"
     workers: int | None = None  # trials at a time
-    said: tuple[str, ...] = ()  # 'key=value'
+    settings: tuple[str, ...] = ()  # 'key=value'
 
     def __post_init__(self):
         self._parsed()
 
     def _parsed(self) -> tuple[type[Launcher], Any]:
         kind = launcher_class(self.name)
-        return kind, parse_settings(self.name, kind.Settings, self.said)
+        return kind, parse_settings(self.name, kind.Settings, self.settings)
 
     @property
     def at_once(self) -> int | None:
@@ -67,11 +67,11 @@ def launcher_class(name: str) -> type[Launcher]:
     return getattr(importlib.import_module(module), attribute)
 
 
-def parse_settings(name: str, kind: type, said: Sequence[str]) -> Any:
-    """A `kind` from 'key=value' strings; a key whose value is a list may be said several times."""
+def parse_settings(name: str, kind: type, settings: Sequence[str]) -> Any:
+    """A `kind` from 'key=value' strings; a key whose value is a list may be given several times."""
     hints, known = typing.get_type_hints(kind), ", ".join(f.name for f in fields(kind)) or "none"
     values: dict[str, Any] = {}
-    for setting in said:
+    for setting in settings:
         key, separator, text = setting.partition("=")
         flag = f"--launcher-set {setting}"
         require(bool(separator), f"{flag}: write it as key=value; the {name} launcher has {known}")

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.running.attempts import Ended
+from experiments.running.attempts import AttemptEnd
 from experiments.running.launchers.base import Command, Launcher, trial_command
-from experiments.running.launchers.far import Attempt
+from experiments.running.launchers.remote import Attempt
 from hma_jax.config import ConfigError, require
 
 log = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ class SlurmLauncher(Launcher):
         self._polled, self._states = -math.inf, None
         return jobs
 
-    def ended(self, handle: Any) -> Ended | None:
+    def ended(self, handle: Any) -> AttemptEnd | None:
         result = self._result(handle)
         if result is not None:
             if result.code != 0:  # Slurm might bring it back, beside the one that the runner submits
@@ -133,21 +133,21 @@ class SlurmLauncher(Launcher):
             return None
         why = f"Slurm says {state} of job {handle.job_id}"
         if state in ASKED_TO_STOP:
-            return Ended(-signal.SIGTERM, why)
+            return AttemptEnd(-signal.SIGTERM, why)
         seen = self._over.setdefault(handle.job_id, time.monotonic())
         if state == COMPLETED and time.monotonic() - seen < LINGER:
             return None
-        return Ended(None, f"{why}; its log is {handle.paths.stdout}")
+        return AttemptEnd(None, f"{why}; its log is {handle.paths.stdout}")
 
-    def _result(self, job: Any) -> Ended | None:
+    def _result(self, job: Any) -> AttemptEnd | None:
         """What the job's process left when it ended by itself."""
         try:
             kind, value = pickle.loads(job.paths.result_pickle.read_bytes())
         except FileNotFoundError:
             return None
         if kind == "success":
-            return Ended(value)
-        return Ended(None, f"job {job.job_id} ended with {str(value).strip().splitlines()[-1]}")
+            return AttemptEnd(value)
+        return AttemptEnd(None, f"job {job.job_id} ended with {str(value).strip().splitlines()[-1]}")
 
     def _state(self, id: str) -> str:
         """Of one job; all are asked for at once, not more often than is good for the cluster."""

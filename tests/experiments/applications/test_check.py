@@ -44,10 +44,10 @@ def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path
         store = small_store(tmp_path, name, lengths=(8 if name == "none" else 20,) * count, min_val=5)
     manifest = freeze_manifest(store, ("few", "many", "none"), 10, 64, 0)
     model = SimpleNamespace(table=store.embodiment_table(store.names))
-    materials = SimpleNamespace(store=store, manifest=manifest)
+    prepared = SimpleNamespace(store=store, manifest=manifest)
 
     def choose(*robots: str) -> tuple[list[str], dict[str, str]]:
-        return choose_robots(tmp_path, model, materials, robots, 64, Path("runs/a"))
+        return choose_robots(tmp_path, model, prepared, robots, 64, Path("runs/a"))
 
     chosen, left_out = choose()
     assert chosen == ["many"] and list(left_out) == ["few", "none"]
@@ -68,11 +68,11 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
         table=own.embodiment_table(("toy",)), run=SimpleNamespace(provenance=provenance, train=TrainConfig())
     )
     monkeypatch.setattr("hma_jax.training.runs.load_model", lambda run: model)
-    monkeypatch.setattr("experiments.cli.evaluate.check_fits", lambda trained, materials: None)
+    monkeypatch.setattr("experiments.cli.evaluate.check_fits", lambda trained, prepared: None)
     monkeypatch.setattr("experiments.applications.check.check_run", lambda *_: {})
     for store, told in ((own, False), (here, True)):
-        materials = SimpleNamespace(store=store, manifest=freeze_manifest(store, ("toy",), 4, 64, 0))
-        monkeypatch.setattr("experiments.applications.check.open_study", lambda _, found=materials: found)
+        prepared = SimpleNamespace(store=store, manifest=freeze_manifest(store, ("toy",), 4, 64, 0))
+        monkeypatch.setattr("experiments.applications.check.open_study", lambda _, found=prepared: found)
         check(tmp_path, tmp_path)
         said = " ".join(capsys.readouterr().out.split())
         assert (

@@ -1,4 +1,4 @@
-"""A process of an engine on some machine, which makes one attempt at a trial in a child of its own.
+"""One attempt at a trial in a child process of an engine's process (Slurm's or Ray's), on whichever machine it runs.
 
 The child's memory, signals and accelerators are its own, and it ends with this process however that ends. The
 engine's SIGTERM is handed on as SIGINT: some engines send it to the child too, and a trial takes the second one
@@ -17,7 +17,7 @@ from experiments.running.attempts import OUTPUT
 from experiments.running.children import child_environment
 from experiments.running.launchers.base import GRACE_SECONDS, Command
 
-LOOK_EVERY = 0.1
+POLL_SECONDS = 0.1
 """Seconds between two checks whether the child has ended, or is to."""
 
 STOP = "stop"
@@ -55,7 +55,7 @@ class Attempt:
             signal.signal(signal.SIGTERM, lambda *_: self._request_stop())
         try:
             while self._code is None and not (self.directory / STOP).exists():
-                time.sleep(LOOK_EVERY)
+                time.sleep(POLL_SECONDS)
             self.end()
             return self._code
         finally:  # the engine interrupts the call
@@ -76,8 +76,8 @@ class Attempt:
         self._request_stop()
         deadline = time.monotonic() + GRACE_SECONDS
         while self._code is None and time.monotonic() < deadline:
-            time.sleep(LOOK_EVERY)
+            time.sleep(POLL_SECONDS)
         if self._code is None:
             self._child.kill()
         while self._code is None:
-            time.sleep(LOOK_EVERY)
+            time.sleep(POLL_SECONDS)

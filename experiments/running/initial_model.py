@@ -1,11 +1,11 @@
-"""A trained model that is given new robots: what training goes on from."""
+"""The initial model of a training run that goes on from a trained one: its parameters, and slices for new robots."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from experiments.running.run_trial import Materials
+from experiments.running.run_trial import PreparedData
 from experiments.running.trial import Trial, loader_of
 from hma_jax.config import ConfigError
 
@@ -15,28 +15,28 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 
-class Beginning(TypedDict):
-    """What `train_trial` takes for a model that is not new."""
+class InitialModel(TypedDict):
+    """The arguments of `train_trial` for a model that begins with trained parameters."""
 
     table: EmbodimentTable
     initial: Params
     origin: dict[str, Any]
 
 
-def add_robots(trained: Run, trial: Trial, materials: Materials) -> Beginning:
+def add_robots(trained: Run, trial: Trial, prepared: PreparedData) -> InitialModel:
     """`trained` with slices for those of the trial's datasets that it does not know, drawn from the trial's seed."""
     from data_pipelines.loading.selection import training_embodiment
     from hma_jax.training.adapt import add_embodiments
 
     loader, scale = loader_of(trial), trial.train.action_scale
     new = [name for name in trial.datasets if name not in trained.table.names]
-    robots = [training_embodiment(materials.store, name, loader, scale) for name in new]
+    robots = [training_embodiment(prepared.store, name, loader, scale) for name in new]
     params, table = add_embodiments(trained.params, trained.model, trained.table, robots, trial.train.seed)
-    return Beginning(table=table, initial=params, origin={"step": trained.step, "provenance": trained.provenance})
+    return InitialModel(table=table, initial=params, origin={"step": trained.step, "provenance": trained.provenance})
 
 
-def begin_from_trial(trial: Trial, source: Path, materials: Materials) -> Beginning:
-    """The beginning of a trial that has a source, whose training run is in `source`. Raises ConfigError without its
+def initial_from_trial(trial: Trial, source: Path, prepared: PreparedData) -> InitialModel:
+    """The initial model of a trial with a source, whose training run is in `source`. Raises ConfigError without its
     last checkpoint."""
     from hma_jax.training.reading import CheckpointError
     from hma_jax.training.runs import load_run
@@ -51,4 +51,4 @@ def begin_from_trial(trial: Trial, source: Path, materials: Materials) -> Beginn
     wanted = trial.source.train.steps
     if trained.step != wanted:
         raise ConfigError(f"the trial goes on from another one that has {trained.step} of {wanted} steps: {source}")
-    return add_robots(trained, trial, materials)
+    return add_robots(trained, trial, prepared)
