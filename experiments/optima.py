@@ -95,16 +95,16 @@ def _optimum(
     of_base: Sequence[CurvePoint],
 ) -> Optimum:
     transferred, moved, penalty, error = math.nan, math.nan, math.nan, math.nan
-    lost = diverged(rows, sweep, role, series)
-    near = [p.x for p in points if p.x not in lost and as_good(p, best)]
+    diverged_x = diverged(rows, sweep, role, series)
+    near = [p.x for p in points if p.x not in diverged_x and as_good(p, best)]
     if base:
         transferred, grid = base.x, sorted({r.x for r in rows if r.sweep == sweep})
         moved = grid.index(best.x) - grid.index(base.x)
-        there = next((p for p in points if p.x == base.x), None)
-        if base.x in lost:
+        transferred_point = next((p for p in points if p.x == base.x), None)
+        if base.x in diverged_x:
             penalty = math.inf
-        elif there:
-            penalty, error = chosen_by_others(points, of_base, lost) or difference(there, best)
+        elif transferred_point:
+            penalty, error = cross_validated_penalty(points, of_base, diverged_x) or difference(transferred_point, best)
     return Optimum(
         sweep, metric, role, series, best.x,
         edge="edge" if best.x in ends(rows, sweep, role, series) else "",
@@ -122,24 +122,24 @@ def as_good(point: CurvePoint, best: CurvePoint) -> bool:
     return seeds > 1 and not mean > scipy.stats.t.isf(0.05, seeds - 1) * error
 
 
-def chosen_by_others(
-    points: Sequence[CurvePoint], of_base: Sequence[CurvePoint], lost: set[float]
+def cross_validated_penalty(
+    points: Sequence[CurvePoint], of_base: Sequence[CurvePoint], diverged_x: set[float]
 ) -> tuple[float, float] | None:
     """(what a curve loses by the base's best x instead of its own, standard error over seeds): for each seed both are
     chosen by the other seeds. None with fewer than two seeds that every point of both curves has."""
-    own, base = ({p.x: p.seeds for p in curve if p.x not in lost} for curve in (points, of_base))
+    own, base = ({p.x: p.seeds for p in curve if p.x not in diverged_x} for curve in (points, of_base))
     base = {x: seeds for x, seeds in base.items() if x in own}
     shared = set.intersection(*(set(seeds) for seeds in (*own.values(), *base.values()))) if base else set()
     if len(shared) < 2:
         return None
-    lost_by = []
+    penalties = []
     for seed in sorted(shared):
         others = shared - {seed}
         best, transferred = (min(c, key=lambda x, c=c: add_up(c[x][s] for s in others)) for c in (own, base))
-        lost_by.append(own[transferred][seed] - own[best][seed])
-    mean = add_up(lost_by) / len(lost_by)
-    spread = add_up((d - mean) ** 2 for d in lost_by) / (len(lost_by) - 1)
-    return mean, math.sqrt(spread / len(lost_by))
+        penalties.append(own[transferred][seed] - own[best][seed])
+    mean = add_up(penalties) / len(penalties)
+    spread = add_up((d - mean) ** 2 for d in penalties) / (len(penalties) - 1)
+    return mean, math.sqrt(spread / len(penalties))
 
 
 def _of(rows: Iterable[Row], sweep: str, role: str, series: str) -> list[Row]:

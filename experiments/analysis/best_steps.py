@@ -25,8 +25,9 @@ LOSS = "cross_entropy"
 
 
 @dataclass(frozen=True)
-class AtBest:
-    """A point judged at the steps chosen on other episodes; `chosen` lists steps and how often each was, 'n x m'.
+class BestSteps:
+    """A point judged at the number of steps chosen on other episodes; `chosen` lists numbers and how often each was
+    chosen, 'steps x times'.
     `edge`: "edge" where the fewest or the most steps that were tried were chosen, so that others may suit it better."""
 
     sweep: str
@@ -43,28 +44,30 @@ class AtBest:
     edge: str
 
 
-def judge_at_best(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[AtBest]:
-    """Of sweeps whose curves differ in nothing but steps: points and seeds that have at least two of them, on episodes
-    that can be halved. Raises NotComparable."""
-    found = []
+def judge_at_best(
+    sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
+) -> list[BestSteps]:
+    """For sweeps whose curves differ in the number of steps alone: every point and seed with at least two numbers of
+    steps, where its episodes can be halved. Raises NotComparable."""
+    rows = []
     for sweep in sweeps:
         if not (sweep.measured and sweep.several) or sweep.valley:
             continue
-        there: dict[float, dict[int, dict[int, WindowTable]]] = defaultdict(lambda: defaultdict(dict))
+        tables_by_steps: dict[float, dict[int, dict[int, WindowTable]]] = defaultdict(lambda: defaultdict(dict))
         for point in sweep.points:
             table = windows.get(trial_id(point.trial, provenance))
             if point.role == POINT and not point.scope and table is not None and LOSS in table.metrics:
-                there[point.x][point.trial.train.seed][point.trial.train.steps] = table
-        for x, seeds in sorted(there.items()):
+                tables_by_steps[point.x][point.trial.train.seed][point.trial.train.steps] = table
+        for x, seeds in sorted(tables_by_steps.items()):
             several = {
                 s: tables for s, tables in sorted(seeds.items()) if len(tables) > 1 and _halved(tables, sweep.scope)
             }
             if several:
-                found += _judge(sweep, x, several)
-    return found
+                rows += _judge(sweep, x, several)
+    return rows
 
 
-def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]]) -> list[AtBest]:
+def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]]) -> list[BestSteps]:
     composed, chosen = {}, Counter()
     for seed, tables in seeds.items():
         composed[seed], steps = cross_fit(tables, sweep.scope)
@@ -81,7 +84,7 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
             continue
         (i,) = bootstrap_intervals(panel.rows(panel.known))
         rows.append(
-            AtBest(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed, edge)
+            BestSteps(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed, edge)
         )
     return rows
 
@@ -114,8 +117,8 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
 
 
 def halves(table: WindowTable) -> np.ndarray:
-    """int [n], 0 or 1: every other episode of each robot, in the order of their numbers. Robots of a single episode
-    take turns, or half 1 would be empty where no robot has two."""
+    """int [n], 0 or 1: the episodes of each robot alternate, by number; robots of a single episode alternate, too, or
+    half 1 would be empty where no robot has two."""
     half, alone = np.zeros(len(table), int), 0
     for robot in table.datasets:
         own = table.dataset == robot
@@ -130,7 +133,7 @@ def _halved(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> bool:
 
 
 def _mean_of_robots(table: WindowTable, chosen: np.ndarray) -> float:
-    """Over those robots that `chosen` [n] has a window of."""
+    """The mean loss of the windows `chosen`, bool [n], by robot, then over robots."""
     loss = table.metrics[LOSS]
     own = [chosen & (table.dataset == robot) for robot in table.datasets]
     return float(np.mean([loss[rows].mean() for rows in own if rows.any()]))

@@ -64,11 +64,15 @@ class Panel:
         if not same or len(self.points) != len(other.points):
             raise NotComparable("panels of different windows or points cannot be subtracted")
         points, names = [], []
-        for mine, own, theirs, foreign in zip(self.points, self.seeds, other.points, other.seeds, strict=True):
-            shared = tuple(s for s in own if s in foreign)
+        for left, left_seeds, right, right_seeds in zip(
+            self.points, self.seeds, other.points, other.seeds, strict=True
+        ):
+            shared = tuple(s for s in left_seeds if s in right_seeds)
             if not shared:
-                raise NotComparable(f"seeds {own} and {foreign} have none in common; run the same seeds of both")
-            points.append(mine[[own.index(s) for s in shared]] - theirs[[foreign.index(s) for s in shared]])
+                raise NotComparable(
+                    f"seeds {left_seeds} and {right_seeds} have none in common; run the same seeds of both"
+                )
+            points.append(left[[left_seeds.index(s) for s in shared]] - right[[right_seeds.index(s) for s in shared]])
             names.append(shared)
         return Panel(self.robot, self.episode, tuple(points), tuple(names))
 
@@ -124,16 +128,16 @@ def resample(
     else:
         drawn = np.tile(value, (draws, 1))
     weights: dict[tuple[int, ...], np.ndarray] = {}
-    found, points, at = [], [], 0
+    drawn_means, points, row = [], [], 0
     for seeds in panel.seeds:
-        own = slice(at, at + len(seeds))
-        at += len(seeds)
+        own = slice(row, row + len(seeds))
+        row += len(seeds)
         if seeds not in weights:
             equal = np.full((draws, len(seeds)), 1 / len(seeds))
             weights[seeds] = _weights(len(seeds), draws, rng) if over_seeds else equal
-        found.append((weights[seeds] * drawn[:, own]).sum(1))
+        drawn_means.append((weights[seeds] * drawn[:, own]).sum(1))
         points.append(value[own].mean())
-    return Draws(np.asarray(points), np.stack(found, axis=1))
+    return Draws(np.asarray(points), np.stack(drawn_means, axis=1))
 
 
 def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list[Interval]:
@@ -150,18 +154,18 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list
         for s, e in ((True, True), (True, False), (False, True))
     )
     sums, counts, ends = _by_episode(panel)
-    episodes, value, found, at = sums.shape[1], _mean_of_robots(sums, counts, ends), [], 0
+    episodes, value, intervals, row = sums.shape[1], _mean_of_robots(sums, counts, ends), [], 0
     for i, seeds in enumerate(panel.seeds):
-        own = slice(at, at + len(seeds))
-        at += len(seeds)
+        own = slice(row, row + len(seeds))
+        row += len(seeds)
         mean = float(value[own].mean())
         # nan, as the interval, if no robot has two episodes
         t_episode = critical(_freedom(sums[own].mean(0), counts, ends))
         t_seed = critical(len(seeds) - 1) if len(seeds) > 1 else 0.0
         half = math.hypot(t_seed * by_seed[i], t_episode * by_episode[i])
         sem = float(both[i]) if episodes > len(ends) else math.nan
-        found.append(Interval(mean, sem, mean - half, mean + half, len(panel.robot), episodes))
-    return found
+        intervals.append(Interval(mean, sem, mean - half, mean + half, len(panel.robot), episodes))
+    return intervals
 
 
 def _by_episode(panel: Panel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

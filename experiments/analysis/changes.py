@@ -58,14 +58,14 @@ Ends = Mapping[float, Mapping[int, tuple[Point, WindowTable]]]
 
 def _ends(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends | None:
     """{x: {seed: its trial}} of the first and the last x; None without two that have a seed in common."""
-    there: dict[float, dict[int, tuple[Point, WindowTable]]] = {}
+    trials: dict[float, dict[int, tuple[Point, WindowTable]]] = {}
     for point in sweep.points:
         table = windows.get(trial_id(point.trial, provenance))
         if point.role == POINT and point.series == series and table is not None:
-            there.setdefault(point.x, {})[point.trial.train.seed] = point, table
-    if len(there) < 2:
+            trials.setdefault(point.x, {})[point.trial.train.seed] = point, table
+    if len(trials) < 2:
         return None
-    ends = {x: there[x] for x in (min(there), max(there))}
+    ends = {x: trials[x] for x in (min(trials), max(trials))}
     return ends if set.intersection(*(set(side) for side in ends.values())) else None
 
 

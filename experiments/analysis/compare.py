@@ -110,14 +110,14 @@ def _panels(pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robot
 
 def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[Difference]:
     """Over the windows that have it, of which there may be none."""
-    there = a.known & b.known
-    robots = list(dict.fromkeys(a.robot[there].tolist()))
-    chosen = [(robot, there & (a.robot == robot)) for robot in robots]
+    known = a.known & b.known
+    robots = list(dict.fromkeys(a.robot[known].tolist()))
+    chosen = [(robot, known & (a.robot == robot)) for robot in robots]
     if not robots:
         return []
-    rows = [(OVERALL, there), *chosen] if len(robots) > 1 else chosen
+    rows = [(OVERALL, known), *chosen] if len(robots) > 1 else chosen
     if not by_robot:
-        rows = [(OVERALL, there)]
+        rows = [(OVERALL, known)]
     return [_difference(scope, metric, a.rows(index), b.rows(index)) for scope, index in rows]
 
 

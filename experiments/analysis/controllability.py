@@ -1,8 +1,9 @@
-"""Per robot, whether a model follows actions, beside how much there is to follow.
+"""Per robot, whether a model follows its actions, and how much of the true motion the actions decide.
 
 One row per robot and metric: the mean with its interval over episodes and, where several seeds were judged, over
-these (`bootstrap`), how many standard errors it is from what a deaf model has, and what share of the change of this
-robot's pixels its actions explain in truth (`experiments.suite.explained`).
+these (`bootstrap`), how many standard errors it is from the value of a deaf model (one whose predictions do not depend
+on actions), and what share of the change of this robot's pixels its actions explain in truth
+(`experiments.suite.explained`).
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
 
 METRICS = ("delta_psnr", "action_nats", "retrieval", "counterfactual_gain")
-"""What a deaf model has none of; of retrieval, more than chance."""
+"""Metrics that are 0 for a deaf model; retrieval is at chance."""
 
 ENOUGH = 2.0
-"""Standard errors beyond which a robot is counted."""
+"""Standard errors above a deaf model beyond which a robot counts as following actions."""
 
 ROUNDING = 1e-5
-"""dB or nats below which a mean is as good as that of a deaf model: devices round by as much, and rounding scatters
-so little that it would look certain."""
+"""dB or nats below which a mean counts as 0: rounding differs by as much between devices, and scatters so little that
+it would look significant."""
 
 
 @dataclass(frozen=True)
-class Controlled:
+class Controllability:
     """A line of the table; `mean` less `deaf` is `errors` standard errors from zero."""
 
     robot: str
@@ -50,7 +51,7 @@ class Controlled:
     role: str = POINT  # or CONTROL: a model trained on the actions of other episodes, which has nothing to follow
 
 
-def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Controlled]:
+def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Controllability]:
     """Of one model of that `role` under several seeds, {seed: table}: every robot that has the metric, in the
     order of the tables.
 
@@ -71,35 +72,37 @@ def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Co
     return rows
 
 
-def beyond(rows: Iterable[Controlled], metric: str) -> tuple[int, int]:
+def count_following(rows: Iterable[Controllability], metric: str) -> tuple[int, int]:
     """(robots whose metric is more than ENOUGH standard errors above that of a deaf model, robots that have it)."""
     own = [row for row in rows if row.metric == metric]
     return sum(row.errors > ENOUGH for row in own), len(own)
 
 
-def by_chance(rows: Iterable[Controlled], metric: str) -> float:
-    """How many of these robots a deaf model has there on average: few episodes make a rough standard error, so that it
-    is Student's t, with as many degrees of freedom as episodes less one. A robot without actions, which has
-    the value of a deaf model in every window, is never there."""
+def expected_by_chance(rows: Iterable[Controllability], metric: str) -> float:
+    """How many of these robots would be counted for a deaf model, on average: by Student's t with as many degrees of
+    freedom as episodes less one, since few episodes make a rough standard error. A robot without actions, which has
+    the value of a deaf model in every window, is never counted."""
     own = [row for row in rows if row.metric == metric and row.episodes > 1]
     freedom = [row.episodes - 1 for row in own if max(abs(row.mean - row.deaf), row.sem) > ROUNDING]
     return float(stdtr(freedom, -ENOUGH).sum())
 
 
-def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, role: str) -> Sequence[Controlled]:
+def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, role: str) -> Sequence[Controllability]:
     values = np.stack([table.metrics[metric] for table in tables.values()])
-    there = ~np.isnan(values).any(0)
-    if not there.any():
+    known = ~np.isnan(values).any(0)
+    if not known.any():
         return ()
     first = next(iter(tables.values()))
-    deaf = float(np.mean(first.metrics["retrieval_chance"][there])) if metric == "retrieval" else 0.0
-    panel = Panel(first.dataset[there], first.episode[there], (values[:, there],), (tuple(tables),))
-    (found,) = bootstrap_intervals(panel)
-    away = found.mean - deaf
-    errors = 0.0 if abs(away) < ROUNDING else away / found.sem if found.sem else float(np.copysign(np.inf, away))
+    deaf = float(np.mean(first.metrics["retrieval_chance"][known])) if metric == "retrieval" else 0.0
+    panel = Panel(first.dataset[known], first.episode[known], (values[:, known],), (tuple(tables),))
+    (interval,) = bootstrap_intervals(panel)
+    excess = interval.mean - deaf
+    errors = (
+        0.0 if abs(excess) < ROUNDING else excess / interval.sem if interval.sem else float(np.copysign(np.inf, excess))
+    )
     return (
-        Controlled(
-            robot, metric, found.mean, found.sem, found.low, found.high, deaf, errors, len(tables), found.n,
-            found.episodes, share, role,
+        Controllability(
+            robot, metric, interval.mean, interval.sem, interval.low, interval.high, deaf, errors, len(tables), interval.n,
+            interval.episodes, share, role,
         ),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from experiments.analysis.measured import Measured
+from experiments.analysis.measured import Measurements
 from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, predict_log
 
 DRAWS, LEVEL = 1000, 0.90
@@ -47,7 +47,7 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class PowerFit:
-    """A fit of `Measured`, or why there is none (`refused`)."""
+    """A fit of `Measurements`, or why there is none (`refused`)."""
 
     axes: tuple[str, ...]
     trials: tuple[str, ...]
@@ -88,7 +88,7 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
 
 
-def fit_power(measured: Measured, draws: int = DRAWS, episodes: bool = True) -> PowerFit:
+def fit_power(measured: Measurements, draws: int = DRAWS, episodes: bool = True) -> PowerFit:
     """The saturating power law of a loss over one axis or two, or the reason why there is none.
 
     `episodes`: whether bootstraps draw episodes too. Without, intervals are conditional on the frozen windows, as
@@ -120,7 +120,7 @@ def weight_of(noise: np.ndarray) -> np.ndarray:
     return np.exp(np.log(noise).mean()) / noise
 
 
-def _unfit(measured: Measured) -> str:
+def _unfit(measured: Measurements) -> str:
     """Why no power law can be fitted; '' if one can."""
     for name, column in zip(measured.axes, measured.x.T, strict=True):
         distinct = np.unique(column)
@@ -140,7 +140,7 @@ def _unfit(measured: Measured) -> str:
     return _rising(measured)
 
 
-def _lines(measured: Measured, k: int) -> list[np.ndarray]:
+def _lines(measured: Measurements, k: int) -> list[np.ndarray]:
     """[n] each: the trials that differ on axis `k` alone, at two positions of it or more. None where no two share a
     position on the other axis, as at equal compute no two sizes see as many windows."""
     others = np.delete(measured.x, k, axis=1)
@@ -148,7 +148,7 @@ def _lines(measured: Measured, k: int) -> list[np.ndarray]:
     return [line for line in lines if len(np.unique(measured.x[line, k])) > 1]
 
 
-def _rising(measured: Measured) -> str:
+def _rising(measured: Measurements) -> str:
     """A loss that does not fall from the first position of an axis to the last, by more than seeds scatter."""
     logs, noise = np.log(measured.value), np.nan_to_num(measured.noise())
     for k, name in enumerate(measured.axes):
@@ -169,7 +169,7 @@ def _rising(measured: Measured) -> str:
     return ""
 
 
-def _inferred(measured: Measured) -> tuple[str, ...]:
+def _inferred(measured: Measurements) -> tuple[str, ...]:
     """Axes along which no trials were compared: that the loss falls there follows from the form."""
     alone = [name for k, name in enumerate(measured.axes) if not _lines(measured, k)]
     return tuple(
@@ -191,7 +191,7 @@ def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> 
     return tuple(Coefficient(n, float(values[n]), *map(float, interval(draws[n]))) for n in values)
 
 
-def _misfit(measured: Measured, residuals: np.ndarray) -> tuple[str, ...]:
+def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
     """Whether positions lie off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
     takes trials for independent, which branches of one run are not quite."""
     points, count = measured.points, np.bincount(measured.points)
@@ -208,7 +208,7 @@ def _misfit(measured: Measured, residuals: np.ndarray) -> tuple[str, ...]:
     return (f"{said}: over the whole range the loss is not of this form",)
 
 
-def _first_position(measured: Measured, found: tuple[Coefficient, ...], weight: np.ndarray) -> tuple[str, ...]:
+def _first_position(measured: Measurements, found: tuple[Coefficient, ...], weight: np.ndarray) -> tuple[str, ...]:
     """Whether the exponent over one axis hangs on the first position, where a power law need not hold yet."""
     x = measured.x[:, 0]
     keep = x > x.min()
@@ -223,7 +223,7 @@ def _first_position(measured: Measured, found: tuple[Coefficient, ...], weight: 
     return (f"without the first position alpha is {theta[2]:.2g} and E {np.exp(theta[0]):.2g}",)
 
 
-def _verdict(measured: Measured, theta: np.ndarray, thetas: np.ndarray) -> tuple[str, tuple[str, ...]]:
+def _verdict(measured: Measurements, theta: np.ndarray, thetas: np.ndarray) -> tuple[str, tuple[str, ...]]:
     """(why the form is not identified, or '', what is doubtful)."""
     k, doubts = len(measured.axes), []
     for i, (_, name) in enumerate(NAMES[:k]):

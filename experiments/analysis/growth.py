@@ -73,22 +73,22 @@ def _along(
     windows: Mapping[str, WindowTable],
     episodes: Mapping[str, int],
 ) -> list[Growth]:
-    there: dict[float, dict[int, tuple[Trial, WindowTable]]] = {}
+    trials: dict[float, dict[int, tuple[Trial, WindowTable]]] = {}
     for p in points:
         if (table := windows.get(trial_id(p.trial, provenance))) is not None:
-            there.setdefault(p.x, {})[p.trial.train.seed] = p.trial, table
+            trials.setdefault(p.x, {})[p.trial.train.seed] = p.trial, table
     found = []
-    for first, last in pairwise(sorted(there)):
-        seeds = there[first].keys() & there[last].keys()
+    for first, last in pairwise(sorted(trials)):
+        seeds = trials[first].keys() & trials[last].keys()
         if not seeds:
             continue
-        before, after = (trajectories_of(next(iter(there[x].values()))[0], episodes) for x in (first, last))
+        before, after = (trajectories_of(next(iter(trials[x].values()))[0], episodes) for x in (first, last))
         known = [name for name in sweep.scope if name in before and name in after]
         groups = {
             GROWS: [name for name in known if after[name] > before[name]],
             EXHAUSTED: [name for name in known if after[name] <= before[name]],
         }
-        b, a = (Side(f"{sweep.axis} {x:g}", {s: there[x][s][1] for s in sorted(seeds)}, "") for x in (first, last))
+        b, a = (Side(f"{sweep.axis} {x:g}", {s: trials[x][s][1] for s in sorted(seeds)}, "") for x in (first, last))
         for data, robots in groups.items():
             for metric in METRICS if robots else ():
                 d = overall_difference(a, b, metric, robots)

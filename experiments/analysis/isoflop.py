@@ -18,7 +18,7 @@ import scipy.stats
 from scipy.interpolate import Akima1DInterpolator
 
 from experiments.analysis.fits import DRAWS, OFTEN, UNLIKELY, Coefficient, interval
-from experiments.analysis.measured import Measured
+from experiments.analysis.measured import Measurements
 from experiments.words import counted
 
 TOLERANCE = 0.1
@@ -70,7 +70,7 @@ class IsoFlop:
     refused: str = ""
 
 
-def fit_isoflop(measured: Measured, budgets: np.ndarray | None = None, draws: int = DRAWS) -> IsoFlop:
+def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws: int = DRAWS) -> IsoFlop:
     """Of losses over (size N, training FLOPs C). Without `budgets`, BUDGETS of them, evenly spread in log C over
     where at least LEAST_SIZES sizes were measured."""
     sizes = np.unique(measured.x[:, 0])
@@ -96,7 +96,7 @@ def fit_isoflop(measured: Measured, budgets: np.ndarray | None = None, draws: in
 class _Line:
     """log loss of one size over log C, of the values and of every draw, its seeds averaged."""
 
-    def __init__(self, measured: Measured, values: np.ndarray, size: float):
+    def __init__(self, measured: Measurements, values: np.ndarray, size: float):
         own = measured.x[:, 0] == size
         self.size, flops = size, measured.x[own, 1]
         self.flops, which = np.unique(flops, return_inverse=True)

@@ -1,4 +1,4 @@
-"""The losses that a curve is fitted to, and how they would scatter with other seeds and other episodes.
+"""The measured losses that a curve is fitted to, and bootstrap draws of them over seeds and episodes.
 
 Episodes are drawn by `bootstrap`: all trials are judged on the same frozen windows, so that a draw takes the same ones
 for all of them, and what makes an episode hard moves the whole curve and not its shape. Seeds are drawn here, since a
@@ -33,7 +33,7 @@ class NoLevel(NotComparable):
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurements:
     """A loss in nats per token of n trials at positions `x` on K axes."""
 
     axes: tuple[str, ...]  # K names, such as "trunk parameters"
@@ -120,8 +120,8 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a trial stands."""
+class Position:
+    """A trial's position on the axes of a curve, and the robots it is judged on."""
 
     trial: str
     run: str
@@ -131,29 +131,29 @@ class Place:
 
 
 def measure(
-    axes: Sequence[str], places: Sequence[Place], tables: Mapping[str, WindowTable], metric: str = "cross_entropy"
-) -> Measured:
-    """The losses of trials at `places` from their `tables` of windows, each over its own robots.
+    axes: Sequence[str], positions: Sequence[Position], tables: Mapping[str, WindowTable], metric: str = "cross_entropy"
+) -> Measurements:
+    """The losses of trials at `positions` from their `tables` of windows, each over its own robots.
 
     Raises NotComparable unless trials of the same robots were judged on the same windows, and NoLevel where they are of
     several robots that nothing makes comparable.
     """
-    require(len(places) > 0, "no finished trial to measure")
+    require(len(positions) > 0, "no finished trial to measure")
     groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    for i, place in enumerate(places):
-        groups[place.scope].append(i)
+    for i, position in enumerate(positions):
+        groups[position.scope].append(i)
     panels = {
-        scope: make_panel([{places[i].seed: tables[places[i].trial]} for i in own], metric, scope)
+        scope: make_panel([{positions[i].seed: tables[positions[i].trial]} for i in own], metric, scope)
         for scope, own in groups.items()
     }
-    value = np.zeros(len(places))
+    value = np.zeros(len(positions))
     for scope, own in groups.items():
         value[own] = resample(panels[scope], 1, over_seeds=False, over_episodes=False).value
-    seed = np.array([place.seed for place in places])
-    x = np.array([place.x for place in places], float).reshape(len(places), len(axes))
+    seed = np.array([position.seed for position in positions])
+    x = np.array([position.x for position in positions], float).reshape(len(positions), len(axes))
     panel = next(iter(panels.values())) if len(panels) == 1 else None
-    return Measured(
-        tuple(axes), x, np.array([place.run for place in places]), tuple(place.trial for place in places), seed,
+    return Measurements(
+        tuple(axes), x, np.array([position.run for position in positions]), tuple(position.trial for position in positions), seed,
         value if panel else _levelled(value, x, seed), panel, 0 if panel else len(np.unique(seed)) - 1,
     )  # fmt: skip
 

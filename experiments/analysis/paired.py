@@ -38,13 +38,13 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
         raise NotComparable(f"no robot was judged in both: {few(a.datasets)} and {few(b.datasets)}")
     for robot in shared:
         try:
-            mine = a.of(robot)
-            theirs = b.of(robot).matched_to(mine)
+            of_a = a.of(robot)
+            of_b = b.of(robot).matched_to(of_a)
         except ConfigError as error:
             raise NotComparable(f"{robot}: {error}") from error
-        _require_equal(mine, mine.frames, theirs.frames, "real frames", 0)
-        if TRUTH in mine.metrics and TRUTH in theirs.metrics:
-            _require_equal(mine, mine.metrics[TRUTH], theirs.metrics[TRUTH], f"dB of {TRUTH}", SAME)
+        _require_equal(of_a, of_a.frames, of_b.frames, "real frames", 0)
+        if TRUTH in of_a.metrics and TRUTH in of_b.metrics:
+            _require_equal(of_a, of_a.metrics[TRUTH], of_b.metrics[TRUTH], f"dB of {TRUTH}", SAME)
     return shared
 
 
@@ -56,13 +56,13 @@ def agree(a: WindowTable, b: WindowTable) -> bool:
     return not both or bool((np.abs(a.metrics[TRUTH] - b.metrics[TRUTH]) <= SAME).all())
 
 
-def _require_equal(table: WindowTable, mine: np.ndarray, theirs: np.ndarray, what: str, tolerance: float) -> None:
+def _require_equal(table: WindowTable, of_a: np.ndarray, of_b: np.ndarray, what: str, tolerance: float) -> None:
     """Raises NotComparable, naming the first window of `table` whose numbers differ."""
-    other = np.flatnonzero(~(np.abs(mine - theirs) <= tolerance))
-    if len(other):
-        robot, episode, start = table.names[other[0]]
+    differing = np.flatnonzero(~(np.abs(of_a - of_b) <= tolerance))
+    if len(differing):
+        robot, episode, start = table.names[differing[0]]
         raise NotComparable(
-            f"window ({robot}, episode {episode}, frame {start}) is not the same one in both: {mine[other[0]]:g} and "
-            f"{theirs[other[0]]:g} {what} (and {len(other) - 1} others of {robot}); compare trials of one frozen set of "
+            f"window ({robot}, episode {episode}, frame {start}) is not the same one in both: {of_a[differing[0]]:g} and "
+            f"{of_b[differing[0]]:g} {what} (and {len(differing) - 1} others of {robot}); compare trials of one frozen set of "
             "windows, on the same data and with the same prompt"
         )

@@ -1,4 +1,4 @@
-"""What a fit says of trials that have not run, written down before they do; and what came.
+"""Predictions of a fit for trials that have not run, sealed before they do, and their outcomes.
 
 A prediction is a small JSON file, sealed with a hash of itself: the fit, the hash of every result it was made from,
 which trials were finished then, and the loss that the trials of one position will have on the frozen windows, with an
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from experiments.analysis.fits import LEVEL, interval
-from experiments.analysis.measured import Place, measure
+from experiments.analysis.measured import Position, measure
 from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_near
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
@@ -44,14 +44,14 @@ class Prediction:
     finished: tuple[str, ...]  # every trial of the study that had a result when this was written
 
     @property
-    def place(self) -> str:
+    def position(self) -> str:
         """In words: '132,480 trunk parameters'."""
         return ", ".join(f"{x:,.12g} {axis}" for x, axis in zip(self.x, self.axes, strict=True))
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A prediction beside what came; `marks` say why it may count for less."""
+    """A prediction and its outcome; `marks` say why it may count for less."""
 
     prediction: Prediction
     observed: float | None  # None: none of its trials is finished
@@ -67,7 +67,7 @@ class Outcome:
 
 def predict(
     curve: Curve,
-    held_out: Sequence[Place],
+    held_out: Sequence[Position],
     windows: Mapping[str, WindowTable],
     hashes: Mapping[str, str],
 ) -> Prediction:
@@ -77,9 +77,9 @@ def predict(
     the trials is finished already, or the others identify no power law.
     """
     ids = tuple(p.trial for p in held_out)
-    there = [id for id in ids if id in windows]
-    require(not there, f"{', '.join(there)} has a result already: a prediction is made before its trial is run")
-    others = Curve(curve.name, curve.axes, tuple(p for p in curve.places if p.trial not in ids))
+    finished = [id for id in ids if id in windows]
+    require(not finished, f"{', '.join(finished)} has a result already: a prediction is made before its trial is run")
+    others = Curve(curve.name, curve.axes, tuple(p for p in curve.positions if p.trial not in ids))
     fitted = fit_curve(others, windows, episodes=False)
     fit = fitted.fit
     require(not fit.refused, f"{curve.name}: nothing can be predicted: {fit.refused}")
@@ -103,7 +103,7 @@ def predict(
 def compare(
     prediction: Prediction, curves: Sequence[Curve], windows: Mapping[str, WindowTable], hashes: Mapping[str, str]
 ) -> Outcome:
-    """What came of a prediction."""
+    """The outcome of a prediction."""
     curve = next((c for c in curves if c.name == prediction.curve), None)
     finished = [p for p in curve.finished(windows) if p.trial in prediction.trials] if curve else []
     marks = []
@@ -111,7 +111,7 @@ def compare(
         marks.append(f"made after {', '.join(early)} had run: no prediction")
     if changed := [id for id, hash in prediction.inputs.items() if hashes.get(id) != hash]:
         marks.append(f"{len(changed)} of the {len(prediction.inputs)} results it was made from changed or are missing")
-    if curve is None or not set(prediction.trials) <= {p.trial for p in curve.places}:
+    if curve is None or not set(prediction.trials) <= {p.trial for p in curve.positions}:
         marks.append("the study does not plan its trials")
     if finished and len(finished) < len(prediction.trials):
         marks.append(f"{len(finished)} of its {len(prediction.trials)} trials finished")

@@ -1,4 +1,4 @@
-"""What the author of a study expected of its points, written down before they ran; and what came.
+"""The author's preregistered expectations of a study, and their outcomes.
 
 A study keeps it in predictions/preregistered.csv, a line per number, by hand: from whatever was known and thought then,
 where `predictions` holds what a fit says by itself. No seal tells when it was written: the column `commit` names the
@@ -26,7 +26,7 @@ FILE = "preregistered.csv"
 
 @dataclass(frozen=True)
 class Expected:
-    """A number that the mean over seeds and judged robots was expected to be, with the interval it was given."""
+    """The expected value of a mean over seeds and judged robots, with the expected interval."""
 
     sweep: str
     series: str  # the curve, in a sweep of several
@@ -41,8 +41,8 @@ class Expected:
 
 
 @dataclass(frozen=True)
-class Came:
-    """One expectation beside what came: `observed`, the mean over `seeds` of the `planned` ones; None before any ran.
+class ExpectationOutcome:
+    """An expectation and its outcome: `observed`, the mean over `seeds` of the `planned` ones; None before any ran.
 
     `seed_sem` is its standard error over seeds."""
 
@@ -87,9 +87,10 @@ def read_expected(path: Path) -> list[Expected]:
             where = f"{path}, line {number}"
             require(e.low <= e.mean <= e.high, f"{where}: low, mean and high do not ascend")
             require(math.isfinite(e.high - e.low), f"{where}: an interval without an end holds more than can come")
-            places = frozenset(map(_place, (e.x, e.against)))  # a difference the other way round is the same number
-            require(len(places) > 1, f"{where}: x has to name a point, and against, if it is given, another one")
-            first = lines.setdefault((e.sweep, e.series, places, e.metric, frozenset(e.seeds)), number)
+            # A difference the other way round is the same number.
+            positions = frozenset(map(_position, (e.x, e.against)))
+            require(len(positions) > 1, f"{where}: x has to name a point, and against, if it is given, another one")
+            first = lines.setdefault((e.sweep, e.series, positions, e.metric, frozenset(e.seeds)), number)
             require(
                 first == number,
                 f"{where}: of the same number as line {first}, which would count twice; keep the one that "
@@ -98,9 +99,9 @@ def read_expected(path: Path) -> list[Expected]:
     return found
 
 
-def what_came(expected: Sequence[Expected], rows: Sequence[Row]) -> list[Came]:
-    """Of every expectation of an axis that `rows` have; other axes may come. Raises ConfigError for an axis, a curve, a
-    point or a metric that is not there."""
+def compare_expected(expected: Sequence[Expected], rows: Sequence[Row]) -> list[ExpectationOutcome]:
+    """The outcome of every expectation of an axis that is in `rows`; others may still be run. Raises ConfigError for an
+    unknown axis, curve, point or metric."""
     points: dict[str, list[Row]] = defaultdict(list)  # once, of a hundred thousand rows
     for row in rows:
         if row.role == POINT and not row.of_robot:
@@ -108,40 +109,40 @@ def what_came(expected: Sequence[Expected], rows: Sequence[Row]) -> list[Came]:
     known = {*AXES, *(r.sweep for r in rows)}
     for e in expected:
         require(e.sweep in known, f"{FILE}: no axis {e.sweep!r}; known: {', '.join(sorted(known))}")
-    return [_came(e, points[e.sweep]) for e in expected if e.sweep in points]
+    return [_compare_one(e, points[e.sweep]) for e in expected if e.sweep in points]
 
 
-def _came(e: Expected, rows: Sequence[Row]) -> Came:
+def _compare_one(e: Expected, rows: Sequence[Row]) -> ExpectationOutcome:
     """`rows`: of the axis, without its controls."""
     where = f"{FILE}: {e.sweep}, {e.series}" if e.series else f"{FILE}: {e.sweep}"
     absent = set(e.seeds) - {r.seed for r in rows}
     require(not absent, f"{where} has no seed {', '.join(map(str, sorted(absent)))}")
     rows = [r for r in rows if not e.seeds or r.seed in e.seeds]
-    places = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
+    positions = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
     for x in filter(None, (e.x, e.against)):
-        there = dict.fromkeys(label or f"{place:g}" for place, label, _ in sorted(places))
-        known = any(_names(x, place, label) for place, label, _ in places)
-        require(known, f"{where} has no point {x!r}, but {', '.join(there) or 'none, nor such a curve'}")
+        names = dict.fromkeys(label or f"{at:g}" for at, label, _ in sorted(positions))
+        known = any(_names(x, at, label) for at, label, _ in positions)
+        require(known, f"{where} has no point {x!r}, but {', '.join(names) or 'none, nor such a curve'}")
     metrics = {r.metric for r in rows} - {""}
     require(not metrics or e.metric in metrics, f"{where} has no metric {e.metric!r}, but {', '.join(sorted(metrics))}")
-    planned = {seed for place, label, seed in places if _names(e.x, place, label)}
+    planned = {seed for at, label, seed in positions if _names(e.x, at, label)}
     points = curve(rows, e.sweep, e.metric, series=e.series)
     point, base = (next((p for p in points if _names(x, p.x, p.label)), None) for x in (e.x, e.against))
     seeds = set(point.seeds) if point else set()
     if e.against:
         seeds &= set(base.seeds) if base else set()
     if point is None or not seeds:
-        return Came(e, None, math.nan, 0, len(planned))
+        return ExpectationOutcome(e, None, math.nan, 0, len(planned))
     mean, error = difference(point, base) if base and e.against else (point.mean, point.seed_sem)
-    return Came(e, mean, error, len(seeds), len(planned))
+    return ExpectationOutcome(e, mean, error, len(seeds), len(planned))
 
 
 def _names(text: str, x: float, label: str) -> bool:
     """Whether `text` means the position `x`, called `label` on an axis of names."""
-    return text == label if label else _place(text) == x
+    return text == label if label else _position(text) == x
 
 
-def _place(text: str) -> float | str:
+def _position(text: str) -> float | str:
     """A position, or its name: 8 and 8.0 are one."""
     try:
         return float(text)

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.analysis.fits import DRAWS, PowerFit, fit_power
 from experiments.analysis.isoflop import IsoFlop, fit_isoflop
-from experiments.analysis.measured import PRIOR, Measured, NoLevel, Place, measure
+from experiments.analysis.measured import PRIOR, Measurements, NoLevel, Position, measure
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, drop_later_fields, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
@@ -36,22 +36,22 @@ OTHER_ROBOTS = "every seed is judged on other robots, how hard these are is take
 
 @dataclass(frozen=True)
 class Curve:
-    """Trials on one axis, or two; `places` are those that the study plans."""
+    """Trials on one axis, or two; `positions` are those that the study plans."""
 
     name: str  # such as "width", and "-<series>" after it
     axes: tuple[str, ...]
-    places: tuple[Place, ...]
+    positions: tuple[Position, ...]
 
-    def finished(self, windows: Mapping[str, WindowTable]) -> tuple[Place, ...]:
-        return tuple(p for p in self.places if p.trial in windows and LOSS in windows[p.trial].metrics)
+    def finished(self, windows: Mapping[str, WindowTable]) -> tuple[Position, ...]:
+        return tuple(p for p in self.positions if p.trial in windows and LOSS in windows[p.trial].metrics)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class CurveFit:
     """A curve with what was measured on it and its fit."""
 
     curve: Curve
-    measured: Measured | None  # None: nothing is finished, or nothing that can be compared
+    measured: Measurements | None  # None: nothing is finished, or nothing that can be compared
     fit: PowerFit
 
 
@@ -85,32 +85,32 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tup
     if not both:
         return {}
     group = max(both, key=len)
-    places = tuple(
-        Place(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
+    positions = tuple(
+        Position(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
         for id, t in group.items()
     )
-    curve = Curve("joint", (TRUNK, WINDOWS), places)
+    curve = Curve("joint", (TRUNK, WINDOWS), positions)
     return {id: (trial, curve) for id, trial in group.items()}
 
 
-def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRAWS, episodes: bool = True) -> Fitted:
+def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRAWS, episodes: bool = True) -> CurveFit:
     """The power law of the finished trials of a curve. Raises ConfigError if they saw different windows."""
-    places = curve.finished(windows)
-    if not places:
-        return Fitted(curve, None, PowerFit(curve.axes, (), f"no finished trial has a {LOSS} of its windows"))
+    positions = curve.finished(windows)
+    if not positions:
+        return CurveFit(curve, None, PowerFit(curve.axes, (), f"no finished trial has a {LOSS} of its windows"))
     try:
-        measured = measure(curve.axes, places, windows, LOSS)
+        measured = measure(curve.axes, positions, windows, LOSS)
     except NoLevel as error:  # until more trials have finished
-        return Fitted(curve, None, PowerFit(curve.axes, tuple(p.trial for p in places), str(error)))
+        return CurveFit(curve, None, PowerFit(curve.axes, tuple(p.trial for p in positions), str(error)))
     fit = fit_power(measured, draws, episodes=episodes)
     if measured.panel is None and not fit.refused:
         fit = replace(fit, doubts=(*fit.doubts, OTHER_ROBOTS))
-    return Fitted(curve, measured, fit)
+    return CurveFit(curve, measured, fit)
 
 
 def fit_study(
     sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable], draws: int = DRAWS
-) -> list[Fitted]:
+) -> list[CurveFit]:
     """The fit of each curve, and the joint one where there is a surface."""
     curves = curves_of(sweeps, provenance)
     surface = surface_of(sweeps, provenance)
@@ -125,16 +125,16 @@ def fit_budgets(
     windows: Mapping[str, WindowTable],
     flops: Mapping[str, float],
     draws: int = DRAWS,
-) -> tuple[Measured | None, IsoFlop | None]:
+) -> tuple[Measurements | None, IsoFlop | None]:
     """The best size for a budget, from the surface's trials and the training `flops` of each; (None, None) without."""
     surface = surface_of(sweeps, provenance)
     if not surface:
         return None, None
     curve = next(iter(surface.values()))[1]
-    places = [replace(p, x=(p.x[0], flops[p.trial])) for p in curve.finished(windows)]
-    if not places:
+    positions = [replace(p, x=(p.x[0], flops[p.trial])) for p in curve.finished(windows)]
+    if not positions:
         return None, None
-    measured = measure((TRUNK, FLOPS), places, windows, LOSS)
+    measured = measure((TRUNK, FLOPS), positions, windows, LOSS)
     return measured, fit_isoflop(measured, draws=draws)
 
 
@@ -142,12 +142,14 @@ def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Prove
     """Over TRUNK where its trials differ in width."""
     wider = len({p.trial.model.width for p in points}) > 1
 
-    def place(p: Point) -> Place:
+    def position(p: Point) -> Position:
         x = float(trunk_parameters(p.trial.model)) if wider else float(p.x)
-        return Place(trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,), p.scope or sweep.scope)
+        return Position(
+            trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,), p.scope or sweep.scope
+        )
 
     name = "-".join(filter(None, (sweep.name, series)))
-    return Curve(name, (TRUNK if wider else sweep.axis,), tuple(map(place, points)))
+    return Curve(name, (TRUNK if wider else sweep.axis,), tuple(map(position, points)))
 
 
 @lru_cache
@@ -187,7 +189,7 @@ def _without_steps(trial: Trial) -> dict[str, Any]:
     return values
 
 
-def noise_near(measured: Measured, x: np.ndarray) -> tuple[float, float]:
+def noise_near(measured: Measurements, x: np.ndarray) -> tuple[float, float]:
     """(standard deviation over seeds of the logarithm of a trial's loss, its degrees of freedom) at the position of
     several seeds that is nearest to `x` [K]: it may grow along the axis. (nan, nan) where there is none."""
     count = np.bincount(measured.points)[measured.points]

@@ -39,14 +39,14 @@ def trial_row(
     provenance: Provenance,
     result: dict[str, Any] | None,
     loss: float,
-    there: Mapping[str, int],
+    available: Mapping[str, int],
 ) -> dict[str, Any]:
-    """One row; `result` is that of result.json (None: there is none), `loss` its training loss, `there` the training
-    trajectories that each robot has."""
+    """One row; `result` is that of result.json (None: there is none), `loss` its training loss, `available` the
+    training trajectories that each robot has."""
     row = {"trial": id, "title": title, "status": status}
     row |= {f"config.{path}": value for path, value in _flat(to_dict(trial))}
     row |= dataclasses.asdict(provenance)
-    used = trajectories_of(trial, there)
+    used = trajectories_of(trial, available)
     row["windows_drawn"] = trial.train.steps * trial.train.batch
     row["trajectories"] = sum(used.values()) if used.keys() == set(trial.datasets) else None
     if result is None:

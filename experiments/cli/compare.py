@@ -70,9 +70,6 @@ def compare(
 
 def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     """A line per scope, overall first; differences of the shown metrics with their standard errors."""
-    from experiments.analysis.compare import NOT_OF_MODELS
-    from experiments.analysis.paired import OF_TOKENS
-
     metrics = [m for m in SHOWN if any(row.metric == m for row in rows)]
     found = {(row.scope, row.metric): row for row in rows}
     ratio = "cross_entropy" in metrics
@@ -82,32 +79,43 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
         cells = [_cell(found.get((scope, metric))) for metric in metrics]
         nats = found.get((scope, "cross_entropy"))
         table.add_row(scope, *cells, *([f"x {nats.ratio:.4g}"] if nats else [""] * ratio))
-    several = max((row.seeds for row in rows), default=1)
-    seeds = f" and over {several} seeds" if several > 1 else ""
-    table.caption = f"Differences with standard errors over episodes{seeds}, window by window."
+    table.caption = _caption(rows, a, b)
+    return table
+
+
+def _caption(rows: list[Difference], a: Side, b: Side) -> str:
+    """What the errors count, and which seeds, robots and metrics were not compared."""
+    from experiments.analysis.compare import NOT_OF_MODELS
+    from experiments.analysis.paired import OF_TOKENS
+
+    seeds = max((row.seeds for row in rows), default=1)
+    over = f" and over {seeds} seeds" if seeds > 1 else ""
+    caption = f"Differences with standard errors over episodes{over}, window by window."
     for side, other in ((a, b), (b, a)):
-        if len(side.seeds) > several:
-            kept, there = (", ".join(map(str, x)) for x in ([s for s in side.seeds if s in other.seeds], side.seeds))
-            verb = "is" if several == 1 else "are"
-            table.caption += f" Of the seeds of {escape(side.name)} ({there}) only {kept} {verb} compared."
+        if len(side.seeds) > seeds:
+            all_seeds, common = (
+                ", ".join(map(str, x)) for x in (side.seeds, [s for s in side.seeds if s in other.seeds])
+            )
+            verb = "is" if seeds == 1 else "are"
+            caption += f" Of the seeds of {escape(side.name)} ({all_seeds}) only {common} {verb} compared."
             if not other.says_seed:
                 unsaid = "does not say with which seed it was trained, and stands for"
-                table.caption += f" {escape(other.name)} {unsaid} {kept}."
-        mine, theirs = (next(iter(one.seeds.values())).datasets for one in (side, other))
-        if left_out := [name for name in mine if name not in theirs]:
-            table.caption += f" Only {escape(side.name)} was judged on {few(left_out)}: nothing here is of them."
+                caption += f" {escape(other.name)} {unsaid} {common}."
+        robots, other_robots = (next(iter(one.seeds.values())).datasets for one in (side, other))
+        if left_out := [name for name in robots if name not in other_robots]:
+            caption += f" Only {escape(side.name)} was judged on {few(left_out)}: nothing here is of them."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
-        table.caption += f" No error of {few(alone)}: one held-out episode."
-    told = {row.metric for row in rows} | set(NOT_OF_MODELS)
+        caption += f" No error of {few(alone)}: one held-out episode."
+    explained = {row.metric for row in rows} | set(NOT_OF_MODELS)
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
-        table.caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
-        told |= set(OF_TOKENS)
+        caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
+        explained |= set(OF_TOKENS)
     elif not (a.tokenizer and b.tokenizer):
-        table.caption += " Nats are comparable only if both saw the same tokens, which one of them does not say."
-    there = dict.fromkeys(metric for side in (a, b) for windows in side.seeds.values() for metric in windows.metrics)
-    if missing := [metric for metric in there if metric not in told]:
-        table.caption += f" Not compared, since not both have them, or among as many actions: {', '.join(missing)}."
-    return table
+        caption += " Nats are comparable only if both saw the same tokens, which one of them does not say."
+    measured = dict.fromkeys(metric for side in (a, b) for table in side.seeds.values() for metric in table.metrics)
+    if missing := [metric for metric in measured if metric not in explained]:
+        caption += f" Not compared, since not both have them, or among as many actions: {', '.join(missing)}."
+    return caption
 
 
 def _heading(metric: str, ids: bool) -> str:

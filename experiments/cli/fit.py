@@ -17,8 +17,8 @@ from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
-    from experiments.analysis.measured import Place
-    from experiments.analysis.scaling import Curve, Fitted
+    from experiments.analysis.measured import Position
+    from experiments.analysis.scaling import Curve, CurveFit
     from experiments.running.provenance import Provenance
     from experiments.sweeps.sweep import Sweep
 
@@ -70,7 +70,7 @@ def _show(root: Path) -> None:
     console.print(table)
 
 
-def _words(fitted: Fitted) -> tuple[str, str, str]:
+def _words(fitted: CurveFit) -> tuple[str, str, str]:
     fit = fitted.fit
     if fit.refused:
         return "no fit", "", fit.refused
@@ -106,7 +106,7 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
     own = next((a for a, s in zip(record.axes, sweeps, strict=False) if s is sweep and is_file(a)), None)
     how = f"in {short(workspace.root / own)}" if own else "with --set"
     curve, held = _held_out(sweep, record.provenance, target, x, how)
-    ids = [place.trial for place in held]
+    ids = [position.trial for position in held]
     ledger = Ledger(workspace.ledger)
     ran = ledger.states()
     for id, state in read_states(sorted(ids), workspace.trials, ledger).items():
@@ -121,13 +121,13 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
     path = out or workspace.predictions / f"{curve.name}-{text}.json".replace("/", "_")
     save_prediction(path, prediction)
     say(
-        f"{curve.name} at {prediction.place}: {prediction.mean:.4f} nats per token, "
+        f"{curve.name} at {prediction.position}: {prediction.mean:.4f} nats per token, "
         f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}"
     )
     wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit, and only then run the trials")
 
 
-def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: str) -> tuple[Curve, list[Place]]:
+def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: str) -> tuple[Curve, list[Position]]:
     """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` one is added. Raises
     ConfigError where a power law is not what the axis is to show, where it is not said which of several curves, and for
     a curve without a trial there."""
@@ -154,4 +154,4 @@ def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: 
         bool(ids),
         f"--predict {target}: the study plans no trial there (its positions: {positions}); add it to the plan {how}",
     )
-    return curves[name], [place for place in curves[name].places if place.trial in ids]
+    return curves[name], [position for position in curves[name].positions if position.trial in ids]

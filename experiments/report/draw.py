@@ -36,7 +36,7 @@ def draw(workspace: Workspace, record: Record) -> None:
 
 
 def _draw(workspace: Workspace, record: Record) -> None:
-    from experiments.analysis.best_steps import AtBest, judge_at_best
+    from experiments.analysis.best_steps import BestSteps, judge_at_best
     from experiments.analysis.changes import Change, find_changes
     from experiments.analysis.growth import Growth, find_growth
     from experiments.optima import Optimum, find_optima
@@ -44,7 +44,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.numbers import compute_numbers
     from experiments.report.page import write_report
     from experiments.report.robots import read_data
-    from experiments.report.sweeps import Along
+    from experiments.report.sweeps import AxisStatistics
     from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
     from experiments.rows import collect, read_rows, write_csv, write_rows
@@ -72,7 +72,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     optima = find_optima(rows, sweeps)
     for path, kind, found in (
         (workspace.changes, Change, changes),
-        (workspace.best_steps, AtBest, at_best),
+        (workspace.best_steps, BestSteps, at_best),
         (workspace.growth, Growth, growth),
         (workspace.optima, Optimum, optima),
     ):
@@ -81,7 +81,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
             tables.append(path)
         else:
             path.unlink(missing_ok=True)  # of other trials, drawn before
-    along = Along(changes, at_best, growth)
+    along = AxisStatistics(changes, at_best, growth)
     write_report(workspace, record, sweeps, rows, optima, along, states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 

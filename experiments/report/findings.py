@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.analysis.preregistered import Came
+from experiments.analysis.preregistered import ExpectationOutcome
 from experiments.report.fits import VERDICTS
 from experiments.report.pieces import pm, section, table
 from experiments.report.sweeps import CHANGED
@@ -59,9 +59,9 @@ def read_findings(path: Path, axes: Sequence[str]) -> Findings:
     return Findings(of_axes, "".join(rest))
 
 
-def describe_expected(sweep: Sweep, came: Sequence[Came]) -> str:
+def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> str:
     """Numbers of an axis that were written down before its trials ran, beside what came."""
-    own = [c for c in came if c.expected.sweep == sweep.name]
+    own = [c for c in outcomes if c.expected.sweep == sweep.name]
     if not own:
         return ""
     lines = []
@@ -69,11 +69,11 @@ def describe_expected(sweep: Sweep, came: Sequence[Came]) -> str:
         e = c.expected
         where = f"{e.x} beside {e.against}" if e.against else e.x
         where += f", seed {', '.join(map(str, e.seeds))}" if e.seeds else ""
-        said = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
-        there = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
+        predicted = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
+        observed = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
         curve = [html.escape(e.series)] if sweep.several else []
         metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
-        lines.append([*curve, html.escape(where), metric, said, there, VERDICTS[c.inside], seeds])
+        lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
     ran = [c for c in own if c.observed is not None]
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
     head = ["curve"] * sweep.several + [sweep.axis, "", "predicted", "came", "", "seeds"]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from experiments.analysis.fits import DRAWS, LEVEL, Coefficient
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome
-from experiments.analysis.scaling import Fitted
+from experiments.analysis.scaling import CurveFit
 from experiments.report.pieces import table
 
 VERDICTS = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}
@@ -34,7 +34,7 @@ class FitRow:
     doubts: str
 
 
-def fit_rows(fits: Sequence[Fitted], isoflop: IsoFlop | None) -> list[FitRow]:
+def fit_rows(fits: Sequence[CurveFit], isoflop: IsoFlop | None) -> list[FitRow]:
     rows = []
     for fitted in fits:
         fit, said = fitted.fit, (fitted.curve.name, " x ".join(fitted.curve.axes), len(fitted.fit.trials))
@@ -58,7 +58,7 @@ def _rows(
     return [FitRow(*said, *n, *last) for n in numbers or [("", "", "", "")]]
 
 
-def describe_fits(fits: Sequence[Fitted], isoflop: IsoFlop | None, outcomes: Sequence[Outcome], drawn: str) -> str:
+def describe_fits(fits: Sequence[CurveFit], isoflop: IsoFlop | None, outcomes: Sequence[Outcome], drawn: str) -> str:
     """`drawn`: the figures."""
     lines = []
     for fitted in fits:
@@ -101,7 +101,7 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
         came = "not run yet" if o.observed is None else f"{o.observed:.4f}"
         said = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
         lines.append([
-            html.escape(p.curve), html.escape(p.place), said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
+            html.escape(p.curve), html.escape(p.position), said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
             html.escape("; ".join(o.marks)),
         ])  # fmt: skip
     head = ["curve", "at", "predicted", "came", "", "seeds", "remarks"]

@@ -9,7 +9,7 @@ from typing import Any
 from experiments.analysis.fits import DRAWS
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome, compare, load_predictions
-from experiments.analysis.scaling import Fitted, curves_of, fit_budgets, fit_study
+from experiments.analysis.scaling import CurveFit, curves_of, fit_budgets, fit_study
 from experiments.running.provenance import Provenance
 from experiments.running.sealed import RESULT, read_result
 from experiments.running.workspace import Workspace, load_record
@@ -24,7 +24,7 @@ from hma_jax.evaluation.windows import FILE, WindowTable
 class Numbers:
     results: Mapping[str, dict[str, Any]]  # of finished trials, by id
     windows: Mapping[str, WindowTable]  # of those that kept them
-    fits: Sequence[Fitted]
+    fits: Sequence[CurveFit]
     isoflop: IsoFlop | None
     outcomes: Sequence[Outcome]
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.analysis.preregistered import FILE as PREREGISTERED
-from experiments.analysis.preregistered import Came, read_expected, what_came
+from experiments.analysis.preregistered import ExpectationOutcome, compare_expected, read_expected
 from experiments.optima import Optimum
 from experiments.report.clips import describe_clips
 from experiments.report.findings import Findings, describe_expected, read_findings
@@ -27,7 +27,7 @@ from experiments.report.pieces import card, picture, section, table
 from experiments.report.plot_style import drawn_metrics
 from experiments.report.robots import Robot, are_sorted, describe_robots, robots_of
 from experiments.report.style import CSS
-from experiments.report.sweeps import Along, describe
+from experiments.report.sweeps import AxisStatistics, describe
 from experiments.report.validity import Check, check_study, draw_box
 from experiments.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
 from experiments.running.agreement import describe as describe_sources
@@ -56,7 +56,7 @@ def write_report(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     optima: Sequence[Optimum],
-    along: Along,
+    along: AxisStatistics,
     states: dict[str, State],
     provenance: Provenance,
     numbers: Numbers,
@@ -75,11 +75,11 @@ def write_report(
     vocabulary = None if model.diffusion else model.vocab_size
     checks = check_study(sweeps, rows, optima, states, robots, name, numbers.outcomes, checked, vocabulary)
     findings = read_findings(workspace.findings, [s.name for s in sweeps])
-    came = what_came(read_expected(workspace.predictions / PREREGISTERED), rows)
+    outcomes = compare_expected(read_expected(workspace.predictions / PREREGISTERED), rows)
     body = [
         _headline(workspace, record, sweeps, rows, states, shown, result),
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, optima, along, came, findings),
+        *_curves(workspace, sweeps, rows, optima, along, outcomes, findings),
         _fits(workspace, numbers),
         findings.rest,
         _clips(workspace.trials / first / "samples.npz", record, robots, aside) if there else "",
@@ -185,8 +185,8 @@ def _curves(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     optima: Sequence[Optimum],
-    along: Along,
-    came: Sequence[Came],
+    along: AxisStatistics,
+    outcomes: Sequence[ExpectationOutcome],
     findings: Findings,
 ) -> list[str]:
     """A section for the scaling curves, which share a figure, and one for each other sweep.
@@ -196,7 +196,7 @@ def _curves(
 
     def say(sweep: Sweep) -> str:
         said = findings.of_axes.get(sweep.name, "")
-        return describe(sweep, rows, optima, along) + describe_expected(sweep, came) + said
+        return describe(sweep, rows, optima, along) + describe_expected(sweep, outcomes) + said
 
     sections = []
     scaling = [s for s in sweeps if s.scaling]

@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter
 from experiments.analysis.fits import LEVEL
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome
-from experiments.analysis.scaling import FLOPS, TRUNK, Fitted
+from experiments.analysis.scaling import FLOPS, TRUNK, CurveFit
 from experiments.report.plot_style import (
     COLOURS,
     DEFAULT,
@@ -34,7 +34,7 @@ ABREAST = 3
 POINTS = dict(marker="o", linestyle="none", markersize=4, alpha=0.6, markeredgewidth=0)
 
 
-def plot_fits(fits: Sequence[Fitted], outcomes: Sequence[Outcome], path: Path) -> None:
+def plot_fits(fits: Sequence[CurveFit], outcomes: Sequence[Outcome], path: Path) -> None:
     """Of each curve with a fit the loss, and below it residuals; ABREAST beside each other. Without any, there is no
     file."""
     path.unlink(missing_ok=True)
@@ -57,7 +57,7 @@ def plot_fits(fits: Sequence[Fitted], outcomes: Sequence[Outcome], path: Path) -
         save(figure, path)
 
 
-def _draw_fit(panels: Sequence[Axes], fitted: Fitted, outcomes: Sequence[Outcome]) -> None:
+def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outcome]) -> None:
     above, below = panels
     measured, fit = fitted.measured, fitted.fit
     x, loss = measured.x[:, 0], measured.value

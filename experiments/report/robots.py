@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from experiments.analysis.controllability import Controlled, beyond, by_chance, controllability
+from experiments.analysis.controllability import Controllability, controllability, count_following, expected_by_chance
 from experiments.report.pieces import pm, table
 from experiments.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.running.provenance import Provenance
@@ -41,7 +41,7 @@ class Robot:
     errors: float  # standard errors of ORDER from zero; nan if it was not measured
     ahead: float  # dB of PSNR ahead of copying the last given frame
     ahead_sem: float
-    follows: Mapping[str, Controlled]  # by metric; {} without per-window numbers
+    follows: Mapping[str, Controllability]  # by metric; {} without per-window numbers
 
 
 def robots_of(
@@ -55,7 +55,7 @@ def robots_of(
         whole = set(sweep.scope) <= set(p.trial.evaluated)
         if p.role == POINT and p.x == sweep.reference_x and whole and id in windows:
             tables[p.trial.train.seed] = windows[id]
-    follows: dict[str, dict[str, Controlled]] = {name: {} for name in sweep.scope}
+    follows: dict[str, dict[str, Controllability]] = {name: {} for name in sweep.scope}
     for line in controllability(tables) if tables else ():
         follows.setdefault(line.robot, {})[line.metric] = line
     found = []
@@ -146,7 +146,7 @@ def are_sorted(robots: Sequence[Robot]) -> bool:
 
 def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames: bool) -> str:
     lines = [line for robot in robots for line in robot.follows.values()]
-    counted = {m: (*beyond(lines, m), by_chance(lines, m)) for m in follows}
+    counted = {m: (*count_following(lines, m), expected_by_chance(lines, m)) for m in follows}
     parts = [
         f"{FOLLOWS[m].split(' (')[0]} of {more} among {of} (chance: {deaf:.1f})"
         for m, (more, of, deaf) in counted.items()

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from experiments.analysis.best_steps import AtBest
+from experiments.analysis.best_steps import BestSteps
 from experiments.analysis.changes import Change
 from experiments.analysis.growth import GROWS, Growth
 from experiments.optima import Optimum
@@ -28,15 +28,15 @@ LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
 
 @dataclass(frozen=True)
-class Along:
-    """What is said of whole axes from every window's numbers."""
+class AxisStatistics:
+    """Statistics of whole axes, computed from every window's numbers."""
 
     changes: Sequence[Change] = ()
-    best: Sequence[AtBest] = ()
+    best: Sequence[BestSteps] = ()
     growth: Sequence[Growth] = ()
 
 
-def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along: Along) -> str:
+def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along: AxisStatistics) -> str:
     """Heading, question and numbers of a sweep of any kind."""
     if sweep.labels:
         numbers = _names(sweep, rows)
@@ -52,9 +52,9 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along
     return f"{heading}<p>{html.escape(sweep.question)} Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
 
 
-def _at_best(sweep: Sweep, rows: Sequence[AtBest]) -> str:
+def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
     """A line per point of an axis of several numbers of steps, at the number that suits it."""
-    points: dict[float, dict[str, AtBest]] = {}
+    points: dict[float, dict[str, BestSteps]] = {}
     for row in rows:
         if row.sweep == sweep.name:
             points.setdefault(row.x, {})[row.metric] = row
@@ -149,7 +149,7 @@ def _change(changes: Sequence[Change]) -> str:
     return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {said}. {told}</p>"
 
 
-def _with_interval(found: AtBest | Change | Growth, sign: str = "", words: str = "") -> str:
+def _with_interval(found: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
     """'0.31 (`words`0.22 to 0.4)', the mean alone where nobody knows its error; `sign`: "+" for one before every
     value."""
     low, high = (f"{end:{sign}.3g}" for end in (found.low, found.high))

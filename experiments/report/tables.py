@@ -27,19 +27,19 @@ def write_tables(
 ) -> list[Path]:
     """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
     and of their controls."""
-    from experiments.analysis.controllability import Controlled, controllability
+    from experiments.analysis.controllability import Controllability, controllability
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
     from experiments.rows import training_loss, write_csv
     from hma_jax.evaluation.windows import FILE
 
     names, rows = titles(sweeps, provenance), []
-    there = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
+    available = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
     for id, trial in unique_trials(sweeps, provenance).items():
         state = states[id].event
         result = results[id] if state == FINISHED else None
         loss = training_loss(result).mean if result else 0.0
-        rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, there))
+        rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, available))
     write_trials(workspace.trial_table, rows)
     found = []
     references = [reference_trial(record.study, seed) for seed in record.study.seeds]
@@ -51,5 +51,5 @@ def write_tables(
     if not found:
         workspace.controllability.unlink(missing_ok=True)  # of trials that are no longer the reference
         return [workspace.trial_table]
-    write_csv(workspace.controllability, Controlled, found)
+    write_csv(workspace.controllability, Controllability, found)
     return [workspace.trial_table, workspace.controllability]

@@ -255,7 +255,7 @@ def _optima(optima: Sequence[Optimum]) -> list[Check]:
 
 def _prediction(outcome: Outcome) -> Check:
     p = outcome.prediction
-    text = f"{p.curve} at {p.place}: {p.mean:.3f} nats, {p.low:.3f} to {p.high:.3f} with {p.level:.0%}"
+    text = f"{p.curve} at {p.position}: {p.mean:.3f} nats, {p.low:.3f} to {p.high:.3f} with {p.level:.0%}"
     if outcome.observed is None:
         verdict: Verdict = "open"
         text += "; its trials have not run."

@@ -63,13 +63,13 @@ def training_of(trial: Trial) -> dict[str, Any]:
     return fields
 
 
-def trajectories_of(trial: Trial, there: Mapping[str, int]) -> dict[str, int]:
-    """{robot: training trajectories that windows may be drawn of}, of the trial's robots that `there` counts."""
+def trajectories_of(trial: Trial, available: Mapping[str, int]) -> dict[str, int]:
+    """{robot: training trajectories that windows may be drawn of}, of the trial's robots that `available` counts."""
     capped, most = trial.capped or trial.datasets, trial.max_trajectories
     return {
-        name: there[name] if most is None or name not in capped else min(there[name], most)
+        name: available[name] if most is None or name not in capped else min(available[name], most)
         for name in trial.datasets
-        if name in there
+        if name in available
     }
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.analysis.preregistered import FILE, Expected, read_expected, what_came
+from experiments.analysis.preregistered import FILE, Expected, compare_expected, read_expected
 from experiments.report.draw import draw
 from experiments.rows import curve, difference, read_rows
 from hma_jax.config import ConfigError
@@ -30,33 +30,33 @@ def rows(study):
 
 
 def test_an_expectation_meets_the_mean_over_seeds(rows):
-    [came] = what_came([WIDTH], rows)
+    [came] = compare_expected([WIDTH], rows)
     first = curve(rows, "width", "cross_entropy")[0]
     assert (came.observed, came.seed_sem) == (first.mean, first.seed_sem)
     assert came.inside is (4.0 <= first.mean <= 6.0)
-    [other] = what_came([replace(WIDTH, low=first.mean + 0.1, mean=first.mean + 0.2, high=first.mean + 1)], rows)
+    [other] = compare_expected([replace(WIDTH, low=first.mean + 0.1, mean=first.mean + 0.2, high=first.mean + 1)], rows)
     assert other.inside is False
 
 
 def test_or_the_difference_of_two_points_seed_by_seed(rows):
-    [came] = what_came([replace(WIDTH, against="16")], rows)
+    [came] = compare_expected([replace(WIDTH, against="16")], rows)
     first, last = curve(rows, "width", "cross_entropy")
     assert (came.observed, came.seed_sem) == difference(first, last)
 
 
 def test_what_has_not_run_is_open(rows):
     unfinished = [replace(r, metric="", status="missing") for r in rows if r.x == 8]
-    [came] = what_came([WIDTH], [*(r for r in rows if r.x != 8), *unfinished])
+    [came] = compare_expected([WIDTH], [*(r for r in rows if r.x != 8), *unfinished])
     assert came.observed is None and came.inside is None
-    assert what_came([replace(WIDTH, sweep="compute")], rows) == []  # an axis that this study does not have
+    assert compare_expected([replace(WIDTH, sweep="compute")], rows) == []  # an axis that this study does not have
     one = [r for r in rows if r.x == 8 or r.seed == 1]
-    [came] = what_came([replace(WIDTH, against="16")], [r for r in one if r.x == 16 or r.seed != 1])
+    [came] = compare_expected([replace(WIDTH, against="16")], [r for r in one if r.x == 16 or r.seed != 1])
     assert came.observed is None  # no seed has both
 
 
 def test_seeds_are_counted(rows):
     unfinished = [replace(r, metric="", status="missing") if r.seed else r for r in rows]
-    [came] = what_came([WIDTH], unfinished)
+    [came] = compare_expected([WIDTH], unfinished)
     assert (came.seeds, came.planned) == (1, 3)
 
 
@@ -66,7 +66,7 @@ def test_some_seeds_alone_may_be_meant(rows, tmp_path):
     )
     some, every = read_expected(tmp_path / FILE)
     assert some == replace(WIDTH, seeds=(0, 2)) and every == WIDTH
-    [came] = what_came([some], rows)
+    [came] = compare_expected([some], rows)
     seeds = curve(rows, "width", "cross_entropy")[0].seeds
     assert came.observed == pytest.approx((seeds[0] + seeds[2]) / 2) and (came.seeds, came.planned) == (2, 2)
 
@@ -81,7 +81,7 @@ def test_a_point_that_is_not_there_is_refused(rows):
         (replace(WIDTH, seeds=(1, 7)), "width has no seed 7"),
     ):
         with pytest.raises(ConfigError, match=message):
-            what_came([wrong], rows)
+            compare_expected([wrong], rows)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.compare import Side, compare
-from experiments.analysis.preregistered import FILE, read_expected, what_came
+from experiments.analysis.preregistered import FILE, compare_expected, read_expected
 from experiments.applications.in_place import in_place
 from experiments.rows import OVERALL, curve, difference
 from experiments.sweeps.sweep import CONTROL
@@ -20,7 +20,7 @@ def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
     """Bold where it did not hold."""
     page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
     assert len(expected) == 20
-    for c in what_came(expected, rows_of("ladder")):
+    for c in compare_expected(expected, rows_of("ladder")):
         e, came = c.expected, "not run"
         if c.observed is not None:
             came = f"{c.observed:+.2f}" if e.against else f"{c.observed:.2f}"

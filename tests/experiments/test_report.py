@@ -19,7 +19,7 @@ from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, count, save
 from experiments.report.robots import describe_robots, read_data, robots_of
-from experiments.report.sweeps import Along, describe
+from experiments.report.sweeps import AxisStatistics, describe
 from experiments.report.validity import Check, check_study
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.running.trial import trial_id
@@ -251,7 +251,7 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     several = replace(sweep, points=tuple(replace(p, series=f"width {p.x}") for p in sweep.points))
     plots.plot_sweep([replace(r, series=f"width {r.x}") for r in rows], several, tmp_path / "several.png")
     assert {p.get_ylabel() for p in kept[1].axes} == {p.get_ylabel() for p in kept[0].axes}
-    said = describe(sweep, rows, [], Along())
+    said = describe(sweep, rows, [], AxisStatistics())
     assert "perplexity" not in said and all(name.removeprefix("squared ") in said for name in shown)
     checked = check_study([sweep], rows, [], {}, [], "reference", [], Check("", "good", ""), None)
     assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
@@ -291,7 +291,7 @@ def test_a_control_beside_one_of_several_curves_is_no_curve(drawn, base, tmp_pat
     plots.plot_sweep(rows, several, tmp_path / "width.png")
     optima = find_optima(rows, [several])
     assert {o.role for o in optima} == ({POINT} if base else set())
-    assert "width 16" in describe(several, rows, optima, Along())
+    assert "width 16" in describe(several, rows, optima, AxisStatistics())
 
 
 @pytest.mark.parametrize("status", ["finished", "diverged"])
@@ -308,7 +308,7 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
     for plan, own in ((plan_newcomers, True), (plan_conditioning, False)):
         sweep = plan(CPU_FULL)
         caption = plot_names([], sweep).get_supxlabel()
-        said = describe(sweep, [], [], Along())
+        said = describe(sweep, [], [], AxisStatistics())
         assert ("each judged on robots of its own" in caption) == ("robots of its own, all variants" in said) == own
         assert ("all judged on the same windows" in caption) != own
         assert ("one seed and its robots: not to be held against means" in caption) == own
@@ -379,7 +379,9 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
     sweep = plan_width(STUDY)
     lost = {(8, "delta_psnr"), (16, "perplexity")}
     rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
-    lines = re.findall(r"<tr><td class=text>(\d+)</td><td>([\d,]+)</td>(.*?)</tr>", describe(sweep, rows, [], Along()))
+    lines = re.findall(
+        r"<tr><td class=text>(\d+)</td><td>([\d,]+)</td>(.*?)</tr>", describe(sweep, rows, [], AxisStatistics())
+    )
     assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [
         ("8", "6,400", 1),
         ("16", "25,600", 1),
@@ -392,7 +394,7 @@ def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():
     for id, trial in unique_trials([sweep], PROVENANCE).items():
         windows = windows_of(trial)
         alone[id] = replace(windows, episode=np.zeros_like(windows.episode), start=np.arange(len(windows)))
-    said = describe(sweep, [], [], Along(changes=find_changes([sweep], PROVENANCE, alone)))
+    said = describe(sweep, [], [], AxisStatistics(changes=find_changes([sweep], PROVENANCE, alone)))
     assert "nats per token \u22120." in said and "One held-out episode per robot tells no interval." in said
     assert "nan" not in said
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.optima import Optimum, as_good, chosen_by_others, find_optima
+from experiments.optima import Optimum, as_good, cross_validated_penalty, find_optima
 from experiments.override import override
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
@@ -146,13 +146,13 @@ def test_what_a_choice_costs_is_judged_on_seeds_that_it_was_not_made_by():
     """Of noise alone, the lowest of several losses would always seem to gain; the choice of other seeds does not."""
     own = [point(1.0, 1.0, 1.2, 1.1), point(2.0, 1.2, 1.0, 1.1)]
     base = [point(1.0, 0.5, 0.5, 0.5), point(2.0, 0.9, 0.9, 0.9)]
-    mean, error = chosen_by_others(own, base, set())
+    mean, error = cross_validated_penalty(own, base, set())
     # Left out 0 the others choose 2, which costs it 0.2; left out 1 they choose 1, which costs 0.2; the base stays at
     # 1.
     assert mean == pytest.approx((1.0 - 1.2 + 0 + 0) / 3) and error > 0
-    assert chosen_by_others([point(1.0, 1.0), point(2.0, 2.0)], base, set()) is None
+    assert cross_validated_penalty([point(1.0, 1.0), point(2.0, 2.0)], base, set()) is None
     clear = [point(1.0, 1.3, 1.4, 1.5), point(2.0, 1.0, 1.1, 1.2)]
-    assert chosen_by_others(clear, base, set()) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-9))
+    assert cross_validated_penalty(clear, base, set()) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-9))
 
 
 def test_an_optimum_at_the_end_of_the_grid_is_marked(tmp_path):

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.analysis.bootstrap import Panel, resample
-from experiments.analysis.measured import Measured
+from experiments.analysis.measured import Measurements
 
 DATASETS, EPISODES = 10, 8
 
 
 def measured(
     x: np.ndarray, loss: np.ndarray, noise: float, seeds: int, rng: np.random.Generator, episode_noise: float = 0.3
-) -> Measured:
+) -> Measurements:
     """`seeds` trials at each of `x` [m, K] with the expected `loss` [m]; each seed is off by `noise` in the logarithm.
 
     Episodes are harder and easier by `episode_noise`, the same ones for every trial.
@@ -26,7 +26,7 @@ def measured(
     robot, episode = np.repeat([f"robot{d}" for d in range(DATASETS)], EPISODES), np.tile(np.arange(EPISODES), DATASETS)
     names = tuple((i % seeds,) for i in range(len(x)))
     panel = Panel(robot, episode, tuple(row[None] for row in values), names)
-    return Measured(
+    return Measurements(
         ("trunk parameters", "windows")[: x.shape[1]], x,
         run=np.array([f"{row[0]:.0f}" for row in x]), trial=tuple(f"t{i}" for i in range(len(x))),
         seed=np.array([seed for (seed,) in names]),
@@ -34,14 +34,14 @@ def measured(
     )  # fmt: skip
 
 
-def scaled(points: Measured, factors: dict[int, float]) -> Measured:
+def scaled(points: Measurements, factors: dict[int, float]) -> Measurements:
     """The same, the losses of some trials times a factor."""
     by = np.array([factors.get(i, 1.0) for i in range(len(points.trial))])
     values = tuple(values * factor for values, factor in zip(points.panel.points, by, strict=True))
     return replace(points, value=points.value * by, panel=replace(points.panel, points=values))
 
 
-def only(points: Measured, chosen: np.ndarray) -> Measured:
+def only(points: Measurements, chosen: np.ndarray) -> Measurements:
     """The trials where `chosen` [n] holds."""
     at = np.flatnonzero(chosen)
     values, seeds = (tuple(column[i] for i in at) for column in (points.panel.points, points.panel.seeds))

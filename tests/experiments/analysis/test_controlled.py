@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.analysis.controllability import beyond, by_chance, controllability
+from experiments.analysis.controllability import controllability, count_following, expected_by_chance
 from experiments.suite.explained import read_table
 from tests.experiments.analysis.worlds import judged
 
@@ -32,8 +32,8 @@ def model(follows: float, seed: int = 0, shift: float = 0.0):
 def test_robots_beyond_two_errors_are_counted_against_what_a_deaf_model_has():
     follows, deaf = controllability({0: model(1.0)}), controllability({0: model(0.0)})
     for metric, robots in (("delta_psnr", 3), ("action_nats", 3), ("retrieval", 3), ("counterfactual_gain", 2)):
-        assert beyond(follows, metric) == (robots, robots)
-        assert beyond(deaf, metric) == (0, robots)
+        assert count_following(follows, metric) == (robots, robots)
+        assert count_following(deaf, metric) == (0, robots)
     assert all(row.errors == 0 for row in deaf if row.metric != "retrieval")
     assert {row.deaf for row in deaf if row.metric == "retrieval"} == {1 / 16}
 
@@ -43,7 +43,7 @@ def test_a_deaf_model_has_as_many_robots_beyond_as_is_said():
     for _ in range(100):
         table = judged(rng, robots=6, episodes=4)
         rows = controllability({0: replace(table, metrics={"delta_psnr": table.metrics["cross_entropy"]})})
-        found, said = found + beyond(rows, "delta_psnr")[0], said + by_chance(rows, "delta_psnr")
+        found, said = found + count_following(rows, "delta_psnr")[0], said + expected_by_chance(rows, "delta_psnr")
     assert said == pytest.approx(100 * 6 * 0.0697, rel=1e-3)
     assert found == pytest.approx(said, abs=3 * said**0.5)
 
@@ -53,15 +53,15 @@ def test_a_robot_without_actions_is_never_there_by_chance():
     table = judged(np.random.default_rng(3), robots=6, episodes=4)
     values = np.where(table.dataset == "r0", 1e-7, table.metrics["cross_entropy"])  # up to rounding
     rows = controllability({0: replace(table, metrics={"delta_psnr": values})})
-    assert beyond(rows, "delta_psnr")[1] == 6
-    assert by_chance(rows, "delta_psnr") == pytest.approx(5 * 0.0697, rel=1e-3)
+    assert count_following(rows, "delta_psnr")[1] == 6
+    assert expected_by_chance(rows, "delta_psnr") == pytest.approx(5 * 0.0697, rel=1e-3)
 
 
 def test_rounding_is_no_control():
     """Always the same 1e-6 dB: many standard errors, and nothing."""
     rows = controllability({0: model(0.0, shift=1e-6)})
-    assert beyond(rows, "delta_psnr") == (0, 3)
-    assert beyond(controllability({0: model(0.0, shift=1e-3)}), "delta_psnr") == (3, 3)
+    assert count_following(rows, "delta_psnr") == (0, 3)
+    assert count_following(controllability({0: model(0.0, shift=1e-3)}), "delta_psnr") == (3, 3)
 
 
 def test_a_row_says_what_there_is_to_follow():

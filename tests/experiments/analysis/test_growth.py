@@ -7,7 +7,7 @@ import pytest
 
 from experiments.analysis.growth import EXHAUSTED, GROWS, find_growth
 from experiments.analysis.paired import NotComparable
-from experiments.report.sweeps import Along, describe
+from experiments.report.sweeps import AxisStatistics, describe
 from experiments.running.trial import trial_id
 from experiments.sweeps.registry import plan_sweeps
 from tests.experiments.fakes import PROVENANCE
@@ -59,7 +59,7 @@ def tables_of_points():
 
 
 def test_the_page_shows_both_groups():
-    said = describe(SWEEP, [], [], Along(growth=find_growth([SWEEP], PROVENANCE, tables(), THERE)))
+    said = describe(SWEEP, [], [], AxisStatistics(growth=find_growth([SWEEP], PROVENANCE, tables(), THERE)))
     assert "Robots whose data grows, and others" in said and "1 with more" in said and "2 without" in said
 
 

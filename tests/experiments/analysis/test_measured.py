@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from experiments.analysis.fits import fit_power
-from experiments.analysis.measured import Measured, Place, measure
+from experiments.analysis.measured import Measurements, Position, measure
 from hma_jax.evaluation.windows import WindowTable
 from tests.experiments.analysis.curves import power, sizes
 
@@ -16,7 +16,9 @@ X = sizes(POINTS, span=8.0)
 LOSS = power(X, 1.5, (1.0, 0.9))
 
 
-def levelled(rng: np.random.Generator, lacking: Sequence[tuple[int, int]] = (), loss: np.ndarray = LOSS) -> Measured:
+def levelled(
+    rng: np.random.Generator, lacking: Sequence[tuple[int, int]] = (), loss: np.ndarray = LOSS
+) -> Measurements:
     """Trials on one curve of `loss` [POINTS], each seed judged on a robot of its own; without those of (point, seed) in
     `lacking`."""
     hard = np.exp(HARD * rng.standard_normal(SEEDS))
@@ -27,7 +29,7 @@ def levelled(rng: np.random.Generator, lacking: Sequence[tuple[int, int]] = (), 
             if (point, seed) in lacking:
                 continue
             robot, zero = f"robot{seed}", np.zeros(1, int)
-            places.append(Place(f"{point}-{seed}", str(point), seed, (x,), (robot,)))
+            places.append(Position(f"{point}-{seed}", str(point), seed, (x,), (robot,)))
             tables[f"{point}-{seed}"] = WindowTable(
                 np.array([robot]), zero, zero, zero + 4, {"cross_entropy": np.array([nats])}
             )

@@ -68,14 +68,14 @@ def test_only_the_parameters_that_robots_share_count():
 
 def test_a_width_sweep_is_a_curve_over_the_trunk():
     [curve] = curves_of(plan_sweeps(WIDE, ("width",)), PROVENANCE)
-    assert curve.axes == (TRUNK,) and len(curve.places) == 15  # five widths, three seeds; the control is none of it
-    assert len({p.x for p in curve.places}) == 5
+    assert curve.axes == (TRUNK,) and len(curve.positions) == 15  # five widths, three seeds; the control is none of it
+    assert len({p.x for p in curve.positions}) == 5
 
 
 def test_other_sweeps_keep_their_own_axis():
     curves = curves_of(plan_sweeps(WIDE, ("trajectories", "lr")), PROVENANCE)
     assert [c.name for c in curves] == ["trajectories"]  # a learning rate is no scale
-    assert {p.x[0] for p in curves[0].places} == set(WIDE.trajectory_counts)
+    assert {p.x[0] for p in curves[0].positions} == set(WIDE.trajectory_counts)
 
 
 def test_compute_is_no_power_of_the_width():
@@ -87,9 +87,9 @@ def test_compute_is_no_power_of_the_width():
 def robots_of_their_own():
     """(the curve of `dilution`, windows of all its trials): three seeds, each of which judges other robots."""
     (curve,) = curves_of(plan_sweeps(CPU_FULL, ("dilution",)), PROVENANCE)
-    assert len({p.scope for p in curve.places}) == 3
+    assert len({p.scope for p in curve.positions}) == 3
     windows = {}
-    for place in curve.places:
+    for place in curve.positions:
         hard = 1 + 0.3 * place.seed
         loss = hard * (2 + (place.x[0] / 5) ** -0.7)
         robots = np.repeat(place.scope, 2)
@@ -102,7 +102,7 @@ def robots_of_their_own():
 def test_seeds_of_other_robots_without_a_common_position_are_no_curve_yet():
     """A report of trials of which each position lacks one ended there."""
     curve, windows = robots_of_their_own()
-    few = {p.trial: windows[p.trial] for p in curve.places if (p.x[0] > 10) == (p.seed == 0)}
+    few = {p.trial: windows[p.trial] for p in curve.positions if (p.x[0] > 10) == (p.seed == 0)}
     fitted = fit_curve(curve, few, draws=10)
     assert fitted.measured is None and "no position has a finished trial of each" in fitted.fit.refused
 
@@ -111,7 +111,7 @@ def test_seeds_of_other_robots_without_a_common_position_are_no_curve_yet():
 def test_seeds_that_judge_other_robots_are_fitted_together(seeds):
     """How hard their robots are is taken out, by position; the shape is the same for all of them."""
     curve, windows = robots_of_their_own()
-    fitted = fit_curve(curve, {p.trial: windows[p.trial] for p in curve.places if p.seed in seeds}, draws=10)
+    fitted = fit_curve(curve, {p.trial: windows[p.trial] for p in curve.positions if p.seed in seeds}, draws=10)
     assert fitted.fit["alpha"].value == pytest.approx(0.7, abs=0.02)
     assert ("how hard these are is taken out" in " ".join(fitted.fit.doubts)) == (len(seeds) > 1)
 
@@ -121,7 +121,7 @@ def test_branches_of_widths_make_a_surface(branches):
     surface = surface_of(sweeps, PROVENANCE)
     assert len(surface) == len(windows) == 90
     curve = next(iter(surface.values()))[1]
-    assert curve.axes == (TRUNK, WINDOWS) and len({p.run for p in curve.places}) == 6
+    assert curve.axes == (TRUNK, WINDOWS) and len({p.run for p in curve.positions}) == 6
     first, *_, joint = fit_study(sweeps, PROVENANCE, windows, draws=30)
     assert first.curve.axes == ("steps",) and first.fit["alpha"].value == pytest.approx(0.4, abs=0.05)
     assert len(set(first.measured.run)) == 1  # one run, of which every step is a branch
