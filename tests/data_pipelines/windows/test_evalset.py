@@ -63,6 +63,10 @@ def test_batches_give_each_window_once_with_its_images_and_actions(store, table,
         for row, name in enumerate(batch["dataset"]):
             entry = table.entries[table.index(name)]
             assert batch["embodiment"][row] == table.index(name)
+            facts = store.manifest(name)
+            for key, recorded in (("action_mean", facts.action_mean), ("action_std", facts.action_std)):
+                own = batch[key][row, : entry.chunk].reshape(entry.stride, entry.action_dim)
+                np.testing.assert_allclose(own, [recorded] * entry.stride, rtol=1e-6)
             steps = batch["tokens"][row, :, 0] % 256
             chunk = batch["actions"][row, :, : entry.chunk].reshape(4, entry.stride, entry.action_dim)
             assert (chunk[..., 1] == steps[..., None] + np.arange(entry.stride)).all()

@@ -75,6 +75,10 @@ def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monke
     assert len(chosen) == len(located) == 40 and {o.split for o in chosen} == {"val", "train"}
     assert others.actions(name, chosen, 3).shape == (40, 4, 3)
     assert all(others._actions(name, o.split, o.episode).base is None for o in chosen)
+    # Each window has its own order of them, and each seed.
+    again = OtherWindows(store, {name: make_cut(store, name, 4, 2.0)}, 4, 2.0, 1)
+    orders = [(others, 0, 0), (others, 0, 4), (others, 0, 8), (again, 0, 0)]
+    assert len({tuple(by.choose(name, episode, start, 5)) for by, episode, start in orders}) == 4
 
 
 def test_fewer_than_asked_for_are_marked(tmp_path):
