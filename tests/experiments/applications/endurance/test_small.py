@@ -128,7 +128,10 @@ def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     assert said.format(abs(three[0][0]), three[0][1], *three[1], *three[2]) in page
     last = over_robots([row for place, row in later("long_ten").items() if place[2] == 10], "object_found")[0]
     ten = [x for measure in ("psnr", "follows") for x in beside(measure, "long_ten", "endurance")]
-    said = "in {:.0f} % of the frames of the last minute; from the second on PSNR {:.1f} ± {:.1f} dB, follows {:.2f} ± {:.2f}."
+    said = (
+        'in {:.0f} % of the frames of the last minute. Compared with "weighed", from the second minute on, PSNR changes by '
+        '{:.1f} ± {:.1f} dB and "follows" by {:.2f} ± {:.2f}.'
+    )
     assert said.format(100 * last, *ten) in page
 
 
