@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from data_pipelines.inspection.action_stats import QUANTILES
 from data_pipelines.inspection.inspect import ActionFacts, Facts, Sample
-from data_pipelines.inspection.remarks import Remark, chosen_actions
+from data_pipelines.inspection.issues import Issue, chosen_actions
 from data_pipelines.inspection.sample import Shown
 from data_pipelines.inspection.suggest import WindowFacts, window_facts
 from data_pipelines.registry import DatasetSpec
@@ -40,9 +40,9 @@ TALL, SMALL = 168, 84
 """Pixels of the clips of the camera in use, and of the others."""
 
 PAGE_CSS = """
-.bad, .doubt { border-left: 4px solid var(--bad); background: var(--soft); border-radius: 4px;
+.error, .warning { border-left: 4px solid var(--bad); background: var(--soft); border-radius: 4px;
   padding: .45rem .8rem; margin: .4rem 0; max-width: 52rem; overflow-wrap: anywhere; }
-.doubt { border-color: #d8902a; } .fine { color: var(--good); }
+.warning { border-color: #d8902a; } .error b { color: var(--bad); } .fine { color: var(--good); }
 .gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1rem; }
 .episode { background: var(--soft); border-radius: 8px; padding: .7rem; min-width: 0; }
 .episode p { margin: .35rem 0; font-size: .86rem; line-height: 1.35; overflow-wrap: anywhere; }
@@ -69,7 +69,7 @@ class Viewed:
     registered: bool  # the entry is the registry's, not one that its contents suggest
     hz: float | None
     stride: int | None
-    remarks: tuple[Remark, ...]
+    issues: tuple[Issue, ...]
 
     @property
     def facts(self) -> Facts:
@@ -97,8 +97,9 @@ def _summary(datasets: Sequence[Viewed], frames: int) -> str:
     lines = []
     for i, d in enumerate(datasets):
         f, windows = d.facts, _windows(d, frames)
-        bad, doubt = (sum(r.kind == kind for r in d.remarks) for kind in ("bad", "doubt"))
-        stands = [f'<span class="failed">{bad} wrong</span>'] * bool(bad) + [f"{doubt} to decide"] * bool(doubt)
+        errors, warnings = (sum(r.severity == severity for r in d.issues) for severity in ("error", "warning"))
+        stands = [f'<span class="failed">{errors} wrong</span>'] * bool(errors)
+        stands += [f"{warnings} to decide"] * bool(warnings)
         lines.append([
             f'<a href="#d{i}">{html.escape(f.name)}</a>',
             ", ".join(stands) or '<span class=fine>nothing stands out</span>',
@@ -110,7 +111,7 @@ def _summary(datasets: Sequence[Viewed], frames: int) -> str:
             f"{d.entry.action_dim}" if d.entry else "?",
         ])  # fmt: skip
     counted = f"windows, T = {frames}"
-    head = ["dataset", "remarks", "episodes", "median steps", "Hz", "Hz of frames", counted, "action values"]
+    head = ["dataset", "issues", "episodes", "median steps", "Hz", "Hz of frames", counted, "action values"]
     return table(head, lines, text=2)
 
 
@@ -118,15 +119,15 @@ def _dataset(i: int, d: Viewed, frames: int) -> list[str]:
     f = d.facts
     sampled = "all" if f.sampled == f.episodes else f"{f.sampled} of {f.episodes:,}"
     where = f"{f.version} · split {f.split} · {sampled} episodes read ({f.bytes_read / 1e6:,.1f} MB) · {f.directory}"
-    remarks = [f"<p class={r.kind}><b>{html.escape(r.title)}</b>: {html.escape(r.text)}.</p>" for r in d.remarks] or [
+    issues = [f"<p class={r.severity}><b>{html.escape(r.title)}</b>: {html.escape(r.text)}.</p>" for r in d.issues] or [
         "<p class=fine>Nothing stands out.</p>"
     ]
     if f.sampled < f.episodes:
-        remarks.append(
+        issues.append(
             "<p class=fine>Recordings that occur twice are found among the episodes that were read alone.</p>"
         )
     return [
-        f'<section id="d{i}"><h2>{html.escape(f.name)}</h2><p class=meta>{html.escape(where)}</p>{"".join(remarks)}',
+        f'<section id="d{i}"><h2>{html.escape(f.name)}</h2><p class=meta>{html.escape(where)}</p>{"".join(issues)}',
         _read_as(d),
         _part("Episodes", _gallery(d)),
         _part("Lengths and windows", _lengths(d, frames)),

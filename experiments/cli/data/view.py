@@ -66,7 +66,7 @@ def view(
     for directory in datasets:
         with step(f"read {directory}"):
             viewed.append(_view_one(directory, split, hz, stride, frames, episodes, shown))
-        _say_remarks(viewed[-1], episodes)
+        _say_issues(viewed[-1], episodes)
     say_unmatched(registry, [one.facts.name for one in viewed])
     given = {
         "split": split, "hz": hz and f"{hz:g}", "stride": stride, "frames": frames, "episodes": episodes,
@@ -84,7 +84,7 @@ def _view_one(
 ) -> Viewed:
     from data_pipelines.inspection.duplicates import find_duplicates
     from data_pipelines.inspection.inspect import inspect_dataset
-    from data_pipelines.inspection.remarks import make_remarks
+    from data_pipelines.inspection.issues import find_issues
     from data_pipelines.inspection.suggest import suggest_entry, window_facts
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_spec
@@ -106,8 +106,8 @@ def _view_one(
     others = [s.name for s in facts.splits if s.name not in split.split("+") and s.episodes][:OTHER_SPLITS]
     prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes, keys))]
     windows = window_facts(facts, stride, frames) if stride else None
-    remarks = make_remarks(facts, entry, windows, find_duplicates(prints))
-    return Viewed(sample, entry, known is not None, rate, stride, tuple(remarks))
+    issues = find_issues(facts, entry, windows, find_duplicates(prints))
+    return Viewed(sample, entry, known is not None, rate, stride, tuple(issues))
 
 
 def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
@@ -123,14 +123,14 @@ def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]
         return ()
 
 
-def _say_remarks(viewed: Viewed, episodes: int) -> None:
-    colours = {"bad": "red", "doubt": "yellow"}
+def _say_issues(viewed: Viewed, episodes: int) -> None:
+    colours = {"error": "red", "warning": "yellow"}
     name = escape(viewed.facts.name)
-    if not viewed.remarks:
+    if not viewed.issues:
         console.print(f"[bold]{name}[/]: nothing stands out")
-    for remark in viewed.remarks:
-        title = f"[{colours[remark.kind]}]{remark.title}[/]"
-        console.print(f"[bold]{name}[/]: {title}: {escape(remark.text)}", soft_wrap=True)
+    for issue in viewed.issues:
+        title = f"[{colours[issue.severity]}]{issue.title}[/]"
+        console.print(f"[bold]{name}[/]: {title}: {escape(issue.text)}", soft_wrap=True)
     f = viewed.facts
     if f.stopped or episodes < f.episodes:  # of others all that can be read were
         console.print(
@@ -142,7 +142,7 @@ def _say_remarks(viewed: Viewed, episodes: int) -> None:
 
 def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> None:
     """The commands that read what can be read, one per rate of frames, or those that lead there."""
-    from data_pipelines.inspection.remarks import MISFIT
+    from data_pipelines.inspection.issues import MISFIT
     from data_pipelines.inspection.suggest import window_facts
 
     file = registry or ENTRIES
@@ -155,7 +155,7 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
         elif not v.registered:
             words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", file)
             after = f"{words}  (it is not in the registry; this writes its entry)"
-        elif any(r.title == MISFIT for r in v.remarks):
+        elif any(r.title == MISFIT for r in v.issues):
             after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
         elif first := other_rate(f, v.hz, registry):
             after = first

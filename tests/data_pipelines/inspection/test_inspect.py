@@ -13,7 +13,7 @@ import pytest
 from data_pipelines.errors import DataError
 from data_pipelines.inspection.action_stats import dimension_facts
 from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, inspect_dataset
-from data_pipelines.inspection.remarks import make_remarks
+from data_pipelines.inspection.issues import find_issues
 from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.registry.own import OWN
@@ -158,11 +158,12 @@ def test_a_camera_that_cannot_be_decoded_costs_no_episode(tmp_path, spoilt):
     assert "step 0 of observation/a_wrist cannot be decoded: 8 bytes" in bad.reason
     assert all(len(example.frames) == 2 - (example.index in spoilt) for example in sample.shown)
     assert choose_camera(facts.cameras)[0] == good
-    for key, kind in ((good.key, "doubt"), (bad.key, "bad")):
-        remarks = make_remarks(facts, replace(make_spec(), image_key=key), None, ())
-        (said,) = [r for r in remarks if r.title == "undecodable frames"]
+    for key, kind in ((good.key, "warning"), (bad.key, "error")):
+        issues = find_issues(facts, replace(make_spec(), image_key=key), None, ())
+        (said,) = [r for r in issues if r.title == "undecodable frames"]
         assert (
-            said.kind == kind and f"frames of {len(spoilt)} of 4 episodes cannot be decoded; the first: " in said.text
+            said.severity == kind
+            and f"frames of {len(spoilt)} of 4 episodes cannot be decoded; the first: " in said.text
         )
 
 

@@ -1,4 +1,4 @@
-"""What stands out of a dataset, each remark on data made to deserve it and on data that does not."""
+"""What stands out of a dataset: each issue on data made to have it and on data without it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image
 
 from data_pipelines.inspection.duplicates import Fingerprint, find_duplicates, take_fingerprint
 from data_pipelines.inspection.inspect import inspect_dataset
-from data_pipelines.inspection.remarks import make_remarks
+from data_pipelines.inspection.issues import find_issues
 from data_pipelines.inspection.suggest import window_facts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.images import decode_image
@@ -33,7 +33,7 @@ def healthy(episode: int, features: dict) -> None:
     features["steps/action"][:] = np.random.default_rng(episode).normal(size=(steps, 3))
 
 
-def remarks_of(tmp_path, change=healthy, lengths=(20,) * 8, spec=SPEC, frames=4) -> dict[str, str]:
+def issues_of(tmp_path, change=healthy, lengths=(20,) * 8, spec=SPEC, frames=4) -> dict[str, str]:
     def both(episode, features):
         healthy(episode, features)
         change(episode, features)
@@ -41,22 +41,22 @@ def remarks_of(tmp_path, change=healthy, lengths=(20,) * 8, spec=SPEC, frames=4)
     directory = write_rlds(tmp_path, make_spec("toy", (3,)), list(lengths), change=both)
     sample = inspect_dataset(directory)
     windows = window_facts(sample.facts, 2, frames)
-    found = make_remarks(sample.facts, spec, windows, find_duplicates(sample.fingerprints))
-    return {r.title: f"{r.kind}: {r.text}" for r in found}
+    found = find_issues(sample.facts, spec, windows, find_duplicates(sample.fingerprints))
+    return {r.title: f"{r.severity}: {r.text}" for r in found}
 
 
 def test_nothing_stands_out_of_healthy_data(tmp_path):
-    assert remarks_of(tmp_path) == {}
+    assert issues_of(tmp_path) == {}
 
 
 def test_no_window(tmp_path):
-    assert remarks_of(tmp_path, lengths=[2, 3], frames=4) == {
-        "no window": "bad: the shortest window at stride 2 takes 4 steps; the longest of 2 episodes has 3"
+    assert issues_of(tmp_path, lengths=[2, 3], frames=4) == {
+        "no window": "error: the shortest window at stride 2 takes 4 steps; the longest of 2 episodes has 3"
     }
 
 
 def test_some_short_episodes(tmp_path):
-    found = remarks_of(tmp_path, lengths=[2, 3, 8, 9], frames=4)
+    found = issues_of(tmp_path, lengths=[2, 3, 8, 9], frames=4)
     assert found["short episodes"].endswith("2 of 4 episodes are shorter")
 
 
@@ -64,15 +64,15 @@ def test_constant_actions(tmp_path):
     def change(episode, features):
         features["steps/action"][:, 1] = 0.25
 
-    assert remarks_of(tmp_path, change) == {"constant action": "doubt: action: value 1 never changes"}
+    assert issues_of(tmp_path, change) == {"constant action": "warning: action: value 1 never changes"}
 
 
 def test_blank_camera_in_use(tmp_path):
     def change(episode, features):
         features["steps/observation/image"] = [png(np.full((8, 8, 3), 7, np.uint8))] * 20
 
-    found = remarks_of(tmp_path, change)
-    assert found["blank camera"].startswith("bad: observation/image (the camera in use)")
+    found = issues_of(tmp_path, change)
+    assert found["blank camera"].startswith("error: observation/image (the camera in use)")
 
 
 def test_actions_and_frames_of_different_number(tmp_path):
@@ -80,8 +80,8 @@ def test_actions_and_frames_of_different_number(tmp_path):
         if episode == 2:
             features["steps/action"] = features["steps/action"][:-1]
 
-    found = remarks_of(tmp_path, change)
-    assert found["cannot be read"].startswith("bad: 1 of the episodes:") and "action 19" in found["cannot be read"]
+    found = issues_of(tmp_path, change)
+    assert found["cannot be read"].startswith("error: 1 of the episodes:") and "action 19" in found["cannot be read"]
 
 
 def test_numbers_that_are_not_finite(tmp_path):
@@ -89,7 +89,7 @@ def test_numbers_that_are_not_finite(tmp_path):
         if episode == 2:
             features["steps/action"][3, 0] = np.nan
 
-    assert remarks_of(tmp_path, change)["not finite"].startswith("bad: action: value 0: 1 numbers are NaN")
+    assert issues_of(tmp_path, change)["not finite"].startswith("error: action: value 0: 1 numbers are NaN")
 
 
 def wrapping(episode: int, features: dict) -> None:
@@ -97,19 +97,19 @@ def wrapping(episode: int, features: dict) -> None:
 
 
 def test_angles_that_wrap_unless_the_entry_mends_them(tmp_path):
-    found = remarks_of(tmp_path / "a", wrapping)
+    found = issues_of(tmp_path / "a", wrapping)
     assert "value 2 jumps by a whole turn" in found["wrapping angle"] and "angles = [2]" in found["wrapping angle"]
     for form in ("sine_cosine", "unwrapped"):
         mended = replace(SPEC, angles=(2,), angle_form=form)
-        assert "wrapping angle" not in remarks_of(tmp_path / form, wrapping, spec=mended)
+        assert "wrapping angle" not in issues_of(tmp_path / form, wrapping, spec=mended)
 
 
 def test_angles_of_another_unit_than_the_entry_s(tmp_path):
     """Their sine and cosine would be those of other angles."""
     mended = replace(SPEC, angles=(2,), angle_form="sine_cosine")
-    assert "unit of angles" not in remarks_of(tmp_path / "a", wrapping, spec=mended)
-    found = remarks_of(tmp_path / "b", wrapping, spec=replace(mended, angle_unit="degree"))
-    said = "bad: action: value 2 jumps by a whole turn of 6.283; the entry's angle_unit is degree, not radian"
+    assert "unit of angles" not in issues_of(tmp_path / "a", wrapping, spec=mended)
+    found = issues_of(tmp_path / "b", wrapping, spec=replace(mended, angle_unit="degree"))
+    said = "error: action: value 2 jumps by a whole turn of 6.283; the entry's angle_unit is degree, not radian"
     assert found["unit of angles"] == said
 
 
@@ -125,7 +125,7 @@ def test_angles_are_numbered_as_the_entry_numbers_them(tmp_path):
     facts = inspect_dataset(write_rlds(tmp_path, fields, [20] * 8, change=change)).facts
 
     def wrapping_of(entry: DatasetSpec | None) -> list[str]:
-        return [r.text for r in make_remarks(facts, entry, None, ()) if r.title == "wrapping angle"]
+        return [r.text for r in find_issues(facts, entry, None, ()) if r.title == "wrapping angle"]
 
     parts = replace(fields, action_keys=("action/part_0[:3]", "action/part_1[:6]"), action_dims=(3, 6))
     (text,) = wrapping_of(parts)
@@ -138,8 +138,8 @@ def test_angles_are_numbered_as_the_entry_numbers_them(tmp_path):
 
 def test_an_entry_that_names_what_is_not_there(tmp_path):
     wrong = replace(SPEC, image_key="observation/rgb", action_keys=("action[:9]",), action_dims=(9,))
-    text = remarks_of(tmp_path, spec=wrong)["entry does not fit"]
-    assert text.startswith("bad") and "wants observation/rgb, action[:9] with 9 values" in text
+    text = issues_of(tmp_path, spec=wrong)["entry does not fit"]
+    assert text.startswith("error") and "wants observation/rgb, action[:9] with 9 values" in text
 
 
 # --- duplicates ---------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ def test_the_same_recording_twice(tmp_path):
         if episode in (3, 6):
             healthy(99, features)
 
-    assert remarks_of(tmp_path, change) == {"likely duplicates": "doubt: 1 episodes repeat another: train 3 = train 6"}
+    assert issues_of(tmp_path, change) == {"likely duplicates": "warning: 1 episodes repeat another: train 3 = train 6"}
 
 
 @pytest.mark.parametrize("what", ["steps/action", "steps/observation/image"])
@@ -161,7 +161,7 @@ def test_one_of_pictures_and_actions_alone_makes_no_duplicate(tmp_path, what):
             healthy(99, other)
             features[what] = other[what]
 
-    assert remarks_of(tmp_path, change) == {}
+    assert issues_of(tmp_path, change) == {}
 
 
 def test_pictures_decide_where_no_action_varies(tmp_path):
@@ -169,7 +169,7 @@ def test_pictures_decide_where_no_action_varies(tmp_path):
         healthy(episode % 4, features)
         features["steps/action"][:] = 0
 
-    assert "4 episodes repeat another" in remarks_of(tmp_path, change)["likely duplicates"]
+    assert "4 episodes repeat another" in issues_of(tmp_path, change)["likely duplicates"]
 
 
 def test_a_recording_is_known_again_compressed_and_smaller():
