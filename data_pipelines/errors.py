@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-MAX_EXAMPLES = 6
+MAX_LISTED = 6
 """Cases that a message lists one by one; of the others it gives the number. Of a dataset that was fetched in part,
 every shard may be damaged."""
 

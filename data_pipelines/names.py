@@ -17,31 +17,28 @@ NAME_RULE = f"use up to {MAX_NAME_LENGTH} letters, digits, '_', '.' and '-', the
 _NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{MAX_NAME_LENGTH - 1}}}")
 
 
-def is_name(text: object) -> bool:
+def is_dataset_name(text: object) -> bool:
     """Whether `text` can be the name of a dataset, and so of a file or a directory."""
     return isinstance(text, str) and _NAME.fullmatch(text) is not None
 
 
-def inside(root: Path, text: object) -> Path:
-    """`root` / `text`, for a relative path that stays below `root`.
-
-    Raises ValueError, saying why, for anything else.
-    """
+def safe_join(root: Path, text: object) -> Path:
+    """`root` / `text`. Raises ValueError, saying why, unless `text` is a relative path that stays below `root`."""
     if not isinstance(text, str) or not 0 < len(text) <= MAX_PATH_LENGTH or not text.isprintable():
-        raise ValueError(f"{shown(text)} is no path of up to {MAX_PATH_LENGTH} printable characters")
+        raise ValueError(f"{quote(text)} is no path of up to {MAX_PATH_LENGTH} printable characters")
     if text[0] == "/" or "\\" in text or ".." in text.split("/"):
-        raise ValueError(f"{shown(text)} leaves the dataset's directory")
+        raise ValueError(f"{quote(text)} leaves the dataset's directory")
     return root / text
 
 
-def brief(text: object) -> str:
+def truncate(text: object) -> str:
     """A message that may quote an untrusted file, cut to a bounded length."""
     text = str(text)
     max_length = 500
     return text if len(text) <= max_length else f"{text[:max_length]} ..."
 
 
-def shown(value: object, max_length: int = 80) -> str:
+def quote(value: object, max_length: int = 80) -> str:
     """A value read from an untrusted file, for a message: on one line, of bounded length."""
     if isinstance(value, (list, dict)):  # of any depth
         return f"a {type(value).__name__} of {len(value):,}"

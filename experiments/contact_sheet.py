@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 if TYPE_CHECKING:
-    from data_pipelines.inspection.inspect import Shown
+    from data_pipelines.inspection.inspect import ExampleEpisode
 
 TILE = 112
 """Pixels of a frame's height."""
@@ -19,7 +19,7 @@ MARGIN = 12
 INK, FAINT, ACCENT, PAPER = (32, 33, 36), (130, 134, 139), (26, 95, 180), (255, 255, 255)
 
 
-def draw_sheet(title: str, examples: Sequence[Shown], blank: Collection[str] = ()) -> Image.Image:
+def draw_sheet(title: str, examples: Sequence[ExampleEpisode], blank: Collection[str] = ()) -> Image.Image:
     """One block per episode, one row per camera, one column per frame; `blank` cameras are marked."""
     plain, bold = ImageFont.load_default(13), ImageFont.load_default(17)
     tiles = [[(c, [_tile(f) for f in frames]) for c, frames in e.frames.items()] for e in examples]
@@ -58,7 +58,7 @@ def _tile(frame: np.ndarray) -> Image.Image:
     return image.resize((width, TILE), way)
 
 
-def _caption(example: Shown) -> str:
+def _caption(example: ExampleEpisode) -> str:
     words = [f"episode {example.index}", f"{example.steps} steps"]
     if example.success is not None:
         words.append("success" if example.success else "failure")

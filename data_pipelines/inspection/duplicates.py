@@ -51,7 +51,7 @@ def take_fingerprint(
     split: str, index: int, steps: int, frames: dict[str, Sequence[np.ndarray]], actions: Sequence[np.ndarray]
 ) -> Fingerprint:
     """Of an episode: `frames` by camera, whose first and last are compared, and fields of `actions` [N, A]."""
-    pictures = [coarse(shown[at]) for _, shown in sorted(frames.items()) for at in (0, -1)]
+    pictures = [coarse(own[at]) for _, own in sorted(frames.items()) for at in (0, -1)]
     times = np.linspace(0, steps - 1, TIMES).round().astype(int)
     rows = [np.asarray(field, np.float64)[times] for field in actions]
     pictures = np.reshape(pictures, (-1, SIDE, SIDE))

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import MAX_EXAMPLES, DataError, EpisodeError
+from data_pipelines.errors import MAX_LISTED, DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
-from data_pipelines.inspection.sample import Shown, shrink
+from data_pipelines.inspection.sample import ExampleEpisode, shrink
 from data_pipelines.sampling.splits import smallest_hashes
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.open import open_source
@@ -126,7 +126,7 @@ class Sample:
     """What was read of a dataset."""
 
     facts: Facts
-    shown: tuple[Shown, ...]
+    examples: tuple[ExampleEpisode, ...]
     fingerprints: tuple[Fingerprint, ...]  # of every sampled episode
 
 
@@ -135,7 +135,7 @@ def inspect_dataset(
     split: str = "train",
     *,
     episodes: int = 32,
-    shown: int = 4,
+    max_examples: int = 4,
     frames: int = 8,
     max_bytes: int = 2_000_000_000,
     action_keys: Sequence[str] = (),
@@ -143,7 +143,7 @@ def inspect_dataset(
     """Facts of one split, some of its episodes to look at, and what tells duplicates.
 
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
-    each camera are decoded in the first `shown`, two in the others. Fields of numbers count as actions
+    each camera are decoded in the first `max_examples`, two in the others. Fields of numbers count as actions
     if they are called so, or if an entry takes them as its `action_keys`. Damaged records are counted and
     left out. A camera that cannot be decoded in an episode is counted as such, and the others are read.
 
@@ -153,47 +153,18 @@ def inspect_dataset(
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
-    if not any(f.per_step for f in fields):
-        keys = ", ".join(f.key for f in fields[:MAX_EXAMPLES])
-        raise DataError(
-            f"{source.schema}: none of its fields ({keys}) is one of a step, below `steps`: these are no episodes. Give a "
-            "dataset in the layout of RLDS, or write this one so (docs/own_data.md, Writing RLDS)."
-        )
-    cameras = {f.key: _CameraLog(f.key) for f in fields if f.per_step and f.kind == "image"}
-    sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
-    taken = {"action", *(field_slice(key)[0] for key in action_keys)}
-    numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= MAX_ACTION_WIDTH)]
-    rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
-    steps, examples, prints, bytes_read = [], [], [], 0
+    _require_steps(source, fields)
+    log = _SampleLog(source, fields, action_keys, max_examples, frames)
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
-    first = np.unique(np.linspace(0, len(drawn) - 1, shown).round().astype(int))  # those to look at
+    first = np.unique(np.linspace(0, len(drawn) - 1, max_examples).round().astype(int))  # the examples
     stopped = False
     for i in [*drawn[first], *np.delete(drawn, first)]:
-        if stopped := bytes_read > max_bytes:
+        if stopped := log.bytes_read > max_bytes:
             break
-        try:
-            record = _read(source, int(i), cameras, numbers)
-            count = _steps(record, source, cameras, numbers)
-            wanted = frames if len(examples) < shown else 2
-            times = tuple(np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist())
-            looked = _look(record, cameras, times, describe(source.runs, int(source.numbers[i])))
-        except EpisodeError as error:
-            source.skip(int(i), error)
-            continue
-        except ValueError as error:
-            source.skip(int(i), EpisodeError(f"{describe(source.runs, int(source.numbers[i]))}: {error}"))
-            continue
-        bytes_read += sum(_size(values) for values in record.values())
-        steps.append(count)
-        actions = {key: np.asarray(record[step_key(key)]).reshape(count, -1) for key in numbers}
-        for key in numbers:
-            rows[key].append(actions[key])
-        prints.append(take_fingerprint(*_named(source, int(i)), count, looked, list(actions.values())))
-        if len(examples) < shown:
-            examples.append(_shown(int(source.numbers[i]), count, record, times, looked, actions))
-    if not steps:
-        reasons = "; ".join(list(source.skipped)[:MAX_EXAMPLES]) or "it is empty"
-        more = f"; {len(source.skipped) - MAX_EXAMPLES:,} more" if len(source.skipped) > MAX_EXAMPLES else ""
+        log.read(int(i))
+    if not log.steps:
+        reasons = "; ".join(list(source.skipped)[:MAX_LISTED]) or "it is empty"
+        more = f"; {len(source.skipped) - MAX_LISTED:,} more" if len(source.skipped) > MAX_LISTED else ""
         raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}{more}")
     facts = Facts(
         name=source.name,
@@ -203,17 +174,17 @@ def inspect_dataset(
         splits=splits,
         split=split,
         episodes=len(source),
-        sampled=len(steps),
-        bytes_read=bytes_read,
-        steps=tuple(steps),
-        lengths=_lengths(steps),
-        cameras=tuple(log.facts() for log in cameras.values()),
-        actions=tuple(ActionFacts(key, dimension_facts(rows[key])) for key in numbers),
+        sampled=len(log.steps),
+        bytes_read=log.bytes_read,
+        steps=tuple(log.steps),
+        lengths=_lengths(log.steps),
+        cameras=tuple(camera.facts() for camera in log.cameras.values()),
+        actions=tuple(ActionFacts(key, dimension_facts(rows)) for key, rows in log.actions.items()),
         damaged=dict(source.skipped),
         hz=source.hz,
         stopped=stopped,
     )
-    return Sample(facts, tuple(examples), tuple(prints))
+    return Sample(facts, tuple(log.examples), tuple(log.fingerprints))
 
 
 # --- schema -----------------------------------------------------------------------------------
@@ -247,7 +218,7 @@ def _read_schema(directory: Location) -> tuple[tuple[FieldFacts, ...], tuple[Spl
 
 def _field(key: str, feature: FlatFeature) -> FieldFacts:
     if feature.image:
-        kind = "image" if feature.dtype == "uint8" else "depth"  # a grey one is shown as one of three colours
+        kind = "image" if feature.dtype == "uint8" else "depth"  # a grey image is decoded to three equal channels
     elif feature.encoding:
         kind = "bytes"
     else:
@@ -256,7 +227,65 @@ def _field(key: str, feature: FlatFeature) -> FieldFacts:
     return FieldFacts(key.removeprefix("steps/"), kind, feature.shape, dtype, key.startswith("steps/"))
 
 
-# --- one episode ------------------------------------------------------------------------------
+def _require_steps(source: EpisodeSource, fields: Sequence[FieldFacts]) -> None:
+    """Raises DataError for records without a field of a step: these are no episodes."""
+    if not any(f.per_step for f in fields):
+        keys = ", ".join(f.key for f in fields[:MAX_LISTED])
+        raise DataError(
+            f"{source.schema}: none of its fields ({keys}) is one of a step, below `steps`: these are no episodes. Give a "
+            "dataset in the layout of RLDS, or write this one so (docs/own_data.md, Writing RLDS)."
+        )
+
+
+# --- episodes ---------------------------------------------------------------------------------
+
+
+class _SampleLog:
+    """Reads episodes one by one and keeps what the facts are made of."""
+
+    def __init__(
+        self,
+        source: EpisodeSource,
+        fields: Sequence[FieldFacts],
+        action_keys: Sequence[str],
+        max_examples: int,
+        frames: int,
+    ):
+        self._source, self._max_examples, self._frames = source, max_examples, frames
+        self.cameras = {f.key: _CameraLog(f.key) for f in fields if f.per_step and f.kind == "image"}
+        sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
+        taken = {"action", *(field_slice(key)[0] for key in action_keys)}
+        self._numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= MAX_ACTION_WIDTH)]
+        self.actions: dict[str, list[np.ndarray]] = {key: [] for key in self._numbers}  # field -> [N, A] per episode
+        self.steps: list[int] = []
+        self.examples: list[ExampleEpisode] = []
+        self.fingerprints: list[Fingerprint] = []
+        self.bytes_read = 0
+
+    def read(self, i: int) -> None:
+        """Episode `i`; a damaged one is counted by the source."""
+        source, number = self._source, int(self._source.numbers[i])
+        is_example = len(self.examples) < self._max_examples
+        try:
+            record = _read(source, i, self.cameras, self._numbers)
+            count = _steps(record, source, self.cameras, self._numbers)
+            wanted = self._frames if is_example else 2
+            times = tuple(np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist())
+            looked = _look(record, self.cameras, times, describe(source.runs, number))
+        except EpisodeError as error:
+            source.skip(i, error)
+            return
+        except ValueError as error:
+            source.skip(i, EpisodeError(f"{describe(source.runs, number)}: {error}"))
+            return
+        self.bytes_read += sum(_size(values) for values in record.values())
+        self.steps.append(count)
+        actions = {key: np.asarray(record[step_key(key)]).reshape(count, -1) for key in self._numbers}
+        for key, rows in actions.items():
+            self.actions[key].append(rows)
+        self.fingerprints.append(take_fingerprint(*_named(source, i), count, looked, list(actions.values())))
+        if is_example:
+            self.examples.append(_example(number, count, record, times, looked, actions))
 
 
 def _named(source: EpisodeSource, i: int) -> tuple[str, int]:
@@ -343,13 +372,13 @@ class _CameraLog:
         return CameraFacts(self._key, sizes, self.frames, self.blank, still, self.undecodable, self.reason)
 
 
-def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> Shown:
+def _example(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> ExampleEpisode:
     found = (record.get(key, ()) for key in INSTRUCTION_KEYS)
     text = next((values[0] for values in found if len(values) and isinstance(values[0], bytes)), b"")
     success = record.get(SUCCESS_KEY)
     known = isinstance(success, np.ndarray) and len(success) == 1
     flag = bool(success[0]) if known else None
-    return Shown(i, steps, flag, text.decode(errors="replace"), times, shrink(looked), actions)
+    return ExampleEpisode(i, steps, flag, text.decode(errors="replace"), times, shrink(looked), actions)
 
 
 def _size(values: np.ndarray | list[bytes]) -> int:

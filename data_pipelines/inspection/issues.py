@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from data_pipelines.errors import MAX_EXAMPLES
+from data_pipelines.errors import MAX_LISTED
 from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.duplicates import Fingerprint
 from data_pipelines.inspection.inspect import ActionFacts, Facts
@@ -57,12 +57,11 @@ def chosen_actions(facts: Facts, entry: DatasetSpec | None) -> list[ActionFacts]
 def _damaged(facts: Facts) -> list[Issue]:
     damaged = list(facts.damaged.items())
     lost = [
-        Issue("error", "cannot be read", f"{count} of the episodes: {reason}")
-        for reason, count in damaged[:MAX_EXAMPLES]
+        Issue("error", "cannot be read", f"{count} of the episodes: {reason}") for reason, count in damaged[:MAX_LISTED]
     ]
-    if rest := sum(count for _, count in damaged[MAX_EXAMPLES:]):
+    if rest := sum(count for _, count in damaged[MAX_LISTED:]):
         lost.append(
-            Issue("error", "cannot be read", f"{rest:,} more episodes, for {len(damaged) - MAX_EXAMPLES} more reasons")
+            Issue("error", "cannot be read", f"{rest:,} more episodes, for {len(damaged) - MAX_LISTED} more reasons")
         )
     short = sum(n < 2 for n in facts.steps)
     if short:
@@ -197,8 +196,8 @@ def _duplicates(groups: Sequence[tuple[Fingerprint, ...]]) -> list[Issue]:
 
 
 def _listed(groups: Sequence[tuple[Fingerprint, ...]]) -> str:
-    words = [" = ".join(e.name for e in group[:4]) for group in groups[:MAX_EXAMPLES]]
-    return ", ".join(words) + (", ..." if len(groups) > MAX_EXAMPLES else "")
+    words = [" = ".join(e.name for e in group[:4]) for group in groups[:MAX_LISTED]]
+    return ", ".join(words) + (", ..." if len(groups) > MAX_LISTED else "")
 
 
 def _values(field: ActionFacts, which: Sequence[int]) -> str:

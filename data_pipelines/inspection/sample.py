@@ -1,4 +1,4 @@
-"""Episodes of a dataset to look at, small enough to be kept in memory by the dozen."""
+"""Example episodes of a dataset, small enough to keep dozens in memory."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ HEIGHT = 240
 
 
 @dataclass(frozen=True)
-class Shown:
-    """An episode for people: a few frames of every camera, and its actions as recorded."""
+class ExampleEpisode:
+    """An episode for a person to look at: a few frames of every camera, and its actions as recorded."""
 
     index: int  # its number among all that its files should have
     steps: int
@@ -27,7 +27,7 @@ class Shown:
 
 def shrink(frames: Mapping[str, Sequence[np.ndarray]], height: int = HEIGHT) -> dict[str, list[np.ndarray]]:
     """The frames of every camera, none higher than `height`."""
-    return {camera: [_shrink(frame, height) for frame in shown] for camera, shown in frames.items()}
+    return {camera: [_shrink(frame, height) for frame in own] for camera, own in frames.items()}
 
 
 def _shrink(frame: np.ndarray, height: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.names import NAME_RULE, is_name, shown
+from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.registry.angles import AngleForm, AngleUnit, angle_width, convert_angles
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import ConfigError, require
@@ -83,7 +83,7 @@ class DatasetSpec:
 
     def __post_init__(self):
         name = self.name
-        require(is_name(name), f"dataset {shown(name)}: no name of a dataset: {NAME_RULE}")
+        require(is_dataset_name(name), f"dataset {quote(name)}: no name of a dataset: {NAME_RULE}")
         require(
             len(self.action_keys) == len(self.action_dims),
             f"dataset {name!r}: action_keys and action_dims must have the same length",

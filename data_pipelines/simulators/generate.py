@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import BinaryIO
 
-from data_pipelines.errors import MAX_EXAMPLES, DataError
+from data_pipelines.errors import MAX_LISTED, DataError
 from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
 from data_pipelines.publishing.output_lock import OutputLock, lock_output
 from data_pipelines.simulators.embodiments import select
@@ -78,10 +78,10 @@ def made_by_other_versions(root: Path, specs: Sequence[SimSpec], episodes: int, 
     """
     found = {s.name: differences(s, root / s.name / VERSION, episodes, size, seed) for s in specs}
     lines = [f"{root / name / VERSION}: {'; '.join(how)}" for name, how in found.items() if how]
-    more = f" and {len(lines) - MAX_EXAMPLES} more" if len(lines) > MAX_EXAMPLES else ""
+    more = f" and {len(lines) - MAX_LISTED} more" if len(lines) > MAX_LISTED else ""
     require(
         not lines,
-        f"datasets are there that were made otherwise (there -> asked for): {', '.join(lines[:MAX_EXAMPLES])}{more}. Nothing "
+        f"datasets are there that were made otherwise (there -> asked for): {', '.join(lines[:MAX_LISTED])}{more}. Nothing "
         "was changed. Choose another directory, or give the settings that they were made with, or remove them to have them "
         "made again.",
     )

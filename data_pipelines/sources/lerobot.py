@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
-from data_pipelines.names import inside, shown
+from data_pipelines.names import quote, safe_join
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta
 from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retry
@@ -50,7 +50,7 @@ class LeRobotSource:
             if feature["dtype"] in PICTURES and not _is_camera(feature)
         }
         if not available:
-            listed = ", ".join(f"{shown(key)}: {'x'.join(map(str, shape))}" for key, shape in others.items())
+            listed = ", ".join(f"{quote(key)}: {'x'.join(map(str, shape))}" for key, shape in others.items())
             found = f" (there are {listed}; grey ones are to be written as red, green and blue)" if others else ""
             raise DataError(
                 f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels{found}."
@@ -118,7 +118,7 @@ class LeRobotSource:
             first, _ = self._place(entry)
             self._check_camera(entry, camera, where)
             (value,) = self._tables.read(entry.data, [camera], first + n, 1)[camera].to_pylist()
-        return self._image_bytes(value, f"{where}: {shown(camera)} at row {n}")
+        return self._image_bytes(value, f"{where}: {quote(camera)} at row {n}")
 
     @property
     def loaded(self) -> int:
@@ -130,7 +130,7 @@ class LeRobotSource:
         available = self._tables.columns(entry.data)
         missing = [n for n in (EPISODE, TIME, *self.vectors.values()) if n not in available]
         if missing:
-            raise UnitError(f"{entry.data}: no column {shown(missing[0])}. {ADVICE}")
+            raise UnitError(f"{entry.data}: no column {quote(missing[0])}. {ADVICE}")
         place = self._tables.find(entry.data, entry.index)
         if place is None:
             raise UnitError(f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}")
@@ -138,7 +138,7 @@ class LeRobotSource:
 
     def _check_camera(self, entry: EpisodeEntry, name: str, where: str) -> None:
         if name not in self._tables.columns(entry.data):
-            raise UnitError(f"{where} has no column {shown(name)}, though the feature is an image. {ADVICE}")
+            raise UnitError(f"{where} has no column {quote(name)}, though the feature is an image. {ADVICE}")
 
     def times(self, table: Any, where: str) -> np.ndarray:
         """Seconds since the episode's first frame. Raises UnitError for a row out of step."""
@@ -161,7 +161,7 @@ class LeRobotSource:
         self._check_camera(entry, name, where)
         images = []
         for row, value in enumerate(self.rows(entry, [name])[name].to_pylist()):
-            here = f"{where}: {shown(name)} at row {row}"
+            here = f"{where}: {quote(name)} at row {row}"
             images.append(stored_jpeg(self._image_bytes(value, here), self.short_side, here))
         return images
 
@@ -171,7 +171,7 @@ class LeRobotSource:
             return value["bytes"]
         if isinstance(value, dict) and value.get("path"):
             try:
-                path = inside(self.root, value["path"])
+                path = safe_join(self.root, value["path"])
             except ValueError as error:
                 raise UnitError(f"{where}: {error}. {ADVICE}") from error
             try:
@@ -186,7 +186,7 @@ class LeRobotSource:
             rows = np.asarray(table[name].to_pylist(), np.float64)
         except (TypeError, ValueError) as error:
             raise UnitError(
-                f"{where}: {shown(name)} is not one array of numbers per row ({error}). {ADVICE}"
+                f"{where}: {quote(name)} is not one array of numbers per row ({error}). {ADVICE}"
             ) from error
         return rows.reshape(len(rows), -1)
 
@@ -204,7 +204,7 @@ class LeRobotSource:
         unknown = [(row, i) for row, i in enumerate(indices) if type(i) is not int or i not in self.meta.tasks]
         if unknown:
             row, index = unknown[0]
-            raise UnitError(f"{where}: task_index {shown(index)} at row {row} is not among the tasks of meta. {ADVICE}")
+            raise UnitError(f"{where}: task_index {quote(index)} at row {row} is not among the tasks of meta. {ADVICE}")
         return [self.meta.tasks[i] for i in indices]
 
 
@@ -239,7 +239,7 @@ def _check_names(features: Mapping[str, dict[str, Any]], path: Path) -> None:
         other = named.setdefault(name, key)
         if other != key:
             raise DataError(
-                f"{path}: the features {shown(other)} and {shown(key)} would both be called {name!r}. "
+                f"{path}: the features {quote(other)} and {quote(key)} would both be called {name!r}. "
                 "Rename one of them."
             )
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_lines, read_object
-from data_pipelines.names import inside, shown
+from data_pipelines.names import quote, safe_join
 from data_pipelines.sources.parquet_rows import ADVICE, read_table
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -55,7 +55,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     version = info.get("codebase_version")
     if version not in VERSIONS:
         raise DataError(
-            f"{info_path}: codebase_version is {shown(version)}; {', '.join(VERSIONS)} can be read. Convert the "
+            f"{info_path}: codebase_version is {quote(version)}; {', '.join(VERSIONS)} can be read. Convert the "
             "dataset with LeRobot's own scripts first."
         )
     for field in ("fps", "features", "data_path"):
@@ -65,7 +65,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     features = info["features"]
     videos = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if videos and not info.get("video_path"):
-        raise DataError(f"{info_path}: no 'video_path', but {shown(videos[0])} is a video. {ADVICE}")
+        raise DataError(f"{info_path}: no 'video_path', but {quote(videos[0])} is a video. {ADVICE}")
     read = _episodes_3 if version == "v3.0" else _episodes_2
     episodes = read(root, info, videos)
     if not episodes:
@@ -101,7 +101,7 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
         table = read_table(path, [*columns, "tasks"])  # beside them stand statistics, which take far more
         missing = [c for c in columns if c not in table.column_names]
         if missing:
-            raise DataError(f"{path}: no column {shown(missing[0])}. {ADVICE}")
+            raise DataError(f"{path}: no column {quote(missing[0])}. {ADVICE}")
         for line, row in enumerate(_rows(table, path)):
             where = f"{path}: row {line}"
             number = {c: (_seconds if c.endswith("timestamp") else _count)(row, c, where) for c in columns}
@@ -155,11 +155,11 @@ def _place(root: Path, info: dict[str, Any], field: str, **place: Any) -> Path:
     try:
         text = _PLACE.sub(lambda m: f"{place[m[1]]:0{m[2]}d}" if m[2] else str(place[m[1]]), info[field])
         if "{" in text:
-            raise ValueError(f"{shown(text)} is left")
-        return inside(root, text)
+            raise ValueError(f"{quote(text)} is left")
+        return safe_join(root, text)
     except (KeyError, ValueError) as error:
         raise DataError(
-            f"{root / 'meta' / 'info.json'}: {field} {shown(info[field])} cannot be filled in ({error}). {ADVICE}"
+            f"{root / 'meta' / 'info.json'}: {field} {quote(info[field])} cannot be filled in ({error}). {ADVICE}"
         ) from error
 
 
@@ -167,43 +167,43 @@ def _check_info(info: dict[str, Any], path: Path) -> None:
     """Raises DataError for a field of info.json of the wrong kind."""
     fps, features = info["fps"], info["features"]
     if type(fps) not in (int, float) or not 0 < fps <= MAX_COUNT:
-        raise DataError(f"{path}: fps is {shown(fps)}, not a rate. {ADVICE}")
+        raise DataError(f"{path}: fps is {quote(fps)}, not a rate. {ADVICE}")
     for field in ("data_path", "video_path"):
         if not isinstance(info.get(field) or "", str):
-            raise DataError(f"{path}: {field} is {shown(info[field])}, not a path. {ADVICE}")
+            raise DataError(f"{path}: {field} is {quote(info[field])}, not a path. {ADVICE}")
     if info.get("chunks_size") is not None:
         _count(info, "chunks_size", str(path))
     if not isinstance(features, dict):
-        raise DataError(f"{path}: features is {shown(features)}, not an object. {ADVICE}")
+        raise DataError(f"{path}: features is {quote(features)}, not an object. {ADVICE}")
     for name, feature in features.items():
         usable = isinstance(feature, dict) and isinstance(feature.get("dtype"), str) and name.isprintable()
         shape = feature.get("shape") if usable else None
         sizes = isinstance(shape, list) and all(type(n) is int and 0 <= n for n in shape)
         if not sizes or math.prod(shape) > MAX_COUNT:
-            raise DataError(f"{path}: feature {shown(name)} has no usable dtype and shape. {ADVICE}")
+            raise DataError(f"{path}: feature {quote(name)} has no usable dtype and shape. {ADVICE}")
         for key in ("info", "video_info"):
             if not isinstance(feature.get(key) or {}, dict):
-                raise DataError(f"{path}: feature {shown(name)}: {key} is no object. {ADVICE}")
+                raise DataError(f"{path}: feature {quote(name)}: {key} is no object. {ADVICE}")
 
 
 def _count(row: Mapping[str, Any], name: str, where: str) -> int:
     value = row.get(name)
     if type(value) is not int or not 0 <= value <= MAX_COUNT:
-        raise DataError(f"{where} has no usable {name!r} ({shown(value)}). {ADVICE}")
+        raise DataError(f"{where} has no usable {name!r} ({quote(value)}). {ADVICE}")
     return value
 
 
 def _seconds(row: Mapping[str, Any], name: str, where: str) -> float:
     value = row.get(name)
     if type(value) not in (int, float) or not 0 <= value <= MAX_COUNT:
-        raise DataError(f"{where} has no usable {name!r} ({shown(value)}). {ADVICE}")
+        raise DataError(f"{where} has no usable {name!r} ({quote(value)}). {ADVICE}")
     return float(value)
 
 
 def _texts(row: Mapping[str, Any], where: str) -> tuple[str, ...]:
     tasks = row.get("tasks") or []
     if not isinstance(tasks, list):
-        raise DataError(f"{where} has no usable 'tasks' ({shown(tasks)}). {ADVICE}")
+        raise DataError(f"{where} has no usable 'tasks' ({quote(tasks)}). {ADVICE}")
     return tuple(map(str, tasks))
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
-from data_pipelines.names import shown
+from data_pipelines.names import quote
 from data_pipelines.sources.rlds.location import is_io_error, retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import RobomimicSettings
@@ -240,7 +240,7 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
         return None
     if type(rate) not in (int, float) or not 0 < rate < math.inf:
         raise DataError(
-            f"{path}: the attribute env_args of 'data' says control_freq {shown(rate)}, which is no rate in Hz. "
+            f"{path}: the attribute env_args of 'data' says control_freq {quote(rate)}, which is no rate in Hz. "
             "Correct it."
         )
     return float(rate)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.names import NAME_RULE, is_name, shown
+from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.registry import DatasetSpec, find_spec
 from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
@@ -101,9 +101,9 @@ def _plan(
                 f"give the one that made them (latents here are joined by --patch {patch})",
             )
         facts[0] = decoder
-    if name is None and not is_name(train.name):
+    if name is None and not is_dataset_name(train.name):
         raise DataError(
-            f"{train.path / 'metadata.json'}: name is {shown(train.name)}; {NAME_RULE}. Say another one with --name."
+            f"{train.path / 'metadata.json'}: name is {quote(train.name)}; {NAME_RULE}. Say another one with --name."
         )
     name = name or train.name
     known = find_spec(name)

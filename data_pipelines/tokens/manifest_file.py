@@ -12,7 +12,7 @@ import numpy as np
 
 from data_pipelines.columns import Column, Columns
 from data_pipelines.errors import DataError
-from data_pipelines.names import brief
+from data_pipelines.names import truncate
 from data_pipelines.tokens.manifest import COLUMNS_FILE, LISTS, READ, SPLITS, Manifest
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict
@@ -39,8 +39,8 @@ def load_manifest(path: Path) -> Manifest:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
     except (ValueError, AttributeError, TypeError, KeyError, OverflowError, RecursionError) as error:
         if isinstance(error, ConfigError):
-            raise DataError(f"{path}: not a manifest of this program: {brief(error)}. {advice}") from error
-        raise DataError(f"{path}: the manifest is damaged ({brief(error)}). {advice}") from error
+            raise DataError(f"{path}: not a manifest of this program: {truncate(error)}. {advice}") from error
+        raise DataError(f"{path}: the manifest is damaged ({truncate(error)}). {advice}") from error
 
 
 Lists = dict[str, dict[str, Sequence[int]]]

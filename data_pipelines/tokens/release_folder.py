@@ -21,7 +21,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
-from data_pipelines.names import shown
+from data_pipelines.names import quote
 from hma_jax.config import ConfigError
 
 ADVICE = "Fetch the folder again."
@@ -99,9 +99,9 @@ def _metadata(path: Path) -> dict[str, Any]:
         if value is None and field in ("latent_channels", "action_dim"):
             continue
         if type(value) is not int or not 1 <= value <= MAX_COUNT:
-            raise DataError(f"{path}: {field} is {shown(value)}, not a positive number. {ADVICE}")
+            raise DataError(f"{path}: {field} is {quote(value)}, not a positive number. {ADVICE}")
     if meta.get("token_dtype", "uint32") not in DTYPES:
-        raise DataError(f"{path}: token_dtype is {shown(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}")
+        raise DataError(f"{path}: token_dtype is {quote(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}")
     return meta
 
 
@@ -117,7 +117,7 @@ def _video_shape(path: Path, meta: dict[str, Any]) -> tuple[int, tuple[int, ...]
         raise ConfigError(f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents.")
     vocab_size = meta.get("vocab_size")
     if type(vocab_size) is not int or not 2 <= vocab_size <= 2**32:
-        raise DataError(f"{path / 'metadata.json'}: vocab_size is {shown(vocab_size)}. {ADVICE}")
+        raise DataError(f"{path / 'metadata.json'}: vocab_size is {quote(vocab_size)}. {ADVICE}")
     return frames, (frames, *grid), dtype
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.markup import escape
 from tyro.conf import arg
 
-from data_pipelines.errors import MAX_EXAMPLES
+from data_pipelines.errors import MAX_LISTED
 from experiments.cli.arguments import RemakeOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
@@ -146,9 +146,9 @@ def show_store(workspace: Workspace, rate: float | None) -> None:
     console.print(table)
     for name in store.names:
         skipped = store.manifest(name).skipped
-        for one in skipped[:MAX_EXAMPLES]:
+        for one in skipped[:MAX_LISTED]:
             console.print(f"[yellow]lost[/] {name}: {escape(without_advice(one.reason))}", soft_wrap=True)
-        if rest := sum(one.episodes for one in skipped[MAX_EXAMPLES:]):
+        if rest := sum(one.episodes for one in skipped[MAX_LISTED:]):
             console.print(
                 f"[yellow]lost[/] {name}: {rest:,} more, see {short(store.root / name / FILE)}", soft_wrap=True
             )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from data_pipelines.inspection.action_stats import QUANTILES
 from data_pipelines.inspection.inspect import ActionFacts, Facts, Sample
 from data_pipelines.inspection.issues import Issue, chosen_actions
-from data_pipelines.inspection.sample import Shown
+from data_pipelines.inspection.sample import ExampleEpisode
 from data_pipelines.inspection.suggest import WindowFacts, window_facts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.schema import field_slice
@@ -161,35 +161,35 @@ def _windows(d: Viewed, frames: int) -> WindowFacts | None:
 
 
 def _gallery(d: Viewed) -> str:
-    return f"<div class=gallery>{''.join(_episode(d, shown) for shown in d.sample.shown)}</div>"
+    return f"<div class=gallery>{''.join(_episode(d, example) for example in d.sample.examples)}</div>"
 
 
-def _episode(d: Viewed, shown: Shown) -> str:
+def _episode(d: Viewed, example: ExampleEpisode) -> str:
     hz = d.hz or UNKNOWN_HZ
-    seconds = shown.steps / hz
+    seconds = example.steps / hz
     speed = min(max(seconds / LONGEST, 1.0), FASTEST)
     blank = {c.key for c in d.facts.cameras if c.is_blank}
     used = d.entry.image_key if d.entry else ""
-    cameras = sorted((c for c in shown.frames if c not in blank), key=lambda c: (c != used, c))
+    cameras = sorted((c for c in example.frames if c not in blank), key=lambda c: (c != used, c))
     clips = [
-        clip(shown.frames[c], seconds / speed, TALL if n == 0 else SMALL, f"{c} of episode {shown.index}")
+        clip(example.frames[c], seconds / speed, TALL if n == 0 else SMALL, f"{c} of episode {example.index}")
         for n, c in enumerate(cameras)
     ]
-    words = [f"<b>episode {shown.index}</b>", f"{shown.steps} steps"]
+    words = [f"<b>episode {example.index}</b>", f"{example.steps} steps"]
     if d.hz:
         words.append(f"{seconds:.1f} s" + (f", shown {speed:.2g} times as fast" if speed > 1.05 else ""))
-    if shown.success is not None:
-        words.append("success" if shown.success else "failure")
-    text = " ".join(shown.instruction.split())
+    if example.success is not None:
+        words.append("success" if example.success else "failure")
+    text = " ".join(example.instruction.split())
     said = f"<p>“{html.escape(text[:160])}{'…' if len(text) > 160 else ''}”</p>" if text else ""
-    drawn = "".join(_curves(field, shown) for field in chosen_actions(d.facts, d.entry))
+    drawn = "".join(_curves(field, example) for field in chosen_actions(d.facts, d.entry))
     pictures = "".join(clips[:1]) + f"<div class=clips>{''.join(clips[1:])}</div>"
     return f"<div class=episode>{pictures}<p>{' · '.join(words)}</p>{said}{drawn}</div>"
 
 
-def _curves(field: ActionFacts, shown: Shown) -> str:
+def _curves(field: ActionFacts, example: ExampleEpisode) -> str:
     key, part = field_slice(field.key)
-    rows = shown.actions[key][:, part]
+    rows = example.actions[key][:, part]
     lows, highs = ([getattr(x, name) for x in field.dimensions] for name in ("minimum", "maximum"))
     names = [str(i) for i in range(len(field.dimensions))]
     return f"<p class=hint>{html.escape(field.key)}, as recorded</p>{curves(rows, lows, highs, names)}"

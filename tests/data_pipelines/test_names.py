@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from data_pipelines.names import MAX_NAME_LENGTH, inside, is_name, shown
+from data_pipelines.names import MAX_NAME_LENGTH, is_dataset_name, quote, safe_join
 from data_pipelines.registry import DatasetSpec, all_specs
 from data_pipelines.registry.toml_file import load_entries
 from hma_jax.config import ConfigError
@@ -32,17 +32,17 @@ BAD = [
 
 
 def test_every_name_of_the_registry_is_one():
-    assert all(is_name(spec.name) for spec in all_specs())
+    assert all(is_dataset_name(spec.name) for spec in all_specs())
 
 
 @pytest.mark.parametrize("name", GOOD)
 def test_name(name):
-    assert is_name(name) and make_spec(name).name == name
+    assert is_dataset_name(name) and make_spec(name).name == name
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_text_that_is_no_name(name):
-    assert not is_name(name)
+    assert not is_dataset_name(name)
     with pytest.raises(ConfigError, match="no name of a dataset: use up to 128 letters"):
         make_spec(name)
 
@@ -69,13 +69,13 @@ def test_part_of_a_field_with_a_huge_number_is_no_crash():
 
 @pytest.mark.parametrize("text", ["a", "a/b", "..a/b..", "a/./b", "videos/x/chunk-000/file.mp4"])
 def test_path_inside(text):
-    assert inside(Path("/root"), text) == Path("/root") / text
+    assert safe_join(Path("/root"), text) == Path("/root") / text
 
 
 @pytest.mark.parametrize("text", ["", "..", "../a", "a/../../b", "/a", "a\\..\\b", "a\0b", "a\nb", "a" * 1025, 7, None])
 def test_path_that_may_leave(text):
     with pytest.raises(ValueError):
-        inside(Path("/root"), text)
+        safe_join(Path("/root"), text)
 
 
 def test_values_of_others_are_shown_on_one_short_line():
@@ -83,4 +83,4 @@ def test_values_of_others_are_shown_on_one_short_line():
     for _ in range(5000):
         deep = [deep]
     for value in (deep, "\x1b[31m" * 99, b"\n" * 999, ["x"] * 999, {"a": "\ud800"}, None):
-        assert shown(value).isprintable() and len(shown(value)) < 100
+        assert quote(value).isprintable() and len(quote(value)) < 100

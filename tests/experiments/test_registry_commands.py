@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_pipelines.inspection.inspect import Shown
+from data_pipelines.inspection.inspect import ExampleEpisode
 from data_pipelines.registry import get_spec, toml_file
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
@@ -277,7 +277,7 @@ def test_contact_sheet_shows_every_frame_where_it_says():
     colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
     frames = [np.full((56, 40, 3), c, np.uint8) for c in colours]
     cameras = {"observation/a": frames, "observation/b": frames}
-    example = Shown(7, 30, True, "push the red thing", (0, 14, 29), cameras, {})
+    example = ExampleEpisode(7, 30, True, "push the red thing", (0, 14, 29), cameras, {})
     pixels = np.asarray(draw_sheet("title", [example, example]))
     for colour in colours:  # a tile is 112 x 80: doubled, pixels kept; two cameras, two episodes
         assert (pixels == colour).all(axis=2).sum() == pytest.approx(4 * 112 * 80, rel=0.05)

@@ -17,7 +17,7 @@ from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.tokens import part_maker
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli.main import main
-from experiments.cli.tokenize import MAX_EXAMPLES, show_store
+from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import sources
 from experiments.progress import Pace
 from experiments.running.workspace import Workspace
@@ -175,7 +175,7 @@ def test_of_many_losses_some_are_named(tmp_path, capsys):
     tokenize_dataset(ARM, rlds, FakeTokenizer(), tmp_path / "tokens", corrupt="skip", max_skipped=0.9)
     show_store(Workspace(tmp_path), 2.0)
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith(f"lost {ARM.name}: ")]
-    assert len(told) == MAX_EXAMPLES + 1 and told[-1].startswith(f"lost {ARM.name}: 18 more, see ")
+    assert len(told) == MAX_LISTED + 1 and told[-1].startswith(f"lost {ARM.name}: 18 more, see ")
     assert main(["data", "inspect", str(rlds), "--hz", "5", "--out", str(tmp_path / "sheet")]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("damaged ")]
     assert len(told) == 7 and told[-1] == "damaged 18 more episode(s): --json FILE names all"

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.names import is_name, shown
+from data_pipelines.names import is_dataset_name, quote
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.rlds.writer import encode_jpeg
@@ -63,9 +63,9 @@ class Ego4dSource:
         if not isinstance(data, dict) or not isinstance(data.get("videos"), list):
             raise DataError(f"{self.path}: no list 'videos' in it; give fho_main.json of the v2 annotations.")
         labels = {str(label.get("video_uid")): label for label in data["videos"] if isinstance(label, dict)}
-        wrong = [uid for uid in labels if not is_name(uid)]
+        wrong = [uid for uid in labels if not is_dataset_name(uid)]
         if wrong:
-            raise DataError(f"{self.path}: video_uid {shown(wrong[0])} names no file. Fetch it again.")
+            raise DataError(f"{self.path}: video_uid {quote(wrong[0])} names no file. Fetch it again.")
         self._labels = {uid: label for uid, label in labels.items() if self._video(uid).is_file()}
         self.units = list(self._labels)
         if not self.units:
@@ -124,7 +124,7 @@ class Ego4dSource:
                 if row is not None:
                     number = self._field(frame, "frame_number", where)
                     if type(number) is not int or not 0 <= number < video.max_frames:
-                        raise UnitError(f"{self.path}: {where} has frame_number {shown(number)}. {ADVICE}")
+                        raise UnitError(f"{self.path}: {where} has frame_number {quote(number)}. {ADVICE}")
                     found.setdefault(number, row)
         numbers = sorted(found)
         return np.array(numbers) / rate, np.array([found[n] for n in numbers]).reshape(-1, 4)

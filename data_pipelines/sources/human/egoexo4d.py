@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.names import is_name, shown
+from data_pipelines.names import is_dataset_name, quote
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.rlds.writer import encode_jpeg
@@ -56,9 +56,9 @@ class EgoExo4dSource:
             raise DataError(f"{self.root / 'takes.json'}: not a list of takes. Fetch it again.")
         for take in takes:
             for field in ("take_uid", "take_name"):
-                if not is_name(take.get(field)):
+                if not is_dataset_name(take.get(field)):
                     raise DataError(
-                        f"{self.root / 'takes.json'}: {field} {shown(take.get(field))} names no file. Fetch it again."
+                        f"{self.root / 'takes.json'}: {field} {quote(take.get(field))} names no file. Fetch it again."
                     )
         self._takes = [t for t in takes if self._pose(t).is_file() and self._video(t) is not None]
         self.units = [str(t.get("take_name")) for t in self._takes]
@@ -153,7 +153,7 @@ class EgoExo4dSource:
 
 def _frame_number(text: str) -> int:
     if not (len(text) <= 9 and text.isascii() and text.isdecimal()):
-        raise ValueError(f"{shown(text)} is no frame number")
+        raise ValueError(f"{quote(text)} is no frame number")
     return int(text)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from data_pipelines.names import shown
+from data_pipelines.names import quote
 
 MAX_FIELDS = 4096
 MAX_DEPTH = 32
@@ -77,7 +77,7 @@ def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[t
         children = content if "features" not in content else _mapping(content["features"], key)
         for name, child in children.items():
             if not name or not name.isprintable() or len(key) + len(name) > MAX_KEY_LENGTH:
-                raise ValueError(f"{_field(key)}: a field cannot be called {shown(name)}")
+                raise ValueError(f"{_field(key)}: a field cannot be called {quote(name)}")
             yield from _fields(child, f"{key}/{name}" if key else name, depth + 1, listed)
     elif form == "sequence":
         inner = _fields(content.get("feature"), key, depth + 1, listed=True)
@@ -106,7 +106,7 @@ def _in_lists(feature: FlatFeature) -> FlatFeature:
 
 
 def _field(key: str) -> str:
-    return f"field {shown(key)}" if key else "its top level"
+    return f"field {quote(key)}" if key else "its top level"
 
 
 def _content(node: Any, key: str) -> tuple[str, Mapping[str, Any]]:
@@ -142,13 +142,13 @@ def _either(node: Mapping[str, Any], name: str) -> Any:
 
 def _mapping(value: Any, key: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{_field(key)}: {shown(value)} where a description should stand")
+        raise ValueError(f"{_field(key)}: {quote(value)} where a description should stand")
     return value
 
 
 def _list(value: Any, key: str) -> list[Any]:
     if not isinstance(value, list):
-        raise ValueError(f"{_field(key)}: {shown(value)} where a list should stand")
+        raise ValueError(f"{_field(key)}: {quote(value)} where a list should stand")
     return value
 
 
@@ -162,7 +162,7 @@ def _shape(content: Mapping[str, Any], key: str) -> tuple[int | None, ...]:
         if isinstance(size, str) and len(size) <= 12 and size.isascii() and size.removeprefix("-").isdecimal():
             size = int(size)  # the JSON of a message has 64-bit numbers as strings
         if size is not None and (type(size) is not int or not -1 <= size <= MAX_NUMBERS):
-            raise ValueError(f"{_field(key)}: {shown(size)} cannot be one of its sizes")
+            raise ValueError(f"{_field(key)}: {quote(size)} cannot be one of its sizes")
         sizes.append(None if size == -1 else size)
     if len(sizes) > 8:
         raise ValueError(f"{_field(key)}: {len(sizes)} dimensions")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
-from data_pipelines.names import NAME_RULE, is_name, shown
+from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
 from data_pipelines.sources.rlds.location import exists, locate, retry
 from hma_jax.config import require
@@ -67,7 +67,7 @@ class DatasetInfo:
             name = re.sub(r"\{([A-Z_]+)\}", lambda m: fields.get(m[1], m[0]), of.template)
             name = name.rpartition("/")[2]
             if not 0 < len(name) <= 255 or not name.isprintable() or name.startswith(".") or "{" in name:
-                raise ValueError(f"split {split!r}: {shown(name)}, of filepathTemplate, is no name of a shard")
+                raise ValueError(f"split {split!r}: {quote(name)}, of filepathTemplate, is no name of a shard")
             names.append(name)
         return names
 
@@ -125,7 +125,7 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
     features = read_features(directory)
     if info.file_format not in FILE_FORMATS:
         known = " and ".join(FILE_FORMATS)
-        raise DataError(f"{directory / INFO}: fileFormat is {shown(info.file_format)}; only {known} can be read.")
+        raise DataError(f"{directory / INFO}: fileFormat is {quote(info.file_format)}; only {known} can be read.")
     parts = split.split("+")
     for part in parts:
         require(
@@ -163,29 +163,31 @@ def read_info(directory: Location) -> DatasetInfo:
     path = directory / INFO
     values = read_object(path, if_missing=ADVICE, advice=ADVICE)
     name, version = values.get("name"), values.get("version")
-    if isinstance(name, str) and name.isidentifier() and not is_name(name):  # tfds takes letters of any alphabet
+    if (
+        isinstance(name, str) and name.isidentifier() and not is_dataset_name(name)
+    ):  # tfds takes letters of any alphabet
         raise DataError(
-            f"{path}: name is {shown(name)}: {NAME_RULE}. Change it there and in the names of the shards, which begin "
+            f"{path}: name is {quote(name)}: {NAME_RULE}. Change it there and in the names of the shards, which begin "
             "with it."
         )
     try:
         splits = [_split(split) for split in _list(values.get("splits", []), "splits")]
         file_format = values.get("fileFormat", values.get("file_format")) or "tfrecord"
         for text, what in ((name, "name"), (version, "version"), (file_format, "fileFormat")):
-            if not is_name(text):
-                raise ValueError(f"{what} is {shown(text)}: {NAME_RULE}")
+            if not is_dataset_name(text):
+                raise ValueError(f"{what} is {quote(text)}: {NAME_RULE}")
     except ValueError as error:
         raise DataError(f"{path}: {error}. {ADVICE}") from error
     return DatasetInfo(name, version, file_format, {split.name: split for split in splits})
 
 
 def _split(values: Any) -> SplitInfo:
-    if not isinstance(values, dict) or not is_name(values.get("name")):
+    if not isinstance(values, dict) or not is_dataset_name(values.get("name")):
         raise ValueError("a split has no usable name")
     name = values["name"]
     template = values.get("filepathTemplate", values.get("filepath_template")) or TEMPLATE
     if not isinstance(template, str) or len(template) > 256:
-        raise ValueError(f"split {name!r}: filepathTemplate is {shown(template)}")
+        raise ValueError(f"split {name!r}: filepathTemplate is {quote(template)}")
     lengths = _list(values.get("shardLengths", values.get("shard_lengths", [])), f"shardLengths of {name!r}")
     if len(lengths) > MAX_SHARDS:
         raise ValueError(f"split {name!r}: {len(lengths):,} shards, more than {MAX_SHARDS:,}")
@@ -195,7 +197,7 @@ def _split(values: Any) -> SplitInfo:
 
 def _list(value: Any, what: str) -> list[Any]:
     if not isinstance(value, list):
-        raise ValueError(f"{what}: {shown(value)} is no list")
+        raise ValueError(f"{what}: {quote(value)} is no list")
     return value
 
 
@@ -204,7 +206,7 @@ def _count(value: Any, what: str) -> int:
     if isinstance(value, str) and len(value) <= 19 and value.isascii() and value.isdecimal():
         value = int(value)
     if type(value) is not int or not 0 <= value < 2**63:
-        raise ValueError(f"{what}: {shown(value)} is no count")
+        raise ValueError(f"{what}: {quote(value)} is no count")
     return value
 
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from data_pipelines.errors import MAX_EXAMPLES
+from data_pipelines.errors import MAX_LISTED
 from experiments.cli.data.next_command import no_window, other_rate, single_episode, tokenize_command
 from experiments.progress import console, say, step, tidy_table
 from experiments.setting import say_unmatched, use_entries
@@ -159,7 +159,7 @@ def data_inspect(
     blank = [c.key for c in facts.cameras if c.is_blank]
     title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
     drawn = io.BytesIO()
-    draw_sheet(title, sample.shown, blank).save(drawn, format="png")
+    draw_sheet(title, sample.examples, blank).save(drawn, format="png")
     write_file(folder / SHEET, drawn.getvalue())
     wrote(folder / SHEET)
     if json is not None:
@@ -182,9 +182,9 @@ def print_facts(facts: Facts) -> None:
         soft_wrap=True,
     )
     damaged = list(facts.damaged.items())
-    for reason, count in damaged[:MAX_EXAMPLES]:
+    for reason, count in damaged[:MAX_LISTED]:
         console.print(f"[yellow]damaged[/] {count} episode(s): {escape(reason)}", soft_wrap=True)
-    if rest := sum(count for _, count in damaged[MAX_EXAMPLES:]):
+    if rest := sum(count for _, count in damaged[MAX_LISTED:]):
         console.print(f"[yellow]damaged[/] {rest:,} more episode(s): --json FILE names all", soft_wrap=True)
     for c in facts.cameras:
         if c.undecodable:

@@ -94,7 +94,9 @@ def _view_one(
     known = find_spec(source_name(directory))
     split = split or (known.split if known else "train")
     keys = known.action_keys if known else ()
-    sample = inspect_dataset(directory, split, episodes=episodes, shown=shown, frames=CLIP_FRAMES, action_keys=keys)
+    sample = inspect_dataset(
+        directory, split, episodes=episodes, max_examples=shown, frames=CLIP_FRAMES, action_keys=keys
+    )
     facts = sample.facts
     rate = hz or (known.hz if known else facts.hz)
     entry = replace(known, hz=rate) if known else None
@@ -116,7 +118,7 @@ def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]
     from data_pipelines.inspection.inspect import inspect_dataset
 
     try:
-        sample = inspect_dataset(directory, split, episodes=episodes, shown=0, frames=2, action_keys=keys)
+        sample = inspect_dataset(directory, split, episodes=episodes, max_examples=0, frames=2, action_keys=keys)
         return sample.fingerprints
     except DataError as error:
         console.print(f"[yellow]note[/]: split {split!r} was not searched for the same episodes: {escape(str(error))}")

@@ -78,9 +78,9 @@ def test_action_statistics_are_those_of_all_sampled_steps(toy):
 
 
 def test_sample_is_bounded_in_episodes_and_bytes(toy):
-    sample = inspect_dataset(toy, episodes=3, shown=2)
-    facts, shown = sample.facts, sample.shown
-    assert (facts.sampled, facts.episodes, len(shown)) == (3, 6, 2)
+    sample = inspect_dataset(toy, episodes=3, max_examples=2)
+    facts, examples = sample.facts, sample.examples
+    assert (facts.sampled, facts.episodes, len(examples)) == (3, 6, 2)
     assert inspect_dataset(toy, episodes=3).facts.steps == inspect_dataset(toy, episodes=3).facts.steps
     facts = inspect_dataset(toy, max_bytes=1).facts
     assert facts.sampled == 1 and facts.stopped and not sample.facts.stopped
@@ -101,7 +101,7 @@ def test_frames_that_are_read_one_by_one_count_as_what_is_read(tmp_path):
 
 
 def test_shown_frames_are_those_of_their_times(toy):
-    for example in inspect_dataset(toy, frames=3).shown:
+    for example in inspect_dataset(toy, frames=3).examples:
         assert example.times[0] == 0 and example.times[-1] == example.steps - 1
         assert example.instruction == "push" and example.success is bool(example.index % 2)
         (frames,) = example.frames.values()
@@ -156,7 +156,7 @@ def test_a_camera_that_cannot_be_decoded_costs_no_episode(tmp_path, spoilt):
     assert (good.frames, good.undecodable) == (20, 0)
     assert (bad.frames, bad.undecodable, bad.is_blank) == (5 * (4 - len(spoilt)), len(spoilt), False)
     assert "step 0 of observation/a_wrist cannot be decoded: 8 bytes" in bad.reason
-    assert all(len(example.frames) == 2 - (example.index in spoilt) for example in sample.shown)
+    assert all(len(example.frames) == 2 - (example.index in spoilt) for example in sample.examples)
     assert choose_camera(facts.cameras)[0] == good
     for key, kind in ((good.key, "warning"), (bad.key, "error")):
         issues = find_issues(facts, replace(make_spec(), image_key=key), None, ())
@@ -175,8 +175,8 @@ def test_episodes_keep_their_numbers_behind_a_shard_that_is_cut_off(tmp_path):
     directory = write_rlds(tmp_path, make_spec(), [5] * 6, shards=2, change=change)
     first = directory / "toy-train.tfrecord-00000-of-00002"
     os.truncate(first, first.stat().st_size - 1)
-    sample = inspect_dataset(directory, shown=4)
-    assert sorted(shown.index for shown in sample.shown) == [0, 1, 3, 5]
+    sample = inspect_dataset(directory, max_examples=4)
+    assert sorted(example.index for example in sample.examples) == [0, 1, 3, 5]
     assert any(r.startswith("toy-train.tfrecord-00001-of-00002, episode 1: its fields") for r in sample.facts.damaged)
 
 
@@ -296,7 +296,7 @@ def test_an_instruction_in_numbers_is_no_text(tmp_path):
     """As some datasets keep the ids of its tokens."""
     numbers = {"steps/language_instruction": np.arange(20)}
     directory = write_rlds(tmp_path, make_spec(), [10] * 2, change=lambda _, features: features.update(numbers))
-    assert [shown.instruction for shown in inspect_dataset(directory).shown] == ["", ""]
+    assert [example.instruction for example in inspect_dataset(directory).examples] == ["", ""]
 
 
 def test_directory_without_a_usable_episode(tmp_path):

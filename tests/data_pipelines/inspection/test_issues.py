@@ -174,7 +174,7 @@ def test_pictures_decide_where_no_action_varies(tmp_path):
 
 def test_a_recording_is_known_again_compressed_and_smaller():
     """Real frames: one episode, the same at 5/8 of its size and as JPEG of quality 60, and another."""
-    one, other = inspect_dataset(REAL_DATA, shown=2).shown
+    one, other = inspect_dataset(REAL_DATA, max_examples=2).examples
 
     def prints(index: int, change) -> Fingerprint:
         frames = {camera: [change(np.ascontiguousarray(f)) for f in shown] for camera, shown in one.frames.items()}

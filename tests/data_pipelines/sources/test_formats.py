@@ -222,7 +222,7 @@ def test_a_success_that_is_not_said_is_unknown(tmp_path):
     spec = make_spec("said")
     rlds = write_rlds(tmp_path, spec, [9] * 2, change=lambda _, features: features.update(texts))
     assert open_source(rlds).episode(0, spec.image_key, ()).success is None
-    assert [shown.success for source in (root, rlds) for shown in inspect_dataset(source).shown] == [None] * 4
+    assert [example.success for source in (root, rlds) for example in inspect_dataset(source).examples] == [None] * 4
 
 
 def as_array_records(directory):
@@ -322,7 +322,7 @@ def test_every_format_gives_frames_to_a_tokenizer(places):
 def test_every_format_is_inspected(places):
     for spec, place in places[:2]:
         sample = inspect_dataset(place)
-        facts, shown = sample.facts, sample.shown
+        facts, shown = sample.facts, sample.examples
         assert (facts.name, facts.hz, facts.episodes, facts.sampled) == (spec.name, spec.hz, 4, 4)
         assert spec.image_key in [c.key for c in facts.cameras] and shown[0].instruction
         assert spec.image_key in shown[0].frames and not facts.damaged
