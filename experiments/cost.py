@@ -97,7 +97,7 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
     frames, draws, flops = model.frames, config.random_actions, 0.0
     if predicts_actions(model, setting):
         copies = 1 if model.action_alignment == "causal" else 2
-        flops += copies * pass_flops(model, table, frames, frames / 2, said=0)
+        flops += copies * pass_flops(model, table, frames, frames / 2, predicted=0)
         if model.diffusion:
             steps = decode.sampler.steps
             flops += steps * denoiser_flops(model, frames, own_steps=False, channels=table.action_width)

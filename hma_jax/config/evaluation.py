@@ -64,7 +64,7 @@ class DecodeConfig:
     (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
     """
 
-    unmask_steps: int = 2  # M: looks at a frame until it is finished
+    unmask_steps: int = 2  # M: passes over a frame until all its tokens are filled
     temperature: float = 0.0  # divides logits; 0: the likeliest entry
     top_k: int = 0  # draw from the k likeliest entries of each factor; 0: from all
     order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked

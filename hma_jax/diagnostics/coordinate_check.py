@@ -99,14 +99,14 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     out = model(masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden)
     diffusion = model.config.diffusion
     if diffusion:
-        note("conditions", out.said)
+        note("conditions", out.predictions)
     else:
-        note("logits", model.logits(out.said, batch["tokens"]))
+        note("logits", model.logits(out.predictions, batch["tokens"]))
     if diffusion:
         key = key_of(0)
         time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)
         _watch(model.denoiser, "condition", lambda y: note("denoiser condition", y))
-        note("denoiser", model.denoiser(noise, time, out.said))
+        note("denoiser", model.denoiser(noise, time, out.predictions))
     if model.action_head is not None and out.actions is not None:
         args = draw_noise(key, batch["actions"].shape, diffusion.steps)[::-1] if diffusion else ()
         note("actions", model.action_head(*args, out.actions, embodiment_B))

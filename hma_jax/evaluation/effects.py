@@ -119,7 +119,7 @@ def find_effects(judge: Judge, actions: np.ndarray, mean: np.ndarray, episode: S
     """One per dimension of `actions` [n, T, stride, A], whose windows are of `episode` [n].
 
     What helps most is changed back first, and the rest is judged again: a wrong dimension makes others look wrong.
-    Raises ConfigError for fewer than FEWEST episodes, of which nothing could be said.
+    Raises ConfigError for fewer than FEWEST episodes, too few for a standard error.
     """
     there = len(set(episode))
     require(there >= FEWEST, f"{there} episodes; what actions do is told from at least {FEWEST}")
@@ -176,10 +176,10 @@ def make_loss(
         hma, tokens, real = declared.merge(params), batch["tokens"][:, : model.frames], batch.get("real")
         followed = None if real is None else real[:, 1 : model.frames]
         hidden = never_shown(table, setting, batch["embodiment"], model.frames)
-        said = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
+        predictions = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
         if model.diffusion:
             keys = jax.vmap(key_of)(jnp.arange(len(tokens)))  # common noise under all changes
-            return mean_over_frames(frame_diffusion_loss(hma, said, tokens[:, 1:], keys), followed)
-        return mean_over_frames(factored_cross_entropy(hma.logits(said, tokens[:, 1:]), tokens[:, 1:]), followed)
+            return mean_over_frames(frame_diffusion_loss(hma, predictions, tokens[:, 1:], keys), followed)
+        return mean_over_frames(factored_cross_entropy(hma.logits(predictions, tokens[:, 1:]), tokens[:, 1:]), followed)
 
     return loss

@@ -44,7 +44,7 @@ from hma_jax.model.embodiments import EmbodimentTable, normalise
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
-from hma_jax.model.readout import likeliest
+from hma_jax.model.readout import choose_likeliest
 from hma_jax.objective.losses import frame_diffusion_loss
 from hma_jax.objective.masking import never_shown
 
@@ -237,7 +237,7 @@ def _likelihood(
     masked frame; the release's is that of the ids after all unmasking steps (reference section 6.3)."""
     if model.config.diffusion:
         return {"diffusion_loss": mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)}
-    guess = compose(model.frame_head.factors_in_turn(out, likeliest)[0], model.config.factor_vocab)
+    guess = compose(model.frame_head.decode_factors(out, choose_likeliest)[0], model.config.factor_vocab)
     return {
         "cross_entropy": mean_over_frames(factored_cross_entropy(model.logits(out, truth), truth), real_BT),
         "accuracy": mean_over_frames((guess == truth).astype(jnp.float32), real_BT),

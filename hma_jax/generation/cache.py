@@ -1,9 +1,9 @@
 """Passes over a window of T positions, with a cache of its finished frames.
 
 Spatial attention stays inside a frame and temporal attention is causal, so all that later frames need of a
-finished one is its keys and values. `Window.start` caches a prompt, `query` asks about a masked frame, and
-`extend_and_query` takes a finished one into the cache and predicts the one after it for the first time, both in one
-pass. How a rollout puts these together is told in `steps`.
+finished one is its keys and values. `Window.start` caches a prompt, `query` predicts a masked frame, and
+`extend_and_query` adds a finished one to the cache and predicts the one after it for the first time, both in one
+pass. `steps` combines them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Window(NamedTuple):
         blank = blank_frame(self.model.config, batch)
 
         def one_frame() -> TemporalCache | None:
-            return self._pass(blank.values[:, None], blank.masked[:, None], 0, remember=1).cache
+            return self._pass(blank.values[:, None], blank.masked[:, None], 0, cache_frames=1).cache
 
         shapes = jax.eval_shape(one_frame)
         layers = jax.tree.map(lambda x: jnp.zeros((*x.shape[:2], room, *x.shape[3:]), x.dtype), shapes)
@@ -68,14 +68,17 @@ class Window(NamedTuple):
         """The cache of finished frames [B, T', S (, C)] at the first positions, with `room` in all."""
         batch, count = frames.shape[:2]
         cache = self.empty(batch, room)
-        return cache.write(self._pass(frames, None, 0, remember=count, said_from=count).cache, 0) if count else cache
+        return (
+            cache.write(self._pass(frames, None, 0, cache_frames=count, predict_from=count).cache, 0)
+            if count
+            else cache
+        )
 
     def query(self, cache: FrameCache, last: jax.Array, frame: Frame, at: int | jax.Array) -> jax.Array:
-        """What the model says [B, S, ...] of a partly masked frame at position `at`, after frame `last`
-        [B, S (, C)]."""
+        """Predictions [B, S, ...] for a partly masked frame at position `at`, after frame `last` [B, S (, C)]."""
         visible = jnp.append(cache.valid, True)[None]
         values, masked = frame.values[:, None], frame.masked[:, None]
-        return self._pass(values, masked, at, cache.layers, visible, before=last[:, None]).said[:, 0]
+        return self._pass(values, masked, at, cache.layers, visible, before=last[:, None]).predictions[:, 0]
 
     def extend_and_query(
         self,
@@ -85,8 +88,8 @@ class Window(NamedTuple):
         slot: int | jax.Array,
         positions: jax.Array | None = None,
     ) -> tuple[FrameCache, jax.Array]:
-        """(the cache with frames `finished` [B, n, S (, C)] from `slot` on, what the model says of the wholly
-        masked frame after them), in one pass.
+        """(the cache with frames `finished` [B, n, S (, C)] from `slot` on, predictions for the wholly masked frame
+        after them), in one pass.
 
         The frames take the actions from `at` on, and those positions unless `positions` [n + 1] are given.
         Without a cache they are the first of the window.
@@ -96,17 +99,17 @@ class Window(NamedTuple):
         values = jnp.concatenate([finished, blank.values[:, None].astype(finished.dtype)], axis=1)
         masked = jnp.broadcast_to((jnp.arange(count + 1) == count)[None, :, None], values.shape[:3])
         if cache is None:
-            out = self._pass(values, masked, at, remember=count, said_from=count)
-            return FrameCache(out.cache, jnp.ones(count, bool)), out.said[:, 0]
+            out = self._pass(values, masked, at, cache_frames=count, predict_from=count)
+            return FrameCache(out.cache, jnp.ones(count, bool)), out.predictions[:, 0]
         # What `finished` takes the place of was still before it, but is past the masked frame's window.
         slots = jnp.arange(cache.room)
         remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
         earlier = jnp.stack([cache.valid] * count + [remaining])
         visible = jnp.concatenate([earlier, causal(count + 1)], axis=1)
         out = self._pass(
-            values, masked, at, cache.layers, visible, positions=positions, remember=count, said_from=count
+            values, masked, at, cache.layers, visible, positions=positions, cache_frames=count, predict_from=count
         )
-        return cache.write(out.cache, slot), out.said[:, 0]
+        return cache.write(out.cache, slot), out.predictions[:, 0]
 
     def read(self, cache: FrameCache, frame: jax.Array, at: int | jax.Array) -> Outputs:
         """A pass over one finished frame [B, S (, C)] at position `at`, which does not enter the cache."""

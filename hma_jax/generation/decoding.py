@@ -1,7 +1,7 @@
 """Filling one masked frame, step by step: the part of generation that differs between variants.
 
-A frame is a `Frame`: what is known of it and what is still masked. Each step predicts it once,
-proposes values for masked tokens and commits some of them; the rest wait for another step.
+A frame is a `Frame`: the tokens known so far and which are still masked. Each unmasking step predicts it once, samples
+values for masked tokens and commits some of them; the rest wait for another step.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from hma_jax.config import DecodeConfig, ModelConfig, check_decoding
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
-from hma_jax.model.readout import ChainedReadout, Readout, drawing
+from hma_jax.model.readout import ChainedReadout, Readout, choose_sampled
 from hma_jax.objective.diffusion import sample_with_key
 from hma_jax.objective.process import make_process, sampling_process
 
@@ -54,18 +54,18 @@ def masked_counts(config: ModelConfig, steps: int) -> list[int]:
 
 
 def sample_tokens(
-    head: Readout | ChainedReadout, said_BS: jax.Array, key_B: jax.Array, temperature: float, top_k: int = 0
+    head: Readout | ChainedReadout, predictions_BS: jax.Array, key_B: jax.Array, temperature: float, top_k: int = 0
 ) -> tuple[jax.Array, jax.Array]:
-    """(ids [B, S], confidence [B, S]) from what is said of tokens; confidence is the product of the chosen factors'
-    probabilities."""
+    """(ids [B, S], confidence [B, S]) from the `predictions` of tokens (`Outputs.predictions`); confidence is the
+    product of the chosen factors' probabilities."""
 
-    def one(said_S: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        choose = drawing(key, head.shape(said_S), temperature, top_k)
-        digits, logits = head.factors_in_turn(said_S, choose)
+    def one(predictions_S: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        choose = choose_sampled(key, head.shape(predictions_S), temperature, top_k)
+        digits, logits = head.decode_factors(predictions_S, choose)
         chosen = jnp.take_along_axis(jax.nn.softmax(logits, axis=-1), digits[..., None], axis=-1)[..., 0]
         return compose(digits, logits.shape[-1]).astype(jnp.int32), jnp.prod(chosen, axis=-1)
 
-    return jax.vmap(one)(said_BS, key_B)
+    return jax.vmap(one)(predictions_BS, key_B)
 
 
 def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_masked: int | jax.Array) -> Frame:
@@ -89,11 +89,11 @@ def _ranks(score_BS: jax.Array) -> jax.Array:
 
 
 Predict = Callable[[Frame], jax.Array]
-"""What the model says of a frame: logits [B, S, Q, V] or conditions [B, S, D]."""
+"""The model's predictions for a frame's tokens (`Outputs.predictions`): [B, S, Q, V] or [B, S, D]."""
 
 
 def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
-    """Values of a frame that starts wholly masked; `first` is what `predict` says of that one. Raises as
+    """Values of a frame that starts wholly masked; `first` is what `predict` returns for it. Raises as
     `check_decoding`."""
     check_decoding(model.config, decode)
     if model.config.diffusion:
@@ -101,24 +101,26 @@ def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Arra
     return _decode_tokens(model, first, predict, key_B, decode)
 
 
-def _decode_tokens(model: HMA, said: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
-    batch, size = said.shape[:2]
+def _decode_tokens(
+    model: HMA, predictions: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig
+) -> jax.Array:
+    batch, size = predictions.shape[:2]
 
-    def fill(frame: Frame, said: jax.Array, step: int | jax.Array, still_masked: int | jax.Array) -> Frame:
+    def fill(frame: Frame, predictions: jax.Array, step: int | jax.Array, still_masked: int | jax.Array) -> Frame:
         keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, step)))(key_B)
-        sampled, score = sample_tokens(model.frame_head, said, keys[:, 0], decode.temperature, decode.top_k)
+        sampled, score = sample_tokens(model.frame_head, predictions, keys[:, 0], decode.temperature, decode.top_k)
         if decode.order == "random":
             score = jax.vmap(lambda k: jax.random.uniform(k, (size,), jnp.float32))(keys[:, 1])
         return unmask(frame, sampled, score, still_masked)
 
-    def look(frame: Frame, at: tuple[jax.Array, jax.Array]) -> tuple[Frame, None]:
+    def unmask_step(frame: Frame, at: tuple[jax.Array, jax.Array]) -> tuple[Frame, None]:
         return fill(frame, predict(frame), *at), None
 
     counts = masked_counts(model.config, decode.unmask_steps)
-    frame = fill(blank_frame(model.config, batch), said, 0, counts[0])
+    frame = fill(blank_frame(model.config, batch), predictions, 0, counts[0])
     # A loop, so that one pass is compiled and not one for each of M.
     later = jnp.arange(1, len(counts)), jnp.asarray(counts[1:], jnp.int32)
-    return jax.lax.scan(look, frame, later)[0].values
+    return jax.lax.scan(unmask_step, frame, later)[0].values
 
 
 def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Actions read off frames: one chunk after recorded frames, or the model acting in its own dreams."""
+"""Actions predicted from frames: after recorded frames, or acting in the model's own rollouts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def predict_actions(
     causally: bool = True,
     real_BT: jax.Array | None = None,
 ) -> jax.Array:
-    """Raw chunks [B, T, U] read off every frame, where those marked hidden are not shown.
+    """Raw chunks [B, T, U] predicted at every frame; chunks that `hidden_BT` marks are not shown to the model.
 
     As a policy a frame's chunk is predicted from frames up to it and what is shown of the
     actions; with `causally` False from the whole window (inverse dynamics), of which frames that are not
@@ -49,8 +49,8 @@ def predict_next_actions(
     key_B: jax.Array,
     decode: DecodeConfig,
 ) -> jax.Array:
-    """Raw chunks [B, T, U]: what the policy would do at every frame of a recorded window, having
-    seen the frames up to it and all actions before.
+    """Raw chunks [B, T, U]: the policy's action at every frame of a recorded window, given the frames up to it and all
+    actions before.
 
     One pass: with causal alignment no frame is shown its own chunk; otherwise every frame stands
     beside a copy of itself whose action is hidden, as in `next_frame_outputs`.
@@ -69,7 +69,7 @@ def predict_next_actions(
         hidden_BT=hidden,
         visible=beside(before),
         positions=jnp.tile(jnp.arange(count), 2),
-        said_from=2 * count,
+        predict_from=2 * count,
     )
     own = out._replace(actions=None if out.actions is None else out.actions[:, count:])
     return read_actions(model, own, embodiment_B, key_B, decode)
@@ -78,7 +78,8 @@ def predict_next_actions(
 def read_actions(
     model: HMA, out: Outputs, embodiment_B: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> jax.Array:
-    """Raw chunks [B, T, U] from what a pass says of actions. Raises ConfigError without a head."""
+    """Raw chunks [B, T, U] from a pass's action features (`Outputs.actions`). Raises ConfigError without an action
+    head."""
     require(
         model.action_head is not None and out.actions is not None,
         "the model predicts no actions; train one with model.action_heads=true and a conditioning with concat",
@@ -117,11 +118,11 @@ def rollout_policy(
     key_B: jax.Array,
     decode: DecodeConfig,
 ) -> tuple[jax.Array, jax.Array]:
-    """The model acts in its own dreams: (new frames [B, T - T', S (, C)], raw chunks [B, T, U]).
+    """The model acts in its own rollout: (new frames [B, T - T', S (, C)], raw chunks [B, T, U]).
 
-    `actions_BTU` are recorded for the T' - 1 transitions within the prompt; from its last frame
-    on the model chooses: it reads a chunk off the frame it sees and predicts what follows. The
-    last returned chunk, after the last frame, is as given.
+    `actions_BTU` are recorded for the T' - 1 transitions within the prompt; from its last frame on
+    the model chooses: it predicts a chunk from the newest frame, then the frame that follows it. The last
+    returned chunk, after the last frame, is as given.
     """
     frames, count = actions_BTU.shape[1], prompt.shape[1]
     require(

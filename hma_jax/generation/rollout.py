@@ -163,7 +163,7 @@ def rollout_naive(
             unknown = jnp.broadcast_to(jnp.arange(size)[None, :, None] >= t - first, values.shape[:3])
             values = values.at[:, t - first].set(frame.values)
             unknown = unknown.at[:, t - first].set(frame.masked)
-            return model(values, unknown, aligned, embodiment_B, hidden_BT=hidden).said[:, t - first]
+            return model(values, unknown, aligned, embodiment_B, hidden_BT=hidden).predictions[:, t - first]
 
         frame = decode_frame(model, predict(blank), predict, fold_in(key_B, t), decode)
         return known.at[:, t].set(frame), None

@@ -1,7 +1,7 @@
 """The next frame, in the three ways that a window allows.
 
-`fill` while the window fills: a pass over two frames (the newest finished one enters the cache, the new one
-is first looked at) and M - 1 passes over one. Positions are absolute: once the window slides, every frame in
+`fill` while the window fills: a pass over two frames (the newest finished one enters the cache, the new one is
+predicted for the first time) and M - 1 passes over one. Positions are absolute: once the window slides, every frame in
 it has another position and another past. `slide` computes the window again for each new frame, which is
 exact. `stream` keeps what was computed, which is an approximation.
 """
@@ -20,14 +20,14 @@ def fill(
     window: Window, cache: FrameCache, last: jax.Array, t: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> tuple[FrameCache, jax.Array]:
     """Frame t at position t; `last` [B, S (, C)] is frame t - 1, which enters the cache."""
-    cache, said = window.extend_and_query(cache, last[:, None], t - 1, t - 1)
-    return cache, _decode(window, cache, last, said, t, key_B, decode)
+    cache, predictions = window.extend_and_query(cache, last[:, None], t - 1, t - 1)
+    return cache, _decode(window, cache, last, predictions, t, key_B, decode)
 
 
 def slide(window: Window, past: jax.Array, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     """The frame at the last position after `past` [B, T - 1, S (, C)]."""
-    cache, said = window.extend_and_query(None, past, 0, 0)
-    return _decode(window, cache, past[:, -1], said, past.shape[1], key_B, decode)
+    cache, predictions = window.extend_and_query(None, past, 0, 0)
+    return _decode(window, cache, past[:, -1], predictions, past.shape[1], key_B, decode)
 
 
 def stream(
@@ -39,16 +39,16 @@ def stream(
     """
     end = cache.room
     oldest = (t - 1) % end  # the slot of frame t - T, which leaves the window
-    stood_at = jnp.array([end, end])  # frame t - 1 was at the last position when it was made
-    cache, said = window.extend_and_query(cache, last[:, None], end - 1, oldest, stood_at)
-    return cache, _decode(window, cache, last, said, end, key_B, decode)
+    positions = jnp.array([end, end])  # frame t - 1 was at the last position when it was made
+    cache, predictions = window.extend_and_query(cache, last[:, None], end - 1, oldest, positions)
+    return cache, _decode(window, cache, last, predictions, end, key_B, decode)
 
 
 def _decode(
     window: Window,
     cache: FrameCache,
     last: jax.Array,
-    said: jax.Array,
+    predictions: jax.Array,
     at: int | jax.Array,
     key_B: jax.Array,
     decode: DecodeConfig,
@@ -56,4 +56,4 @@ def _decode(
     def predict(frame: Frame) -> jax.Array:
         return window.query(cache, last, frame, at)
 
-    return decode_frame(window.model, said, predict, key_B, decode)
+    return decode_frame(window.model, predictions, predict, key_B, decode)

@@ -19,10 +19,10 @@ def next_frame_outputs(
     embodiment_B: jax.Array,
     hidden_BT: jax.Array | None = None,
 ) -> jax.Array:
-    """What the model says of frames 1 .. T-1, each wholly masked after its true past: logits
-    [B, T - 1, S, Q, V] or conditions [B, T - 1, S, D].
+    """`Outputs.predictions` for frames 1 .. T-1, each wholly masked after its true past: [B, T - 1, S, Q, V] or
+    [B, T - 1, S, D].
     """
-    return _look(model, frames, actions_BTU, embodiment_B, hidden_BT).said
+    return _look(model, frames, actions_BTU, embodiment_B, hidden_BT).predictions
 
 
 def next_frames(
@@ -34,20 +34,20 @@ def next_frames(
     decode: DecodeConfig,
     hidden_BT: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """(outputs, filled): what `next_frame_outputs` says and frames 1 .. T-1 [B, T - 1, S (, C)], each
-    predicted from its true past.
+    """(predictions, frames): those of `next_frame_outputs`, and frames 1 .. T-1 [B, T - 1, S (, C)] decoded from them,
+    each after its true past.
 
     Frame t is drawn from fold_in(key, t), as in `rollout`. M passes over T - 1 masked frames and
     one over the true ones, where the official evaluation makes M (T - 1) over the window.
     """
     count = frames.shape[1] - 1
-    out = _look(model, frames, actions_BTU, embodiment_B, hidden_BT, remember=count)
+    out = _look(model, frames, actions_BTU, embodiment_B, hidden_BT, cache_frames=count)
     actions = model.align(actions_BTU)[:, 1:]
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
 
     def predict(frame: Frame) -> jax.Array:
-        """Of all masked frames at once, as if they were examples: [B (T - 1), S, ...]."""
+        """For all masked frames at once, as if they were examples: [B (T - 1), S, ...]."""
         out_of_past = model(
             _by_window(frame.values, count),
             _by_window(frame.masked, count),
@@ -59,11 +59,11 @@ def next_frames(
             past=out.cache,
             before=frames[:, :-1],
         )
-        return _by_frame(out_of_past.said)
+        return _by_frame(out_of_past.predictions)
 
     keys = jnp.stack([fold_in(key_B, t) for t in range(1, count + 1)], axis=1)
-    filled = decode_frame(model, _by_frame(out.said), predict, _by_frame(keys), decode)
-    return out.said, _by_window(filled, count)
+    filled = decode_frame(model, _by_frame(out.predictions), predict, _by_frame(keys), decode)
+    return out.predictions, _by_window(filled, count)
 
 
 def _look(
@@ -72,12 +72,12 @@ def _look(
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     hidden_BT: jax.Array | None,
-    remember: int = 0,
+    cache_frames: int = 0,
 ) -> Outputs:
     """At frames 1 .. T-1, all of them wholly masked."""
     before = frames[:, :-1]  # what lies under a mask does not matter
     masked = jnp.ones(before.shape[:3], bool)
-    return look_beside(model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, remember=remember)
+    return look_beside(model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, cache_frames=cache_frames)
 
 
 def _by_frame(x: jax.Array) -> jax.Array:

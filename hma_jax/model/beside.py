@@ -23,14 +23,14 @@ def look_beside(
     hidden_BT: jax.Array | None = None,
     *,
     leak: ActionLeak = "none",
-    remember: int = 0,
+    cache_frames: int = 0,
     slice_B: jax.Array | None = None,
 ) -> Outputs:
     """What the model says of frames `ahead` [B, T - 1, S (, C)] at positions 1 .. T-1, of which it is not shown what
     bool `masked` says; each follows the frames of `before`, of that shape too, from position 0 on.
 
     Actions are the recorded chunks, of which those that `hidden_BT` says are not shown (`leak` as for the model);
-    `remember` frames of `before` are cached.
+    `cache_frames` frames of `before` are cached.
     """
     count = ahead.shape[1]
     hidden = model.align_hidden(hidden_BT, actions_BTU.shape[:2])
@@ -43,9 +43,9 @@ def look_beside(
         leak=leak,
         visible=beside(causal(count)),
         positions=jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)]),
-        remember=remember,
+        cache_frames=cache_frames,
         before=jnp.concatenate([before, before], axis=1),
-        said_from=count,
+        predict_from=count,
         slice_B=slice_B,
     )
 

@@ -21,23 +21,25 @@ def forward_flops_per_window(
     `masking` does not predict is not computed. An action head without a denoiser is too small to count.
     """
     t, diffusion = config.frames, config.diffusion
-    frames, said = (2 * (t - 1), t - 1) if masking.teacher_forcing else (t, t)
-    said = said if masking.predicts_frames else 0
+    frames, predicted = (2 * (t - 1), t - 1) if masking.teacher_forcing else (t, t)
+    predicted = predicted if masking.predicts_frames else 0
     denoisers = 0.0
     if diffusion:
-        denoisers = denoiser_flops(config, diffusion.repeats * said * config.tokens)
+        denoisers = denoiser_flops(config, diffusion.repeats * predicted * config.tokens)
         if masking.predicts_actions:
             denoisers += denoiser_flops(config, t, channels=table.action_width)
-    return pass_flops(config, table, frames, t / 2, said) + denoisers
+    return pass_flops(config, table, frames, t / 2, predicted) + denoisers
 
 
-def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: float, said: int | None = None) -> float:
-    """One pass over `frames` frames of one window, up to logits or, with latents, conditions of `said` of them (None:
-    all).
+def pass_flops(
+    config: ModelConfig, table: EmbodimentTable, frames: int, seen: float, predicted: int | None = None
+) -> float:
+    """One pass over `frames` frames of one window, up to the logits, or the denoiser's conditions, of `predicted` of
+    them (None: all).
 
     `seen`: frames that one attends to over time, itself among them, on average; T / 2 in a causal window of T.
     """
-    said = frames if said is None else said
+    predicted = frames if predicted is None else predicted
     d, p = config.width, config.frame_tokens
     attention = 2 * 4 * d * d  # q, k, v and output, spatial and temporal
     mlp = 2 * d * config.mlp_width
@@ -55,7 +57,7 @@ def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: f
     if config.chain_factors:
         outputs += d + (config.factors - 1) * config.factor_vocab
     shared = config.layers * (p * per_token + per_frame) + stem + embedding
-    return 2.0 * (frames * shared + said * config.tokens * d * outputs)
+    return 2.0 * (frames * shared + predicted * config.tokens * d * outputs)
 
 
 def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True, channels: int | None = None) -> float:

@@ -1,8 +1,8 @@
 """How frames enter the trunk and leave it, for both variants.
 
-Discrete: ids with one table per vocabulary factor in, what is said of each factor (`readout`) out. Continuous: latent
-patches in, out the vectors that condition the diffusion head (`heads.Denoiser`). Masked tokens enter as one learned
-vector in both.
+Discrete: ids are embedded by one table per vocabulary factor, and read out as logits of each factor (`readout`).
+Continuous: latent patches are embedded linearly, and read out as the vectors that condition the diffusion head
+(`heads.Denoiser`). In both, masked tokens enter as one learned vector.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class LatentEmbed(nnx.Module):
 
 
 class Condition(nnx.Module):
-    """Trunk outputs -> what the diffusion head is told of each token (reference section 2.2)."""
+    """Trunk outputs -> the diffusion head's condition for each token (reference section 2.2)."""
 
     def __init__(self, config: ModelConfig):
         width, shape = config.width, (config.frames, config.tokens, config.width)
@@ -107,7 +107,7 @@ class Condition(nnx.Module):
 
 
 class Recall(nnx.Module):
-    """At masked tokens also what stood there a frame earlier (`ModelConfig.recall`)."""
+    """Adds, at masked tokens, the embedding of the token at the same place a frame earlier (`ModelConfig.recall`)."""
 
     def __init__(self, config: ModelConfig):
         self.gain = param((config.width,), ("D",), ones, role="vector")

@@ -33,13 +33,13 @@ def causal(frames: int) -> jax.Array:
 
 
 class Outputs(NamedTuple):
-    """What a pass says of the frames it was given, or of those from `said_from` on."""
+    """What a pass returns, for the frames that it was given or for those from `predict_from` on."""
 
-    # Of tokens, float32: logits [B, T, S, Q, V]; where factors are chained, or of the denoiser, conditions
-    # [B, T, S, D].
-    said: jax.Array
+    # The frame head's output for each token, float32: logits [B, T, S, Q, V]; with chained factors the features that
+    # logits are computed from, and with latents the denoiser's conditions, both [B, T, S, D].
+    predictions: jax.Array
     actions: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
-    cache: TemporalCache | None  # of the frames that are to be remembered
+    cache: TemporalCache | None  # keys and values of the first `cache_frames` frames
 
 
 class HMA(nnx.Module):
@@ -80,8 +80,8 @@ class HMA(nnx.Module):
         positions: jax.Array | None = None,
         past: TemporalCache | None = None,
         before: jax.Array | None = None,
-        remember: int = 0,
-        said_from: int = 0,
+        cache_frames: int = 0,
+        predict_from: int = 0,
         slice_B: jax.Array | None = None,
     ) -> Outputs:
         """One pass over ids [B, T, S] or latents [B, T, S, C], masked where bool `masked` says.
@@ -92,10 +92,10 @@ class HMA(nnx.Module):
         instead of actions runs without action tokens and conditioning. The frames stand at window
         positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T], or with a
         leading B, defaults to causal: then padding at a window's end is seen by no real frame. `before`,
-        of the shape of `frames`, is the frame that precedes each of them, which `config.recall` is told
-        of; by default the one before it here. The cache of the first `remember` frames is returned; of
-        the frames before `said_from` nothing is said. Where the parameters at hand are those of some
-        robots only, `slice_B` says which slice is each example's own.
+        of the shape of `frames`, is the frame that precedes each of them, which `config.recall` reads; by
+        default the one before it here. The cache of the first `cache_frames` frames is returned; frames before
+        `predict_from` get no predictions. Where the parameters hold the slices of some robots only,
+        `slice_B` [B] is each example's index into them.
         """
         config = self.config
         count = frames.shape[1]
@@ -119,11 +119,11 @@ class HMA(nnx.Module):
         if self.norm is not None:
             x = self.norm(x)
         x = constrain(x, ("B", None, None, "D_act"))
-        x, cache = self.trunk(x, action, slice_B, visible, past, remember)
+        x, cache = self.trunk(x, action, slice_B, visible, past, cache_frames)
         pooled = x[:, :, config.tokens :].mean(axis=2) if x.shape[2] > config.tokens else None
-        x = x[:, said_from:, : config.tokens]
-        said = self.frame_head(x, positions[said_from:]) if config.diffusion else self.frame_head(x)
-        return Outputs(said, pooled, cache)
+        x = x[:, predict_from:, : config.tokens]
+        predictions = self.frame_head(x, positions[predict_from:]) if config.diffusion else self.frame_head(x)
+        return Outputs(predictions, pooled, cache)
 
     def _a_frame_earlier(self, frames: jax.Array, unknown_BTS: jax.Array, before: jax.Array | None) -> jax.Array:
         """[B, T, S, D]: what stood at each token a frame earlier, 0 where that is not known either."""
@@ -141,11 +141,11 @@ class HMA(nnx.Module):
             feature_BTD = replaced(feature_BTD, hidden_BT, vectors_TD)
         return over_tokens(feature_BTD, self.config.action_tokens)
 
-    def logits(self, said: jax.Array, ids: jax.Array) -> jax.Array:
-        """[..., Q, V]: what is `said` of tokens [...] about each factor, given those of `ids` [...] before it where
-        factors are chained."""
+    def logits(self, predictions: jax.Array, ids: jax.Array) -> jax.Array:
+        """Logits [..., Q, V] of each factor from the `predictions` of tokens [...]; with chained factors, given the
+        factors of `ids` [...] before it."""
         digits = factorise(ids, self.config.factors, self.config.factor_vocab)
-        return self.frame_head.factors_in_turn(said, lambda factor, _: digits[..., factor])[1]
+        return self.frame_head.decode_factors(predictions, lambda factor, _: digits[..., factor])[1]
 
     def align(self, actions: jax.Array) -> jax.Array:
         """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own as released,

@@ -1,4 +1,5 @@
-"""What is said of a token's factors, and how they are chosen from it: all at once or one after the other."""
+"""From trunk outputs to logits of a token's factors, and how factors are chosen: independently or one after the
+other."""
 
 from __future__ import annotations
 
@@ -21,8 +22,7 @@ Choose = Callable[[int, jax.Array], jax.Array]
 
 
 class Readout(nnx.Module):
-    """Trunk outputs [..., D] -> what is said of tokens: float32 logits [..., Q, V] of factors, independent of each
-    other."""
+    """Trunk outputs [..., D] -> float32 logits [..., Q, V] of a token's factors, independent of each other."""
 
     def __init__(self, config: ModelConfig, precise: bool = False):
         self.factors, self.multiplier = config.factors, config.mup_multiplier("readout")
@@ -34,19 +34,19 @@ class Readout(nnx.Module):
         y = self.linear(x / self.multiplier, dtype=jnp.float32)
         return y.reshape(*y.shape[:-1], self.factors, y.shape[-1] // self.factors)
 
-    def shape(self, said: jax.Array) -> tuple[int, ...]:
+    def shape(self, predictions: jax.Array) -> tuple[int, ...]:
         """[..., Q, V] of the logits."""
-        return said.shape
+        return predictions.shape
 
-    def factors_in_turn(self, said: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
-        """(digits [..., Q], logits [..., Q, V]) as `choose` finds them, factor by factor."""
-        digits = [choose(q, said[..., q, :]) for q in range(self.factors)]
-        return jnp.stack(digits, axis=-1), said
+    def decode_factors(self, predictions: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
+        """(digits [..., Q], logits [..., Q, V]): `choose` is called for factor 0, 1, ... with its logits."""
+        digits = [choose(q, predictions[..., q, :]) for q in range(self.factors)]
+        return jnp.stack(digits, axis=-1), predictions
 
 
 class ChainedReadout(nnx.Module):
-    """The same, each factor given those before it (`ModelConfig.chain_factors`): to what `Readout` says of a factor is
-    added what a layer of width D makes of the trunk's output and of the digits chosen so far. All of it in float32.
+    """Logits of each factor given those before it (`ModelConfig.chain_factors`): those of `Readout`, plus the output of
+    a layer of width D that sees the trunk's output and the digits chosen so far. All of it in float32.
     """
 
     def __init__(self, config: ModelConfig):
@@ -59,15 +59,15 @@ class ChainedReadout(nnx.Module):
         self.out = param((q - 1, d, v), ("Q", "D", "V"), zeros, role="output", precise=True)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """The trunk's outputs [..., D] themselves: factors are said one by one."""
+        """The trunk's outputs [..., D] in float32: logits follow factor by factor, in `decode_factors`."""
         return x.astype(jnp.float32)
 
-    def shape(self, said: jax.Array) -> tuple[int, ...]:
-        return (*said.shape[:-1], len(self.out) + 1, self.out.shape[-1])
+    def shape(self, predictions: jax.Array) -> tuple[int, ...]:
+        return (*predictions.shape[:-1], len(self.out) + 1, self.out.shape[-1])
 
-    def factors_in_turn(self, said: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
-        alone = self.alone(said)
-        hidden = self.norm(self.condition(said))
+    def decode_factors(self, predictions: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
+        alone = self.alone(predictions)
+        hidden = self.norm(self.condition(predictions))
         logits = [alone[..., 0, :]]
         digits = [choose(0, logits[0])]
         for q in range(len(self.tables)):
@@ -78,14 +78,14 @@ class ChainedReadout(nnx.Module):
         return jnp.stack(digits, axis=-1), jnp.stack(logits, axis=-2)
 
 
-def drawing(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, top_k: int = 0) -> Choose:
-    """Draws factors of one example, whose logits have `shape` [..., Q, V]; temperature 0 takes the likeliest, `top_k`
-    draws among so many.
+def choose_sampled(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, top_k: int = 0) -> Choose:
+    """A `Choose` that samples the factors of one example, whose logits have `shape` [..., Q, V]. Temperature 0 takes
+    the likeliest; `top_k` restricts to so many entries (0: all).
 
-    Factors that are chosen in turn have the noise that they would have if they were drawn at once.
+    The Gumbel noise is drawn for all factors at once: chained and independent factors see the same noise.
     """
     if temperature == 0:
-        return likeliest
+        return choose_likeliest
     noise = draw_flat(jax.random.gumbel, key, shape)
 
     def choose(factor: int, logits: jax.Array) -> jax.Array:
@@ -98,7 +98,7 @@ def drawing(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, to
     return choose
 
 
-def likeliest(factor: int, logits: jax.Array) -> jax.Array:
+def choose_likeliest(factor: int, logits: jax.Array) -> jax.Array:
     """The likeliest digits, as a `Choose`."""
     del factor
     return jnp.argmax(logits, axis=-1)

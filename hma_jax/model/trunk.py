@@ -87,12 +87,12 @@ class Trunk(nnx.Module):
         slice_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None = None,
-        remember: int = 0,
+        cache_frames: int = 0,
     ) -> tuple[jax.Array, TemporalCache | None]:
         """Runs all blocks.
 
         `visible` [T, T_past + T] says which frames each frame's temporal attention may see.
-        The cache of the first `remember` new frames is returned; None if `remember` is 0.
+        The cache of the first `cache_frames` new frames is returned; None if `cache_frames` is 0.
         """
         block_def, layers = nnx.split(self.blocks)
 
@@ -101,7 +101,7 @@ class Trunk(nnx.Module):
             x = remat.block_input(x)
             layer = layer_for_compute(layer, x.dtype)
             x, new = nnx.merge(block_def, layer)(x, action, slice_B, visible, layer_past)
-            new = jax.tree.map(lambda y: y[:, :remember], new) if remember else None
+            new = jax.tree.map(lambda y: y[:, :cache_frames], new) if cache_frames else None
             return _by_example(x), new
 
         body = remat.checkpointed(body, self.remat, scanned=self.unroll == 1)

@@ -22,8 +22,8 @@ from hma_jax.objective.masking import Masked
 from hma_jax.objective.own_past import draw_own_past
 from hma_jax.objective.process import make_process
 
-SAID_FROM = 1
-"""The first frame that can have targets: frame 0 is never masked."""
+FIRST_PREDICTED = 1
+"""The first frame that is predicted: frame 0 is never masked."""
 
 
 class LossSums(NamedTuple):
@@ -118,7 +118,7 @@ def masked_loss(
             # Not the key of a round of `own_past`, nor of a repeat of the diffusion loss.
             keys = jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(key_B)
             past = displace_patches(past, masking.displaced_past, keys)
-        inputs = past, masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
+        inputs = past, masked.inputs[:, FIRST_PREDICTED:], masked.masked[:, FIRST_PREDICTED:]
         out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
     else:
         out = model(
@@ -128,18 +128,18 @@ def masked_loss(
             embodiment_B,
             hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
             visible=seen_by_all(tokens.shape[1], real_BT) if masking.setting == "inverse" else None,
-            said_from=SAID_FROM,
+            predict_from=FIRST_PREDICTED,
             **options,
         )
     zero = jnp.zeros(())
     loss = correct = action_loss = zero
     if masking.predicts_frames:
-        weight, tokens = weigh_tokens(masked, tokens, masking)[:, SAID_FROM:], tokens[:, SAID_FROM:]
+        weight, tokens = weigh_tokens(masked, tokens, masking)[:, FIRST_PREDICTED:], tokens[:, FIRST_PREDICTED:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.said, tokens, key_B, training=True)
+            per_token = frame_diffusion_loss(model, out.predictions, tokens, key_B, training=True)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
-            logits = model.logits(out.said, tokens)
+            logits = model.logits(out.predictions, tokens)
             per_token, right = smoothed_cross_entropy(logits, labels, masking.label_smoothing)
             correct = jnp.sum(right * weight)
         loss = jnp.sum(per_token * weight)

@@ -1,9 +1,9 @@
-"""A past that the model made itself, for training: generated frames follow generated ones, which err.
+"""Scheduled sampling: a past that the model drew itself, for training, since generated frames follow generated ones.
 
-Some past frames of a teacher-forced window are drawn from what the model says of them after the past, and the
-true frames that follow are still the targets: what errs is to be mended, not gone on with. One round draws all of
-them at once after their true past: errors of a single frame. Each further round draws them again after what the round
-before drew, and so gathers the errors of one frame more, as a rollout does. A round is one pass without gradient.
+Some past frames of a teacher-forced window are replaced by samples of the model's predictions for them; the true
+frames that follow are still the targets, so that the model learns to correct its errors. One round draws all of them at
+once after their true past: errors of a single frame. Each further round draws them again after those of the round
+before, and so accumulates the errors of one more frame, as a rollout does. A round is one pass without gradient.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hma_jax.config.training import ActionLeak
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
-from hma_jax.model.readout import drawing
+from hma_jax.model.readout import choose_sampled
 
 
 def draw_own_past(
@@ -43,18 +43,18 @@ def draw_own_past(
         share = greatest_share * jax.random.uniform(share_key, (), jnp.float32)
         return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,), jnp.float32) < share
 
-    def draw(key: jax.Array, said_TS: jax.Array) -> jax.Array:
-        digits, _ = head.factors_in_turn(said_TS, drawing(key, head.shape(said_TS)))
+    def draw(key: jax.Array, predictions_TS: jax.Array) -> jax.Array:
+        digits, _ = head.decode_factors(predictions_TS, choose_sampled(key, head.shape(predictions_TS)))
         return compose(digits, model.config.factor_vocab).astype(before.dtype)
 
     ids_key_B, own_BT = jax.vmap(choose_frames)(key_B)
     past = before
     for number in range(rounds):
         shown = actions_BTU, embodiment_B, hidden_BT
-        said = look_beside(model, past, past, masked, *shown, leak=leak, slice_B=slice_B).said
-        said = jax.lax.stop_gradient(said[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
+        predictions = look_beside(model, past, past, masked, *shown, leak=leak, slice_B=slice_B).predictions
+        predictions = jax.lax.stop_gradient(predictions[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
         # The first round draws what it draws where it is the only one.
         keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B
-        own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, said), before[:, 1:])
+        own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, predictions), before[:, 1:])
         past = jnp.concatenate([before[:, :1], own], axis=1)
     return past

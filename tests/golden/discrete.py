@@ -58,7 +58,7 @@ def check_logits(case: Case) -> None:
 
     def check(output, actions, robot, frames=None):
         out = apply(ids[:, :frames], masked[:, :frames], actions, case.robot(robot, batch))
-        check_channels_first(case, output, out.said)
+        check_channels_first(case, output, out.predictions)
 
     for robot in case.domains:
         check(f"logits__{robot}", case.actions(robot), robot)
@@ -71,7 +71,7 @@ def check_logits(case: Case) -> None:
         robot = case.domains[-1]
         plain = [replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries]
         declared = declare_model(case.run.model, EmbodimentTable(tuple(plain)))
-        out = jax.jit(lambda p, *args: declared.merge(p)(*args).said)(
+        out = jax.jit(lambda p, *args: declared.merge(p)(*args).predictions)(
             case.params, ids, masked, case.actions(robot), case.robot(robot, batch)
         )
         check_channels_first(case, "logits_skip_normalization", out)
@@ -112,7 +112,7 @@ def check_loss(case: Case) -> None:
         (loss, accuracy), grads = gradient(case.params, actions, robots)
         case.check(f"loss__{robot}", loss)
         case.check(f"acc__{robot}", accuracy)
-        logits = apply(ids, masked, actions, robots).said
+        logits = apply(ids, masked, actions, robots).predictions
         check_channels_first(case, f"logits__{robot}", logits)
         check_channels_first(case, f"logits_last_frame__{robot}", logits)
         if index == 0:
@@ -122,7 +122,7 @@ def check_loss(case: Case) -> None:
             case.check_zero(named, case.info["unused_parameters"])
 
     if "loss__no_action" in case.outputs:
-        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).said
+        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).predictions
         digits = factorise(labels, case.run.model.factors, case.run.model.factor_vocab)
         weight = recorded.targets_TS / recorded.targets_TS.sum()
         per_token, _ = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
@@ -162,7 +162,7 @@ class Decoder:
         for step, keep in enumerate(masked_counts(config, steps)):
             ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
             out = self.apply(ids, masked, self.actions, robots, self.hidden)
-            logits = out.said[:, t]
+            logits = out.predictions[:, t]
             first = logits if first is None else first
             sampled, score = sample_tokens(head, logits, keys, 0.0)
             if keep and scores is not None:

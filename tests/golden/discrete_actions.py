@@ -20,7 +20,7 @@ def check_joint(case: Case) -> None:
     def read(params, actions, robots, hidden):
         model = case.declared.merge(params)
         out = model(ids, masked, actions, robots, hidden_BT=hidden)
-        return out.said, model.action_head(out.actions, robots)
+        return out.predictions, model.action_head(out.actions, robots)
 
     for robot in case.domains:
         robots, chunk = case.robot(robot, batch), case.table.entries[case.table.index(robot)].chunk
@@ -72,7 +72,7 @@ def _check_training(case: Case) -> None:
             out = model(ids, masked, actions, robots, hidden_BT=hidden, leak=masking.action_leak)
             predicted = model.action_head(out.actions, robots)[..., :chunk]
             action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(hidden.astype(jnp.float32))
-            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.said)
+            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.predictions)
 
         return jax.grad(total, has_aux=True)(params)
 

@@ -43,10 +43,10 @@ def test_old_robots_answers_stay_bit_identical(diffusion, conditioning: str):
             hma = declared.merge(p)
             out = hma(batch["tokens"], None, actions, batch["embodiment"])
             if out.actions is None:
-                return out.said, 0
+                return out.predictions, 0
             keys = jax.random.split(jax.random.key(0), 8)
             chunks = read_actions(hma, out, batch["embodiment"], keys, decode)
-            return out.said, chunks[..., : TABLE.action_width]
+            return out.predictions, chunks[..., : TABLE.action_width]
 
         return jax.jit(run)(params)
 
@@ -69,14 +69,14 @@ def test_an_old_robot_s_answer_does_not_depend_on_how_wide_the_table_is(rows: in
     def answer(declared, params, width: int) -> tuple[jax.Array, jax.Array]:
         actions = np.pad(batch["actions"][:, :frames], ((0, 0), (0, 0), (0, width - TABLE.action_width)))
         out = jax.jit(lambda p: declared.merge(p)(tokens, None, actions, batch["embodiment"]))(params)
-        return out.said, out.actions
+        return out.predictions, out.actions
 
-    said, pooled = answer(declared, params, TABLE.action_width)
+    predictions, pooled = answer(declared, params, TABLE.action_width)
     for width in (1, 33, 300):
         newcomer = Embodiment("newcomer", width, 1, (0.1,) * width, (2.0,) * width)
         wider, table = add_embodiments(params, config, TABLE, (newcomer,), seed=3)
         again = answer(declare_model(config, table), wider, table.action_width)
-        np.testing.assert_array_equal(again[0], said)
+        np.testing.assert_array_equal(again[0], predictions)
         np.testing.assert_array_equal(again[1], pooled)
 
 

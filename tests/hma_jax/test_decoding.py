@@ -50,9 +50,9 @@ def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monke
         return jnp.full((*z.shape[:2], DIFFUSION.token_channels), float(len(drawn)))
 
     monkeypatch.setattr(decoding, "denoise", numbered)
-    said, keys = jnp.zeros((2, tokens, 3)), jax.random.split(jax.random.key(0), 2)
+    predictions, keys = jnp.zeros((2, tokens, 3)), jax.random.split(jax.random.key(0), 2)
     decode = DecodeConfig(9, sampler=SamplerConfig(steps=3))
-    frame = decoding.decode_frame(SimpleNamespace(config=config), said, lambda _: said, keys, decode)
+    frame = decoding.decode_frame(SimpleNamespace(config=config), predictions, lambda _: predictions, keys, decode)
     assert min(drawn) == 1 and sum(drawn) == tokens
     np.testing.assert_array_equal(np.sort(frame[..., 0]), [np.repeat(np.arange(1.0, len(drawn) + 1), drawn)] * 2)
 

@@ -174,7 +174,9 @@ def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
         actions = batch["actions"].copy()
         actions[:, chunk, :2] += 3.0
         hidden = hma.align_hidden(None, (2, config.frames))
-        look = jax.jit(lambda a: hma(batch["tokens"], None, hma.align(a), batch["embodiment"], hidden_BT=hidden).said)
+        look = jax.jit(
+            lambda a: hma(batch["tokens"], None, hma.align(a), batch["embodiment"], hidden_BT=hidden).predictions
+        )
         logits = [look(a) for a in (batch["actions"], actions)]
         changed = np.abs(logits[0] - logits[1]).max((0, 2, 3, 4)) > 1e-3
         return int(np.argmax(changed))
@@ -192,7 +194,7 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
     hidden = hma.align_hidden(None, batch["tokens"].shape[:2])
     look = jax.jit(
         lambda masked: (
-            hma(batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden).said
+            hma(batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden).predictions
         )
     )
     fast = jax.jit(lambda: next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))()

@@ -285,10 +285,10 @@ def test_stems_and_modulation_learn_from_hidden_actions_that_leak(conditioning: 
     declared, params = lively_params(config)
     hma, rest = declared.merge(params), (data["actions"], data["embodiment"])
 
-    def said(actions):
-        return hma(masked.inputs, masked.masked, actions, rest[1], hidden_BT=masked.hidden_T, leak=leak).said
+    def predictions(actions):
+        return hma(masked.inputs, masked.masked, actions, rest[1], hidden_BT=masked.hidden_T, leak=leak).predictions
 
-    reaches = bool((jax.jit(said)(rest[0]) != jax.jit(said)(rest[0] + 1)).any())
+    reaches = bool((jax.jit(predictions)(rest[0]) != jax.jit(predictions)(rest[0] + 1)).any())
     assert reaches == bool(presence.shared["actions_shown"]) == (conditioning != "concat" or leak == "all")
 
 

@@ -15,7 +15,7 @@ from tests.tiny import TABLE, lively_params, model_config, random_batch, shallow
 
 def logits_of(config, declared, params, batch, actions=True):
     given = batch["actions"] if actions else None
-    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], None, given, b["embodiment"]).said)
+    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], None, given, b["embodiment"]).predictions)
     return np.asarray(apply(params, batch))
 
 
@@ -132,7 +132,9 @@ def test_flops_formula_counts_what_the_program_multiplies():
     table = EmbodimentTable((Embodiment("a", 2, 1, (0.0,) * 2, (1.0,) * 2),))
     declared = declare_model(config, table)
     batch = random_batch(0, config, 1, table)
-    apply = jax.jit(lambda p: declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).said)
+    apply = jax.jit(
+        lambda p: declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).predictions
+    )
     counted = apply.lower(declared.init(0)).compile().cost_analysis()["flops"]
     formula = forward_flops_per_window(config, table)
     # XLA adds element-wise work and full (not causal) temporal scores.

@@ -13,7 +13,7 @@ from hma_jax.config.training import ActionLeak
 from hma_jax.generation.teacher import next_frame_outputs
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose, factorise
-from hma_jax.model.readout import likeliest
+from hma_jax.model.readout import choose_likeliest
 from hma_jax.objective import losses, own_past
 from hma_jax.objective.losses import noise_keys
 from hma_jax.objective.masking import mask_batch
@@ -39,11 +39,11 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
     assert replaced.mean(1).std() > 0.2  # and drawn for each example
     # Of a frame that is replaced, each factor is as frequent as the model says after the true past.
     first = one["tokens"][:1], *(x[:1] for x in given)
-    said = jax.jit(lambda *x: jax.nn.softmax(next_frame_outputs(model, *x)[0, 0]))(*first)
+    predictions = jax.jit(lambda *x: jax.nn.softmax(next_frame_outputs(model, *x)[0, 0]))(*first)
     own = factorise(jnp.asarray(drawn[replaced[:, 0], 1]), config.factors, config.factor_vocab)
     frequency = jax.nn.one_hot(own, config.factor_vocab).mean(0)
-    assert np.abs(np.asarray(frequency - said)).max() < 0.2
-    assert np.corrcoef(np.ravel(frequency), np.ravel(said))[0, 1] > 0.8
+    assert np.abs(np.asarray(frequency - predictions)).max() < 0.2
+    assert np.corrcoef(np.ravel(frequency), np.ravel(predictions))[0, 1] > 0.8
     np.testing.assert_array_equal(draw(0.0), before)
 
     # The loss is that of what follows this past.
@@ -63,7 +63,7 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
 
 def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(monkeypatch):
     """Where the likeliest ids are taken, the first r frames of r rounds each are what the model says after its own."""
-    monkeypatch.setattr(own_past, "drawing", lambda *_: likeliest)
+    monkeypatch.setattr(own_past, "choose_sampled", lambda *_: choose_likeliest)
     config = shallow_config(action_heads=False)
     declared, params = lively_params(config, scale=0.5)
     model, rows = declared.merge(params), 8
@@ -78,9 +78,9 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
             model, before, *given, None, every_frame, rounds, noise_keys(jax.random.key(0), rows), given[1]
         )
         whole = jnp.concatenate([past, past[:, -1:]], axis=1)
-        digits, _ = model.frame_head.factors_in_turn(next_frame_outputs(model, whole, *given), likeliest)
-        said = compose(digits, config.factor_vocab)[:, : frames - 1]
-        return (said == past[:, 1:]).mean((0, 2))
+        digits, _ = model.frame_head.decode_factors(next_frame_outputs(model, whole, *given), choose_likeliest)
+        predictions = compose(digits, config.factor_vocab)[:, : frames - 1]
+        return (predictions == past[:, 1:]).mean((0, 2))
 
     shares = [own_share(rounds) for rounds in range(1, frames)]
     for rounds, share in enumerate(shares, start=1):
@@ -99,7 +99,7 @@ def test_it_needs_a_past_that_is_shown():
 
 def test_it_is_drawn_after_hidden_actions_where_these_leak_to_the_model(monkeypatch):
     """As the frames that follow it are predicted."""
-    monkeypatch.setattr(own_past, "drawing", lambda *_: likeliest)
+    monkeypatch.setattr(own_past, "choose_sampled", lambda *_: choose_likeliest)
     config = shallow_config(action_heads=False)
     declared, params = lively_params(config, scale=0.5)
     batch = random_batch(0, config, 8)

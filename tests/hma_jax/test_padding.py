@@ -59,12 +59,12 @@ def test_what_is_said_of_real_frames_does_not_depend_on_padding(context):
     visible = seen_by_all(FRAMES, jnp.asarray(REAL)) if context == "inverse" else None
 
     @jax.jit
-    def said(params, batch):
+    def predictions(params, batch):
         out = declared.merge(params)(batch["tokens"], None, batch["actions"], batch["embodiment"], visible=visible)
-        return out.said, out.actions
+        return out.predictions, out.actions
 
     batch = random_batch(0, MODEL, len(LENGTHS))
-    found = [said(params, spoilt(batch, other)) for other in (7, 8)]
+    found = [predictions(params, spoilt(batch, other)) for other in (7, 8)]
     for one, other in zip(*found, strict=True):
         one, other = np.asarray(one), np.asarray(other)
         np.testing.assert_array_equal(one[REAL], other[REAL])

@@ -12,7 +12,7 @@ from flax import nnx
 from hma_jax.config import ConfigError
 from hma_jax.model.frames import compose
 from hma_jax.model.params import declare
-from hma_jax.model.readout import ChainedReadout, Readout, drawing, likeliest
+from hma_jax.model.readout import ChainedReadout, Readout, choose_likeliest, choose_sampled
 from tests.tiny import DIFFUSION, SMALLER, lively_params, model_config
 
 FACTORS, ENTRIES = 3, 4
@@ -27,18 +27,18 @@ def lively_head() -> tuple[nnx.Module, jax.Array]:
     return declared.merge(params).frame_head, jax.random.normal(jax.random.key(1), (CONFIG.width,))
 
 
-def logits(head: nnx.Module, said: jax.Array, digits: jax.Array) -> jax.Array:
-    return head.factors_in_turn(said, lambda factor, _: digits[..., factor])[1]
+def logits(head: nnx.Module, predictions: jax.Array, digits: jax.Array) -> jax.Array:
+    return head.decode_factors(predictions, lambda factor, _: digits[..., factor])[1]
 
 
-def log_likelihood(head: nnx.Module, said: jax.Array, digits: jax.Array) -> jax.Array:
-    log_p = jax.nn.log_softmax(logits(head, said, digits))
+def log_likelihood(head: nnx.Module, predictions: jax.Array, digits: jax.Array) -> jax.Array:
+    log_p = jax.nn.log_softmax(logits(head, predictions, digits))
     return jnp.take_along_axis(log_p, digits[..., None], axis=-1)[..., 0].sum(-1)
 
 
-def of_every_token(head: nnx.Module, said: jax.Array) -> np.ndarray:
+def of_every_token(head: nnx.Module, predictions: jax.Array) -> np.ndarray:
     """Probabilities [V^Q]."""
-    every = jnp.broadcast_to(said, (len(EVERY), *said.shape))
+    every = jnp.broadcast_to(predictions, (len(EVERY), *predictions.shape))
     return np.exp(np.asarray(jax.jit(lambda: log_likelihood(head, every, EVERY))(), np.float64))
 
 
@@ -51,8 +51,8 @@ def test_probabilities_of_all_tokens_add_up_to_one_and_are_no_product():
 
 
 def test_a_factor_is_given_those_before_it_and_none_after():
-    head, said = lively_head()
-    asked, zeros = jax.jit(lambda digits: logits(head, said, digits)), np.zeros(FACTORS, int)
+    head, predictions = lively_head()
+    asked, zeros = jax.jit(lambda digits: logits(head, predictions, digits)), np.zeros(FACTORS, int)
     before = asked(zeros)
     for changed in range(FACTORS):
         after = asked(np.where(np.arange(FACTORS) == changed, 1, zeros))
@@ -61,31 +61,33 @@ def test_a_factor_is_given_those_before_it_and_none_after():
 
 
 def test_tokens_are_drawn_as_often_as_they_are_likely():
-    head, said = lively_head()
+    head, predictions = lively_head()
     draws = 20_000
-    told = jnp.broadcast_to(said, (draws, *said.shape))
-    digits, _ = jax.jit(lambda: head.factors_in_turn(told, drawing(jax.random.key(0), head.shape(told))))()
+    told = jnp.broadcast_to(predictions, (draws, *predictions.shape))
+    digits, _ = jax.jit(lambda: head.decode_factors(told, choose_sampled(jax.random.key(0), head.shape(told))))()
     share = np.bincount(np.asarray(compose(digits, ENTRIES)), minlength=ENTRIES**FACTORS) / draws
-    wanted = of_every_token(head, said)
+    wanted = of_every_token(head, predictions)
     ids = np.asarray(compose(EVERY, ENTRIES))
     # Five standard errors, of 64 shares.
     assert np.abs(share[ids] - wanted).max() < 5 * np.sqrt(wanted.max() / draws)
 
 
 def test_the_likeliest_factor_follows_the_likeliest_before_it():
-    head, said = lively_head()
-    digits, of_each = head.factors_in_turn(said, likeliest)
-    np.testing.assert_array_equal(digits, jnp.argmax(logits(head, said, digits), axis=-1))
-    np.testing.assert_array_equal(of_each, logits(head, said, digits))
+    head, predictions = lively_head()
+    digits, of_each = head.decode_factors(predictions, choose_likeliest)
+    np.testing.assert_array_equal(digits, jnp.argmax(logits(head, predictions, digits), axis=-1))
+    np.testing.assert_array_equal(of_each, logits(head, predictions, digits))
 
 
 def test_it_begins_as_if_factors_were_independent():
     declared = declare(lambda: ChainedReadout(CONFIG), 1)
     params = declared.init(0)
     head = declared.merge(params)
-    said = jax.random.normal(jax.random.key(1), (5, CONFIG.width))
+    predictions = jax.random.normal(jax.random.key(1), (5, CONFIG.width))
     for digits in (jnp.zeros((5, FACTORS), int), jnp.ones((5, FACTORS), int)):
-        np.testing.assert_array_equal(*jax.jit(lambda digits=digits: (logits(head, said, digits), head.alone(said)))())
+        np.testing.assert_array_equal(
+            *jax.jit(lambda digits=digits: (logits(head, predictions, digits), head.alone(predictions)))()
+        )
 
 
 @pytest.mark.parametrize(("kind", "nats"), [(ChainedReadout, np.log(ENTRIES)), (Readout, FACTORS * np.log(ENTRIES))])
@@ -93,13 +95,13 @@ def test_what_stands_in_all_factors_at_once_costs_a_chain_once(kind: type, nats:
     """Tokens whose factors are all the same: log V nats, where factors that know nothing of each other cost Q log V."""
     declared = declare(lambda: kind(CONFIG), 1)
     params = declared.init(0)
-    said = jnp.zeros((ENTRIES, CONFIG.width))
+    x = jnp.zeros((ENTRIES, CONFIG.width))
     same = jnp.broadcast_to(jnp.arange(ENTRIES)[:, None], (ENTRIES, FACTORS))
     adam = optax.adam(3e-2)
 
     def loss(params) -> jax.Array:
         head = declared.merge(params)
-        return -log_likelihood(head, head(said), same).mean()
+        return -log_likelihood(head, head(x), same).mean()
 
     def step(carry, _):
         params, state = carry

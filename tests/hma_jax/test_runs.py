@@ -147,7 +147,7 @@ def test_a_model_is_loaded_as_it_is_executed(dtype: str, averaged):
 
     def logits(params, batch):
         merged = model.declared.merge(params)
-        return merged(batch["tokens"], None, merged.align(batch["actions"]), batch["embodiment"]).said
+        return merged(batch["tokens"], None, merged.align(batch["actions"]), batch["embodiment"]).predictions
 
     assert jax.eval_shape(logits, model.params, next(batches(MODEL, 4)(0))).shape == (4, 3, 4, 2, 4)
 
@@ -168,11 +168,11 @@ def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
         model = declared.merge(params)
         out = model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"])
         if not config.diffusion:
-            return model.logits(out.said, batch["tokens"]), out.actions
+            return model.logits(out.predictions, batch["tokens"]), out.actions
         times = jnp.full((4, config.frames), 3)
         tokens, actions = batch["tokens"], batch["actions"]
         return (
-            model.denoiser(tokens, jnp.full(tokens.shape[:-1], 3), out.said),
+            model.denoiser(tokens, jnp.full(tokens.shape[:-1], 3), out.predictions),
             model.action_head(actions, times, out.actions, batch["embodiment"]),
         )
 

@@ -50,7 +50,9 @@ def main(directory: str) -> None:
             checkpoints.save(1, state)
         with jax.set_mesh(mesh):
             rows = put_batch(batch, mesh)
-            apply = jax.jit(lambda p, b, d=declared: d.merge(p)(b["tokens"], None, b["actions"], b["embodiment"]).said)
+            apply = jax.jit(
+                lambda p, b, d=declared: d.merge(p)(b["tokens"], None, b["actions"], b["embodiment"]).predictions
+            )
             logits = np.asarray(apply(state.params, rows))
         split = [x for x in jax.tree.leaves(state.params) if not x.sharding.is_fully_replicated]
         found.append({"state": digest(state), "logits": logits.ravel().tolist(), "split": len(split)})

@@ -46,10 +46,10 @@ def everything(config, params, execution: ExecutionConfig) -> dict[str, np.ndarr
     def apply(params):
         model = declared.merge(params)
         out = model(batch["tokens"], None, batch["actions"], robots)
-        made = {"frames": out.said}
+        made = {"frames": out.predictions}
         if config.diffusion:
             time = jnp.asarray(rng.integers(0, 1000, batch["tokens"].shape[:3]))
-            made["denoiser"] = model.denoiser(batch["tokens"], time, out.said)
+            made["denoiser"] = model.denoiser(batch["tokens"], time, out.predictions)
         if config.action_heads:
             noised = (jnp.where(alive, batch["actions"], 0), time[..., 0]) if config.diffusion else ()
             actions = model.action_head(*noised, out.actions, robots)

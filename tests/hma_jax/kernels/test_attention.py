@@ -120,8 +120,10 @@ def test_every_backend_on_offer_is_known_where_it_runs_and_another_is_refused(pl
         attention.find_backend("flash")
     for name, where in {"cudnn": "an NVIDIA GPU", "splash": "a TPU"}.items():
         if name != own:
-            said = f"attention '{name}' runs on {where} alone, and the device here is a {platform.upper()}; choose auto"
-            with pytest.raises(ConfigError, match=said):
+            message = (
+                f"attention '{name}' runs on {where} alone, and the device here is a {platform.upper()}; choose auto"
+            )
+            with pytest.raises(ConfigError, match=message):
                 attention.find_backend(name)
 
 
@@ -137,11 +139,11 @@ def test_the_backend_is_that_of_the_devices_that_are_compiled_for(monkeypatch):
 def test_large_frames_attend_one_by_one_on_cpu_and_say_the_same():
     config = model_config(width=16, layers=1, tokens=260, action_tokens=4)
     batch, (_, params) = random_batch(0, config, 2), lively_params(config)
-    said = []
+    predictions = []
     for how in ("cpu", "plain"):
         declared = declare_model(config, TABLE, ExecutionConfig(attention=how))
         look = jax.jit(
-            lambda p, d=declared: d.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).said
+            lambda p, d=declared: d.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).predictions
         )
-        said.append(np.asarray(look(params)))
-    np.testing.assert_allclose(*said, atol=1e-4 * np.abs(said[1]).max())
+        predictions.append(np.asarray(look(params)))
+    np.testing.assert_allclose(*predictions, atol=1e-4 * np.abs(predictions[1]).max())
