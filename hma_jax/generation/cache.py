@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.generation.decoding import Frame, blank_frame
-from hma_jax.model.hma import HMA, Outputs, causal
+from hma_jax.model.hma import HMA, Outputs, causal_mask
 from hma_jax.model.trunk import TemporalCache
 
 
@@ -105,7 +105,7 @@ class Window(NamedTuple):
         slots = jnp.arange(cache.room)
         remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
         earlier = jnp.stack([cache.valid] * count + [remaining])
-        visible = jnp.concatenate([earlier, causal(count + 1)], axis=1)
+        visible = jnp.concatenate([earlier, causal_mask(count + 1)], axis=1)
         out = self._pass(
             values, masked, at, cache.layers, visible, positions=positions, cache_frames=count, predict_from=count
         )

@@ -9,10 +9,10 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
-from hma_jax.model.beside import beside
 from hma_jax.model.hma import HMA, Outputs
+from hma_jax.model.teacher_forcing import teacher_forcing_mask
 from hma_jax.objective.diffusion import sample_with_key
-from hma_jax.objective.losses import seen_by_all
+from hma_jax.objective.losses import bidirectional_mask
 from hma_jax.objective.process import make_process, sampling_process
 
 
@@ -35,7 +35,7 @@ def predict_actions(
     `real_BT` (None: all are) are no part. Padding is 0.
     """
     count = frames.shape[1]
-    visible = None if causally else seen_by_all(count, real_BT)
+    visible = None if causally else bidirectional_mask(count, real_BT)
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     out = model(frames, None, model.align(actions_BTU), embodiment_B, hidden_BT=hidden, visible=visible)
     return read_actions(model, out, embodiment_B, key_B, decode)
@@ -52,8 +52,8 @@ def predict_next_actions(
     """Raw chunks [B, T, U]: the policy's action at every frame of a recorded window, given the frames up to it and all
     actions before.
 
-    One pass: with causal alignment no frame is shown its own chunk; otherwise every frame stands
-    beside a copy of itself whose action is hidden, as in `next_frame_outputs`.
+    One pass. With causal alignment no frame is shown its own chunk; otherwise the window is followed by a copy of
+    itself whose actions are hidden, under the mask of teacher forcing.
     """
     batch, count = frames.shape[:2]
     if model.config.action_alignment == "causal":
@@ -67,7 +67,7 @@ def predict_next_actions(
         jnp.concatenate([actions_BTU, actions_BTU], axis=1),
         embodiment_B,
         hidden_BT=hidden,
-        visible=beside(before),
+        visible=teacher_forcing_mask(before),
         positions=jnp.tile(jnp.arange(count), 2),
         predict_from=2 * count,
     )

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from hma_jax.config import DecodeConfig
 from hma_jax.generation.decoding import Frame, decode_frame
 from hma_jax.generation.rollout import fold_in
-from hma_jax.model.beside import look_beside
-from hma_jax.model.hma import HMA, Outputs, causal
+from hma_jax.model.hma import HMA, Outputs, causal_mask
+from hma_jax.model.teacher_forcing import teacher_forced_pass
 
 
 def next_frame_outputs(
@@ -22,7 +22,7 @@ def next_frame_outputs(
     """`Outputs.predictions` for frames 1 .. T-1, each wholly masked after its true past: [B, T - 1, S, Q, V] or
     [B, T - 1, S, D].
     """
-    return _look(model, frames, actions_BTU, embodiment_B, hidden_BT).predictions
+    return _fully_masked_pass(model, frames, actions_BTU, embodiment_B, hidden_BT).predictions
 
 
 def next_frames(
@@ -41,7 +41,7 @@ def next_frames(
     one over the true ones, where the official evaluation makes M (T - 1) over the window.
     """
     count = frames.shape[1] - 1
-    out = _look(model, frames, actions_BTU, embodiment_B, hidden_BT, cache_frames=count)
+    out = _fully_masked_pass(model, frames, actions_BTU, embodiment_B, hidden_BT, cache_frames=count)
     actions = model.align(actions_BTU)[:, 1:]
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
@@ -54,7 +54,7 @@ def next_frames(
             actions,
             embodiment_B,
             hidden_BT=hidden,
-            visible=jnp.concatenate([causal(count), jnp.eye(count, dtype=bool)], axis=1),
+            visible=jnp.concatenate([causal_mask(count), jnp.eye(count, dtype=bool)], axis=1),
             first=1,
             past=out.cache,
             before=frames[:, :-1],
@@ -66,7 +66,7 @@ def next_frames(
     return out.predictions, _by_window(filled, count)
 
 
-def _look(
+def _fully_masked_pass(
     model: HMA,
     frames: jax.Array,
     actions_BTU: jax.Array,
@@ -74,10 +74,12 @@ def _look(
     hidden_BT: jax.Array | None,
     cache_frames: int = 0,
 ) -> Outputs:
-    """At frames 1 .. T-1, all of them wholly masked."""
+    """`teacher_forced_pass` with frames 1 .. T-1 wholly masked."""
     before = frames[:, :-1]  # what lies under a mask does not matter
     masked = jnp.ones(before.shape[:3], bool)
-    return look_beside(model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, cache_frames=cache_frames)
+    return teacher_forced_pass(
+        model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, cache_frames=cache_frames
+    )
 
 
 def _by_frame(x: jax.Array) -> jax.Array:

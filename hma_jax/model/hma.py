@@ -27,8 +27,8 @@ from hma_jax.model.trunk import TemporalCache, Trunk
 from hma_jax.runtime.sharding import constrain
 
 
-def causal(frames: int) -> jax.Array:
-    """bool [T, T]: a frame sees itself and what came before."""
+def causal_mask(frames: int) -> jax.Array:
+    """bool [T, T]: a frame attends to itself and to those before it."""
     return jnp.tril(jnp.ones((frames, frames), bool))
 
 
@@ -102,7 +102,7 @@ class HMA(nnx.Module):
         if positions is None:
             positions = first + jnp.arange(count)
         if visible is None:
-            visible = causal(count)
+            visible = causal_mask(count)
         slice_B = embodiment_B if slice_B is None else slice_B
         x = self.embed(frames, masked, self.dtype)
         if self.recall is not None and masked is not None:

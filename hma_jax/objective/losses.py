@@ -13,9 +13,9 @@ import jax.numpy as jnp
 
 from hma_jax.config import MaskingConfig
 from hma_jax.kernels.random import draw_flat
-from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
+from hma_jax.model.teacher_forcing import teacher_forced_pass
 from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.displaced import displace_patches
 from hma_jax.objective.masking import Masked
@@ -119,7 +119,7 @@ def masked_loss(
             keys = jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(key_B)
             past = displace_patches(past, masking.displaced_past, keys)
         inputs = past, masked.inputs[:, FIRST_PREDICTED:], masked.masked[:, FIRST_PREDICTED:]
-        out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
+        out = teacher_forced_pass(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
     else:
         out = model(
             masked.inputs,
@@ -127,7 +127,7 @@ def masked_loss(
             model.align(actions_BTU),
             embodiment_B,
             hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
-            visible=seen_by_all(tokens.shape[1], real_BT) if masking.setting == "inverse" else None,
+            visible=bidirectional_mask(tokens.shape[1], real_BT) if masking.setting == "inverse" else None,
             predict_from=FIRST_PREDICTED,
             **options,
         )
@@ -149,8 +149,8 @@ def masked_loss(
     return LossSums(loss, correct, action_loss)
 
 
-def seen_by_all(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
-    """bool [T, T] or [B, T, T]: every frame sees every real one (`real_BT` None: all are), later ones too."""
+def bidirectional_mask(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
+    """bool [T, T] or [B, T, T]: every frame attends to every real one (`real_BT` None: all are), later ones too."""
     everything = jnp.ones((frames, frames), bool)
     return everything if real_BT is None else everything & real_BT[:, None]
 

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config.training import ActionLeak
-from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
 from hma_jax.model.readout import choose_sampled
+from hma_jax.model.teacher_forcing import teacher_forced_pass
 
 
 def draw_own_past(
@@ -51,7 +51,7 @@ def draw_own_past(
     past = before
     for number in range(rounds):
         shown = actions_BTU, embodiment_B, hidden_BT
-        predictions = look_beside(model, past, past, masked, *shown, leak=leak, slice_B=slice_B).predictions
+        predictions = teacher_forced_pass(model, past, past, masked, *shown, leak=leak, slice_B=slice_B).predictions
         predictions = jax.lax.stop_gradient(predictions[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
         # The first round draws what it draws where it is the only one.
         keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B

@@ -59,7 +59,7 @@ def test_the_past_alone_is_displaced(monkeypatch):
     def show(model, *given, **how):
         raise Shown(*given[:3])
 
-    monkeypatch.setattr(losses, "look_beside", show)
+    monkeypatch.setattr(losses, "teacher_forced_pass", show)
     config = shallow_config(action_heads=False)
     batch = random_batch(0, config, 32)
     tokens, given = jnp.asarray(batch["tokens"]), (batch["actions"], batch["embodiment"])

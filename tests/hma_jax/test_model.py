@@ -9,7 +9,7 @@ from hma_jax.model.conditioning import ActionFeature, CrossAttention
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
-from hma_jax.model.hma import causal, declare_model
+from hma_jax.model.hma import causal_mask, declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch, shallow_config
 
 
@@ -69,7 +69,7 @@ def test_of_actions_attended_to_a_frame_s_own_weighs_as_much_as_all_earlier_ones
     shown = np.array([[True] * 6, [False, True, False, True, True, False]])
     x, slices = jnp.zeros((2, 6, 3, config.width)), jnp.zeros(2, int)
     attend = jax.jit(attend)
-    got, cache = attend(x, ActionFeature(feature, shown), slices, causal(6), None)
+    got, cache = attend(x, ActionFeature(feature, shown), slices, causal_mask(6), None)
 
     def mixed(example, t):
         earlier = [feature[example, s] for s in range(t) if shown[example, s]]

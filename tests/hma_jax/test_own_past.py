@@ -11,9 +11,9 @@ import pytest
 from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.config.training import ActionLeak
 from hma_jax.generation.teacher import next_frame_outputs
-from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose, factorise
 from hma_jax.model.readout import choose_likeliest
+from hma_jax.model.teacher_forcing import teacher_forced_pass
 from hma_jax.objective import losses, own_past
 from hma_jax.objective.losses import noise_keys
 from hma_jax.objective.masking import mask_batch
@@ -49,8 +49,12 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
     # The loss is that of what follows this past.
     shown, own = [], before + 1
     monkeypatch.setattr(losses, "draw_own_past", lambda *_: own)
-    monkeypatch.setattr(losses, "look_beside", lambda model, past, *rest, **how: shown.append(past) or look_beside(
-        model, past, *rest, **how))  # fmt: skip
+
+    def recording_pass(model, past, *rest, **how):
+        shown.append(past)
+        return teacher_forced_pass(model, past, *rest, **how)
+
+    monkeypatch.setattr(losses, "teacher_forced_pass", recording_pass)
 
     def loss(masking: MaskingConfig) -> jax.Array:
         masked = mask_batch(jax.random.key(0), one["tokens"], one["embodiment"], config, masking, TABLE)

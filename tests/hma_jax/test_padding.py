@@ -12,7 +12,7 @@ import pytest
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, MaskingConfig, SamplerConfig
 from hma_jax.evaluation.evaluate import evaluate, held
 from hma_jax.evaluation.metrics import psnr
-from hma_jax.objective.losses import seen_by_all
+from hma_jax.objective.losses import bidirectional_mask
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
 from hma_jax.training.validation import make_sums
@@ -56,7 +56,7 @@ def step_of(model, masking):
 def test_what_is_said_of_real_frames_does_not_depend_on_padding(context):
     """Padding stands at the end: causal attention needs no mask, inverse dynamics has one."""
     declared, params = lively_params(MODEL)
-    visible = seen_by_all(FRAMES, jnp.asarray(REAL)) if context == "inverse" else None
+    visible = bidirectional_mask(FRAMES, jnp.asarray(REAL)) if context == "inverse" else None
 
     @jax.jit
     def predictions(params, batch):

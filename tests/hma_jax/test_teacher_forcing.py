@@ -7,9 +7,9 @@ import pytest
 
 from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.generation.teacher import next_frame_outputs
-from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
+from hma_jax.model.teacher_forcing import teacher_forced_pass
 from hma_jax.objective.losses import frame_diffusion_loss, masked_loss, noise_keys, smoothed_cross_entropy
 from hma_jax.objective.masking import mask_batch
 from tests.tiny import DIFFUSION, TABLE, lively_params, random_batch, shallow_config
@@ -63,7 +63,7 @@ def test_a_frame_is_told_the_frames_before_it_and_not_their_masks():
 
     @jax.jit
     def said(before: jax.Array, masked: jax.Array) -> jax.Array:
-        return look_beside(model, before, tokens[:, 1:], masked, *rest).predictions
+        return teacher_forced_pass(model, before, tokens[:, 1:], masked, *rest).predictions
 
     shown = said(tokens[:, :-1], some)
     other_masks = said(tokens[:, :-1], some.at[:, 0].set(~some[:, 0]))
@@ -82,7 +82,7 @@ def test_what_a_masked_token_recalls_is_the_frame_before_and_never_the_truth(dif
 
     @jax.jit
     def said(before: jax.Array, ahead: jax.Array) -> jax.Array:
-        return look_beside(model, before, ahead, masked, *rest).predictions
+        return teacher_forced_pass(model, before, ahead, masked, *rest).predictions
 
     told = said(before, tokens[:, 1:])
     np.testing.assert_array_equal(said(before, jnp.zeros_like(before)), told)
