@@ -90,11 +90,11 @@ def train_tokenizer(setting: Setting, replace: Step | None) -> None:
 
 
 def _write(tokenizer: BaseTokenizer, out: Path) -> None:
-    from hma_jax.convert.aside import written_aside
+    from hma_jax.convert.atomic import atomic_directory
     from hma_jax.tokenizers.io import save_tokenizer
 
-    with written_aside(out) as aside:
-        save_tokenizer(tokenizer, aside)
+    with atomic_directory(out) as temporary:
+        save_tokenizer(tokenizer, temporary)
     if tokenizer.channels:
         what = f"latents of {tokenizer.channels} channels"
     else:

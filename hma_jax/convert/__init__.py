@@ -4,7 +4,7 @@ Models meet in a `training.runs.Run`: readers return one, writers take one. Read
 tokenizers return one that `tokenizers.io` saves.
 """
 
-from hma_jax.convert.aside import require_free
+from hma_jax.convert.atomic import require_free
 from hma_jax.convert.neutral import read_neutral, write_neutral
 from hma_jax.convert.official import official_shapes, read_official, write_official
 from hma_jax.convert.pretrained import find_reader, read_magvit2, read_svd_vae

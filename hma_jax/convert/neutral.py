@@ -16,7 +16,7 @@ import numpy as np
 
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
 from hma_jax.config.json import from_dict
-from hma_jax.convert.aside import written_aside
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.table import check_names, flat, nested
 from hma_jax.convert.tensors import read_finite, read_safetensors, write_safetensors
 from hma_jax.model.embodiments import EmbodimentTable
@@ -44,9 +44,9 @@ def write_neutral(run: Run, directory: Path) -> None:
         **describe_run(run.model, run.train, run.table, run.provenance),
         "tensors": describe_tensors(declare_model(run.model, run.table).leaves()),
     }
-    with written_aside(directory) as aside:
-        (aside / DESCRIPTION).write_text(json.dumps(description, indent=1))
-        write_safetensors(aside / WEIGHTS, arrays)
+    with atomic_directory(directory) as temporary:
+        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=1))
+        write_safetensors(temporary / WEIGHTS, arrays)
 
 
 def read_neutral(directory: Path) -> Run:

@@ -1,10 +1,9 @@
 """Checkpoints of the official PyTorch release (STMaskGIT and STMAR), as a `Run` and back.
 
-A directory holds config.json and model.safetensors, or a torch file in its place. Reading is
-strict: a tensor too few, too many or of another shape is refused, where the release leaves random
-weights in its place. What we have no use for is kept in the run's provenance, so that a run that
-came from there and was not trained since goes back byte for byte. In every other run what muP
-multiplies with is folded into the weights where the release would multiply otherwise (`multipliers`).
+A directory holds config.json and model.safetensors, or a torch file in its place. Reading is strict: a tensor too few,
+too many or of another shape is refused, where the release leaves random weights in its place. Fields that we do not use
+are kept in the run's provenance, so that a run that was imported and not trained since is exported byte for byte. In
+every other run muP's multipliers are folded into the weights where the release would use other ones (`multipliers`).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import numpy as np
 
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
 from hma_jax.config.json import stable_hash
-from hma_jax.convert.aside import written_aside
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.convert.official_config import (
     CONTINUOUS_DEFAULTS,
@@ -75,13 +74,13 @@ def read_official(directory: Path) -> Run:
         is_continuous(config) == any(name.startswith("diffloss.") for name in tensors),
         f"{directory}: {CONFIG} describes the {_variant(config)} variant, the tensors are the other's",
     )
-    with _of_file(where):
+    with _naming_file(where):
         model, masking = read_model(config, where), read_masking(config)
     names = config["action_domains"] if isinstance(config.get("action_domains"), list) else []
     missing = [name for robot in names for name in _statistics(robot) if name not in tensors]
     require(not missing, f"{directory}: missing tensors {', '.join(missing[:10])}")
     statistics = {robot: tuple(tensors[name].read() for name in _statistics(robot)) for robot in names}
-    with _of_file(where):
+    with _naming_file(where):
         table = read_table(config, statistics, where)
     check_names(
         official_shapes(model, table),
@@ -105,8 +104,8 @@ def read_official(directory: Path) -> Run:
 
 
 @contextmanager
-def _of_file(where: str) -> Iterator[None]:
-    """What a configuration of ours says of itself does not name the file that asked for it."""
+def _naming_file(where: str) -> Iterator[None]:
+    """Adds the name of the file to errors of our own configurations, which do not know it."""
     try:
         yield
     except ConfigError as error:
@@ -156,9 +155,9 @@ def write_official(run: Run, directory: Path) -> list[str]:
             "it goes back as it came, which the release itself does not load: its muP stops at continuous "
             "models of another width than 256. Once trained on here, it is written with muP folded in"
         )
-    with written_aside(directory) as aside:
-        (aside / CONFIG).write_text(json.dumps(config, indent=2, sort_keys=True))
-        write_safetensors(aside / WEIGHTS, tensors)
+    with atomic_directory(directory) as temporary:
+        (temporary / CONFIG).write_text(json.dumps(config, indent=2, sort_keys=True))
+        write_safetensors(temporary / WEIGHTS, tensors)
     return remarks
 
 
@@ -167,7 +166,7 @@ def official_config(run: Run) -> dict[str, Any]:
 
     Raises ConfigError if the release could not compute the model.
     """
-    form = _form(run)
+    form = _exportable(run)
     source = run.provenance.get("official", {})
     original = source.get("config", {})
     fields = write_config(form, run.table, run.train.masking)
@@ -181,14 +180,14 @@ def official_config(run: Run) -> dict[str, Any]:
 
 def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     """(name -> array, remarks for the user). Raises ConfigError as `official_config` does."""
-    form, remarks = _form(run), []
+    form, remarks = _exportable(run), []
     leaves = declare_model(form, run.table).leaves()
     arrays = flat(run.params)
     if not run.model.action_heads:
         arrays |= {path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays}
         remarks.append("the release has action heads, this model has none: they are written as zeros")
-    if not _untouched(run):
-        arrays |= _without_constants(arrays, run.table)
+    if not _unchanged_since_import(run):
+        arrays |= _without_constant_actions(arrays, run.table)
     arrays = folded(arrays, leaves, run.model, form)
     remarks += _remarks(run.model, form)
     tensors = to_official(nested(arrays), official_parts(form, run.table, leaves))
@@ -199,17 +198,17 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     return {name: _narrow(x, halves.get(name)) for name, x in tensors.items()}, remarks
 
 
-def _form(run: Run) -> ModelConfig:
-    """The model that is written: as it came where it came from the release and was not trained since, else
-    as the release holds it. Raises ConfigError if the release could not compute it."""
-    if _untouched(run):
+def _exportable(run: Run) -> ModelConfig:
+    """The configuration that is written: the imported one if the run came from the release and was not trained since,
+    else `released_form`. Raises ConfigError if the release could not compute it."""
+    if _unchanged_since_import(run):
         return run.model
     require_official(run.model, run.table, run.train.masking.setting)
     return released_form(run.model)
 
 
-def _untouched(run: Run) -> bool:
-    """Whether it came from the release and was not trained since, nor changed in another format."""
+def _unchanged_since_import(run: Run) -> bool:
+    """Whether the run was imported from the release and neither trained nor edited since."""
     source = run.provenance.get("official")
     if not source or run.step or source["table"] != stable_hash(run.table):
         return False
@@ -226,17 +225,17 @@ def _hash_of(params: Params) -> str:
     return digest.hexdigest()[:16]
 
 
-def _without_constants(arrays: dict[str, np.ndarray], table: EmbodimentTable) -> dict[str, np.ndarray]:
-    """What action values come in by, with zeros for those that do not vary. These are 0 to this model; the release
-    divides their rounding noise by about 0 (`EmbodimentTable.normalise`)."""
+def _without_constant_actions(arrays: dict[str, np.ndarray], table: EmbodimentTable) -> dict[str, np.ndarray]:
+    """The parameters that multiply actions, with zeros for action values that do not vary: this model normalises those
+    to 0, the release divides their rounding noise by about 0 (`EmbodimentTable.normalise`)."""
     alive_EU = table.alive()
     return {path: np.where(alive_EU[..., None], arrays[path], 0) for path in ACTIONS_IN if path in arrays}
 
 
-def _same(theirs: ModelConfig, form: ModelConfig) -> bool:
+def _same(original: ModelConfig, form: ModelConfig) -> bool:
     """Whether the multipliers and everything else are equal; a base width means nothing without muP."""
-    switches = theirs.mup.enabled == form.mup.enabled
-    return theirs == form or (switches and released_form(theirs) == released_form(form))
+    switches = original.mup.enabled == form.mup.enabled
+    return original == form or (switches and released_form(original) == released_form(form))
 
 
 def _remarks(model: ModelConfig, form: ModelConfig) -> list[str]:
@@ -268,7 +267,7 @@ def _remarks(model: ModelConfig, form: ModelConfig) -> list[str]:
 
 
 def _narrow(tensor: np.ndarray, dtype: str | None) -> np.ndarray:
-    """In the type that it was read in, while nothing is lost by that."""
+    """In the type that it was imported in, unless that loses precision."""
     if dtype is None:
         return tensor
     narrow = tensor.astype(dtype)

@@ -150,13 +150,13 @@ def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
         isinstance(network, str) and network in NETWORKS,
         f"{where}: action_network {network!r} is not supported; supported are {', '.join(NETWORKS)}",
     )
-    fields = {ours: full[theirs] for theirs, ours in MODEL_FIELDS.items()}
+    fields = {field: full[official] for official, field in MODEL_FIELDS.items()}
     fields["conditioning"] = NETWORKS[network]
     base = full["d_model"] if is_continuous(config) else BASE_WIDTH
     fields["mup"] = {"enabled": full["use_mup"], "base_width": base}
     size = full["S"]
     if is_continuous(config):
-        fields["diffusion"] = {ours: full[theirs] for theirs, ours in DIFFUSION_FIELDS.items()}
+        fields["diffusion"] = {field: full[official] for official, field in DIFFUSION_FIELDS.items()}
         cells = full["patch_size"] ** 2
         require(size % cells == 0, f"{where}: S {size} latent cells do not make whole patches of {cells}")
         fields["tokens"] = size // cells
@@ -184,7 +184,7 @@ def _root(vocab: int | None, factors: int, where: str) -> int:
 def read_masking(config: Mapping[str, Any]) -> MaskingConfig:
     """How the release would go on training."""
     full = {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
-    fields = {ours: full[theirs] for theirs, ours in MASKING_FIELDS.items()}
+    fields = {field: full[official] for official, field in MASKING_FIELDS.items()}
     fields["setting"] = "full" if full["jointly_predict_actions"] else "forward"
     if is_continuous(config):
         fields |= {"mask_angle_min": full["dataloader_mask_ratio_min"], "mask_unit": "cell"}
@@ -219,8 +219,8 @@ def read_table(
 
 def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingConfig) -> dict[str, Any]:
     """The fields of an official config.json that follow from a model the release can hold (`release_limits`)."""
-    config = {theirs: getattr(model, ours) for theirs, ours in MODEL_FIELDS.items()}
-    config |= {theirs: getattr(masking, ours) for theirs, ours in MASKING_FIELDS.items()}
+    config = {official: getattr(model, field) for official, field in MODEL_FIELDS.items()}
+    config |= {official: getattr(masking, field) for official, field in MASKING_FIELDS.items()}
     config |= {
         "S": model.tokens * (model.diffusion.cells if model.diffusion else 1),
         "use_mup": model.mup.enabled,
@@ -232,7 +232,7 @@ def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingCon
         "action_stats": [[list(e.centre), list(e.unit)] for e in table.entries],
     }
     if model.diffusion:
-        config |= {theirs: getattr(model.diffusion, ours) for theirs, ours in DIFFUSION_FIELDS.items()}
+        config |= {official: getattr(model.diffusion, field) for official, field in DIFFUSION_FIELDS.items()}
         config |= {"image_vocab_size": None, "factored_vocab_size": 64}  # the release's placeholders
         config["dataloader_mask_ratio_min"] = masking.mask_angle_min
     else:

@@ -48,20 +48,20 @@ class Source:
     """How one kind is published."""
 
     tokenizer: type[BaseTokenizer]
-    fields: Mapping[str, str]  # official field of config.json -> ours
+    fields: Mapping[str, str]  # official field of config.json -> field of our configuration
     required: tuple[str, ...]  # official fields without which a config.json is not one of this kind
     fixed: Mapping[str, tuple[Any, ...]]  # official field -> values that are supported
     shortcut: str  # official name of the 1x1 convolution beside a residual block
 
-    def config(self, official: Mapping[str, Any], where: str, **ours: Any) -> Any:
+    def config(self, official: Mapping[str, Any], where: str, **given: Any) -> Any:
         """Our configuration. Raises ConfigError naming the field that is missing or not supported."""
         missing = [name for name in self.required if official.get(name) is None]
         require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
         for name, good in self.fixed.items():
             value = official.get(name, good[0])
             require(value in good, f"{where}: {name} is {value!r}, supported is {good[0]!r}")
-        known = {ours_: official[theirs] for theirs, ours_ in self.fields.items() if theirs in official}
-        return from_dict(self.tokenizer.config_class, known | ours, where)
+        known = {field: official[name] for name, field in self.fields.items() if name in official}
+        return from_dict(self.tokenizer.config_class, known | given, where)
 
     def official_name(self, path: str) -> str:
         """'decoder.conv_in.weight' of 'decoder/conv_in/kernel'."""
@@ -144,15 +144,15 @@ def read_magvit2(path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtyp
     Raises ConfigError naming what of the file is not as it should be.
     """
     path = Path(path)
-    ours: dict[str, Any] = {"image_size": image_size, "compute_dtype": compute_dtype}
+    given: dict[str, Any] = {"image_size": image_size, "compute_dtype": compute_dtype}
     if path.is_dir():
         official = read_config(path)
         bits = official.get("z_channels")
         if isinstance(bits, int) and bits % Magvit2Config.factors:
-            ours["factors"] = 1
-        config = MAGVIT2.config(official, str(path / "config.json"), **ours)
+            given["factors"] = 1
+        config = MAGVIT2.config(official, str(path / "config.json"), **given)
     else:
-        config = Magvit2Config(**ours)
+        config = Magvit2Config(**given)
     tensors = read_tensors(path)
     kept = {name: t for name, t in tensors.items() if not name.startswith(IGNORED)}
     declared = Magvit2Tokenizer.declare(config)

@@ -9,7 +9,7 @@ from typing import get_args
 import jax
 import numpy as np
 
-from hma_jax.convert.aside import written_aside
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.model.params import Use
 from hma_jax.runtime.files import write_file
 from hma_jax.training.checkpoints import Checkpoints
@@ -19,18 +19,17 @@ from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState
 
 
-def write_run(run: Run, directory: Path, beside: Mapping[str, str] | None = None) -> None:
-    """Writes a checkpoint of step 0 with an optimiser that has not moved yet, and texts beside it, by their files'
-    names.
+def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None) -> None:
+    """Writes a checkpoint of step 0 with a fresh optimiser state, and `texts`, files by name, into the run directory.
 
     Raises ConfigError if `directory` exists.
     """
-    with written_aside(directory) as aside:
+    with atomic_directory(directory) as temporary:
         meta = describe_run(run.model, run.train, run.table, run.provenance)
-        with Checkpoints(aside / CHECKPOINTS, meta) as checkpoints:
+        with Checkpoints(temporary / CHECKPOINTS, meta) as checkpoints:
             checkpoints.save(0, fresh_state(run))
-        for name, text in (beside or {}).items():
-            write_file(aside / name, text)
+        for name, text in (texts or {}).items():
+            write_file(temporary / name, text)
 
 
 def fresh_state(run: Run) -> TrainState:

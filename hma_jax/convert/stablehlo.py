@@ -21,7 +21,7 @@ from jax import export
 
 from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.config.json import to_dict
-from hma_jax.convert.aside import written_aside
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.neutral import describe_tensors
 from hma_jax.convert.table import flat, nested
 from hma_jax.convert.tensors import write_safetensors
@@ -104,13 +104,13 @@ def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
     leaves = declare_model(model, table).leaves()
     weights = {path: jax.ShapeDtypeStruct(spec.shape, jnp.float32) for path, spec in leaves.items()}
     inputs = input_shapes(model, table, config)
-    with written_aside(directory) as aside:
+    with atomic_directory(directory) as temporary:
         program = jax.jit(generate_function(model, table, masking.setting, config))
         exported = export.export(program, platforms=config.platforms)(weights, *inputs.values())
-        (aside / PROGRAM).write_bytes(exported.serialize())
-        write_safetensors(aside / WEIGHTS, {path: np.asarray(x) for path, x in flat(run.params).items()})
+        (temporary / PROGRAM).write_bytes(exported.serialize())
+        write_safetensors(temporary / WEIGHTS, {path: np.asarray(x) for path, x in flat(run.params).items()})
         description = _describe(run, config, inputs, exported)
-        (aside / DESCRIPTION).write_text(json.dumps(description, indent=1))
+        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=1))
 
 
 MEANINGS = {

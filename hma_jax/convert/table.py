@@ -1,10 +1,10 @@
-"""Which official tensor is which part of which parameter of ours: one table, read in both directions.
+"""Which official tensor is which part of which of our parameters: one table, read in both directions.
 
-An entry names a parameter of ours, the official tensors it is made of, and an einops pattern from
-one of its slices to the official layout; read backwards the pattern is the inverse. Of the axes
-that we stack (layers N, robots E, factors Q) every index is an official tensor of its own where
-the official name has a place for it. A robot's slice is cut to its own chunk along U: what lies
-beyond is padding, which is zero and without influence. Facts: reference sections 8.3 and 8.4.
+An entry has the path of one of our parameters, the names of the official tensors it is made of, and an einops pattern
+from one of its slices to the official layout; read backwards the pattern is the inverse. Along an axis that we stack
+(layers N, robots E, factors Q) every index is an official tensor of its own if the official name has a placeholder for
+it. A robot's slice is cut to its own chunk along U: what lies beyond is padding, which is zero and without influence.
+Facts: reference sections 8.3 and 8.4.
 """
 
 from __future__ import annotations
@@ -24,59 +24,59 @@ from hma_jax.convert.tensors import Stored, read_finite
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
 
-PLACES = {LAYER_AXIS: "{layer}", EMBODIMENT_AXIS: "{robot}", "Q": "{factor}"}
-"""Where the index of a stacked axis stands in an official name."""
+PLACEHOLDERS = {LAYER_AXIS: "{layer}", EMBODIMENT_AXIS: "{robot}", "Q": "{factor}"}
+"""In an official name: where the index along a stacked axis, or the robot's name, goes."""
 
 LINEAR = "i o -> o i"
 SAME = "d -> d"
 
 
 class Entry(NamedTuple):
-    ours: str  # path of a parameter
-    official: str  # names of its tensors
-    pattern: str  # einops, one slice of ours -> the official tensor
+    path: str  # of our parameter
+    official: str  # name of its tensors, with placeholders
+    pattern: str  # einops: one slice of our parameter -> the official tensor
 
 
-def _linear(ours: str, official: str) -> tuple[Entry, ...]:
+def _linear(path: str, official: str) -> tuple[Entry, ...]:
     return (
-        Entry(f"{ours}/kernel", f"{official}.weight", LINEAR),
-        Entry(f"{ours}/bias", f"{official}.bias", SAME),
+        Entry(f"{path}/kernel", f"{official}.weight", LINEAR),
+        Entry(f"{path}/bias", f"{official}.bias", SAME),
     )
 
 
-def _norm(ours: str, official: str) -> tuple[Entry, ...]:
+def _norm(path: str, official: str) -> tuple[Entry, ...]:
     return (
-        Entry(f"{ours}/gain", f"{official}.weight", SAME),
-        Entry(f"{ours}/bias", f"{official}.bias", SAME),
+        Entry(f"{path}/gain", f"{official}.weight", SAME),
+        Entry(f"{path}/bias", f"{official}.bias", SAME),
     )
 
 
-def _attention(ours: str, official: str) -> tuple[Entry, ...]:
+def _attention(path: str, official: str) -> tuple[Entry, ...]:
     return (
-        Entry(f"{ours}/qkv", f"{official}.qkv.weight", "d c h i -> (c h i) d"),
-        Entry(f"{ours}/qkv_bias", f"{official}.qkv.bias", "c h i -> (c h i)"),
-        Entry(f"{ours}/out", f"{official}.proj.weight", "h i d -> d (h i)"),
-        Entry(f"{ours}/out_bias", f"{official}.proj.bias", SAME),
-        *_norm(f"{ours}/norm", f"{official}.norm"),
+        Entry(f"{path}/qkv", f"{official}.qkv.weight", "d c h i -> (c h i) d"),
+        Entry(f"{path}/qkv_bias", f"{official}.qkv.bias", "c h i -> (c h i)"),
+        Entry(f"{path}/out", f"{official}.proj.weight", "h i d -> d (h i)"),
+        Entry(f"{path}/out_bias", f"{official}.proj.bias", SAME),
+        *_norm(f"{path}/norm", f"{official}.norm"),
     )
 
 
-def _denoiser(ours: str, official: str, depth: int) -> tuple[Entry, ...]:
+def _denoiser(path: str, official: str, depth: int) -> tuple[Entry, ...]:
     entries = [
-        *_linear(f"{ours}/time_in", f"{official}.time_embed.mlp.0"),
-        *_linear(f"{ours}/time_out", f"{official}.time_embed.mlp.2"),
-        *_linear(f"{ours}/condition", f"{official}.cond_embed"),
-        *_linear(f"{ours}/into", f"{official}.input_proj"),
-        *_linear(f"{ours}/modulation", f"{official}.final_layer.adaLN_modulation.1"),
-        Entry(f"{ours}/out", f"{official}.final_layer.linear.weight", "f k c -> (k c) f"),
-        Entry(f"{ours}/out_bias", f"{official}.final_layer.linear.bias", "k c -> (k c)"),
+        *_linear(f"{path}/time_in", f"{official}.time_embed.mlp.0"),
+        *_linear(f"{path}/time_out", f"{official}.time_embed.mlp.2"),
+        *_linear(f"{path}/condition", f"{official}.cond_embed"),
+        *_linear(f"{path}/into", f"{official}.input_proj"),
+        *_linear(f"{path}/modulation", f"{official}.final_layer.adaLN_modulation.1"),
+        Entry(f"{path}/out", f"{official}.final_layer.linear.weight", "f k c -> (k c) f"),
+        Entry(f"{path}/out_bias", f"{official}.final_layer.linear.bias", "k c -> (k c)"),
     ]
     for j in range(depth):
-        block, theirs = f"{ours}/blocks/{j}", f"{official}.res_blocks.{j}"
-        entries += _norm(f"{block}/norm", f"{theirs}.in_ln")
-        entries += _linear(f"{block}/into", f"{theirs}.mlp.0")
-        entries += _linear(f"{block}/out", f"{theirs}.mlp.2")
-        entries += _linear(f"{block}/modulation", f"{theirs}.adaLN_modulation.1")
+        block, official_block = f"{path}/blocks/{j}", f"{official}.res_blocks.{j}"
+        entries += _norm(f"{block}/norm", f"{official_block}.in_ln")
+        entries += _linear(f"{block}/into", f"{official_block}.mlp.0")
+        entries += _linear(f"{block}/out", f"{official_block}.mlp.2")
+        entries += _linear(f"{block}/modulation", f"{official_block}.adaLN_modulation.1")
     return tuple(entries)
 
 
@@ -127,7 +127,7 @@ CROSS_ATTENTION = (
 
 
 def entries_of(model: ModelConfig) -> dict[str, Entry]:
-    """Our path -> its entry; also of parameters that the model's switches leave out."""
+    """The entry of each of our parameters, by path; also of parameters that the model's switches leave out."""
     entries = [*SHARED, *(CROSS_ATTENTION if model.conditioning == "cross_attention" else MODULATION)]
     if model.diffusion:
         depth = model.diffusion.depth
@@ -136,7 +136,7 @@ def entries_of(model: ModelConfig) -> dict[str, Entry]:
         entries += _denoiser("action_head/robots", "action_diff_losses.{robot}.net", depth)
     else:
         entries += DISCRETE
-    return {entry.ours: entry for entry in entries}
+    return {entry.path: entry for entry in entries}
 
 
 # --- One official tensor as a part of one parameter --------------------------------------------
@@ -144,7 +144,7 @@ def entries_of(model: ModelConfig) -> dict[str, Entry]:
 
 @dataclass(frozen=True)
 class Part:
-    """`ours[index]` is the official tensor `name`, up to `pattern`."""
+    """`path[index]` is the official tensor `name`, up to `pattern`."""
 
     name: str
     index: tuple[int | slice, ...]
@@ -168,7 +168,7 @@ class Part:
 
 def parts_of(entry: Entry, spec: ParamSpec, table: EmbodimentTable) -> Iterator[Part]:
     """The official tensors that a parameter consists of."""
-    stacked = [axis for axis in spec.axes if axis in PLACES and PLACES[axis] in entry.official]
+    stacked = [axis for axis in spec.axes if axis in PLACEHOLDERS and PLACEHOLDERS[axis] in entry.official]
     axes, shape = spec.axes[len(stacked) :], spec.shape[len(stacked) :]
     for index in np.ndindex(spec.shape[: len(stacked)]):
         where = dict(zip(stacked, index, strict=True))

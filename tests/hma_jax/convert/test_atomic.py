@@ -4,45 +4,45 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
-from hma_jax.convert.aside import written_aside
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.tensors import write_safetensors
 from tests.full_disk import full_disk
 
 
 def test_a_directory_appears_whole_or_not_at_all(tmp_path):
-    with pytest.raises(KeyError), written_aside(tmp_path / "out") as aside:
-        (aside / "a").touch()
+    with pytest.raises(KeyError), atomic_directory(tmp_path / "out") as temporary:
+        (temporary / "a").touch()
         raise KeyError
     assert not list(tmp_path.iterdir())
-    with written_aside(tmp_path / "out") as aside:
-        (aside / "a").touch()
+    with atomic_directory(tmp_path / "out") as temporary:
+        (temporary / "a").touch()
         assert not (tmp_path / "out").exists()
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
-    with pytest.raises(ConfigError, match="out exists already"), written_aside(tmp_path / "out"):
+    with pytest.raises(ConfigError, match="out exists already"), atomic_directory(tmp_path / "out"):
         pass
 
 
 def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
-    with pytest.raises(KeyError), written_aside(tmp_path / "out") as aside:
+    with pytest.raises(KeyError), atomic_directory(tmp_path / "out") as temporary:
         raise KeyError
-    aside.mkdir()
-    (aside / "half").touch()
-    with written_aside(tmp_path / "out") as aside:
-        (aside / "a").touch()
+    temporary.mkdir()
+    (temporary / "half").touch()
+    with atomic_directory(tmp_path / "out") as temporary:
+        (temporary / "a").touch()
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
 
 
 def test_a_full_disk_is_said_of_the_place_and_leaves_nothing(tmp_path):
     weights = {"one": np.zeros(9000, np.float32)}
     for write in (lambda path: path.write_text("a" * 9000), lambda path: write_safetensors(path, weights)):
-        with full_disk(1000), pytest.raises(OSError, match="out.*"), written_aside(tmp_path / "out") as aside:
-            write(aside / "model.safetensors")
+        with full_disk(1000), pytest.raises(OSError, match="out.*"), atomic_directory(tmp_path / "out") as temporary:
+            write(temporary / "model.safetensors")
         assert not list(tmp_path.iterdir())
 
 
 def test_two_that_write_to_one_place_do_not_meet(tmp_path):
-    with written_aside(tmp_path / "out") as aside:
-        (aside / "a").touch()
-        with pytest.raises(ConfigError, match="out is being written .process"), written_aside(tmp_path / "out"):
+    with atomic_directory(tmp_path / "out") as temporary:
+        (temporary / "a").touch()
+        with pytest.raises(ConfigError, match="out is being written .process"), atomic_directory(tmp_path / "out"):
             pass
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]

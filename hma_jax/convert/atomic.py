@@ -1,4 +1,4 @@
-"""Directories that are never seen half written."""
+"""Directories that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ def require_free(directory: Path) -> None:
 
 
 @contextmanager
-def written_aside(directory: Path) -> Iterator[Path]:
-    """A new directory to write into, which takes the place of `directory` when the block ends well. One that a killed
-    process left half written is removed.
+def atomic_directory(directory: Path) -> Iterator[Path]:
+    """A temporary directory to write into, renamed to `directory` when the block succeeds. One that a killed process
+    left behind is removed.
 
     Raises ConfigError if something is there already, if nothing can be written there, or while another process writes
     there.
     """
     directory = Path(directory).absolute()
-    aside, lock = (directory.with_name(f".{directory.name}.{kind}") for kind in ("tmp", "lock"))
+    temporary, lock = (directory.with_name(f".{directory.name}.{kind}") for kind in ("tmp", "lock"))
     with ExitStack() as stack:
         try:
             directory.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(exclusive(lock, remove=True))
             require_free(directory)
-            shutil.rmtree(aside, ignore_errors=True)
-            aside.mkdir()
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir()
         except Held as held:
             raise ConfigError(f"{directory} is being written ({held.who}); choose another output directory") from None
         except OSError as error:
             raise unwritable(directory, error) from error
-        stack.callback(shutil.rmtree, aside, ignore_errors=True)
+        stack.callback(shutil.rmtree, temporary, ignore_errors=True)
         with naming(directory):
-            yield aside
-        os.replace(aside, directory)
+            yield temporary
+        os.replace(temporary, directory)
