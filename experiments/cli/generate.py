@@ -79,7 +79,7 @@ def generate(
         run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,
         decode=decode, history=1,
     )  # fmt: skip
-    if simulator.deaf:
+    if simulator.ignores_actions:
         say(f"note: {DEAF}")
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None

@@ -78,7 +78,7 @@ def play(
             f"note: not on the page: {few(missing)}; there are no held-out frames here to start from, as of robots that "
             "the model knew before it was given others"
         )
-    if simulator.deaf:
+    if simulator.ignores_actions:
         say(f"note: {DEAF}")
     say(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling")
     warm_up(simulator, together=1)

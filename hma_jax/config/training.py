@@ -119,7 +119,7 @@ class MaskingConfig:
         return self.setting in PREDICT_ACTIONS
 
     @property
-    def deaf(self) -> bool:
+    def ignores_actions(self) -> bool:
         """Whether frames are predicted without actions, so that none has an effect."""
         return self.setting == "passive"
 

@@ -68,7 +68,7 @@ class Programs:
     def __init__(self, model: Model, tokenizer: BaseTokenizer, episodes: int, decode: DecodeConfig):
         self.weights = Weights(model.params, tokenizer.params)
         declared, room = model.declared, model.config.frames - 1
-        hidden = model.run.train.masking.deaf
+        hidden = model.run.train.masking.ignores_actions
         decoded: Callable[[Weights, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(w.tokenizer, x)
 
         def fresh(weights: Weights, tokens: jax.Array, at: Beginning) -> Episodes:

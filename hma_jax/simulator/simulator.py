@@ -124,9 +124,9 @@ class Simulator:
         return tuple(0 if e is None else e.count for e in self._episodes)
 
     @property
-    def deaf(self) -> bool:
+    def ignores_actions(self) -> bool:
         """Whether the model was trained without actions, so that none has an effect."""
-        return self.model.run.train.masking.deaf
+        return self.model.run.train.masking.ignores_actions
 
     def describe(self, robots: Sequence[Robot]) -> None:
         """Takes better descriptions of robots, for episodes that begin from now on. ConfigError if one does not fit."""

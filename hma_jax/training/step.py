@@ -148,7 +148,7 @@ def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
 
 def check_own(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
     """Raises ConfigError if nothing that only these robots have would move, however long it is trained."""
-    shown = not masking.deaf or masking.action_leak != "none"
+    shown = not masking.ignores_actions or masking.action_leak != "none"
     require(
         shown and any(robot.chunk for robot in robots),
         f"train.only: nothing that {', '.join(robot.name for robot in robots)} alone has would be trained: all of it is of "

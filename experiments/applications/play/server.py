@@ -103,7 +103,7 @@ def describe(simulator: Simulator, truth: Truth) -> list[dict]:
             **to_dict(robot),
             "starts": [picture(start.images[-1]) for start in starts],
             "first": [command(robot, s.actions[-1] if len(s.actions) else None) for s in starts],
-            "deaf": simulator.deaf,
+            "deaf": simulator.ignores_actions,
             "truth": truth(robot) is not None and all(start.seed is not None for start in starts),
         })  # fmt: skip
     return described
