@@ -20,7 +20,7 @@ from experiments.running.workspace import Workspace
 from experiments.setting import command_words
 from experiments.words import few
 from hma_jax.config import require
-from hma_jax.evaluation.effects import FEWEST, Effect, find_effects, make_loss
+from hma_jax.evaluation.effects import MIN_EPISODES, Effect, find_effects, make_loss
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_robots
 from hma_jax.simulator.robots import Robot
@@ -80,16 +80,16 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
     """What took how many, if so many `windows` of a robot are of too few episodes; None if they are of enough."""
     (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
     judged, of_all = (len({episode for episode, _ in some}) for some in (spread(frozen, windows), frozen))
-    if judged >= FEWEST:
+    if judged >= MIN_EPISODES:
         return None
     there = store.manifest(robot)
     held_out, settings = len(there.val.steps), there.settings
-    if of_all >= FEWEST:
+    if of_all >= MIN_EPISODES:
         why = (
             f"--windows {windows} takes {judged} of the {of_all} episodes that the {len(frozen)} windows there are of; "
             "give more"
         )
-    elif held_out >= FEWEST:
+    elif held_out >= MIN_EPISODES:
         why = (
             f"{held_out} are held out, and the {len(frozen)} frozen windows are of {of_all} of them: "
             "eval.windows_per_dataset took no more, or the others are too short. Freeze more with `hma tokenize ... "
@@ -104,20 +104,20 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
             f"store.val_fraction={settings.val_fraction:g} and at most "
             f"store.max_val_fraction={settings.max_val_fraction:g}. {_hold_out_more(settings, episodes)}"
         )
-    return f"{robot} has {judged} episodes to be judged; what actions do is told from at least {FEWEST}. {why}"
+    return f"{robot} has {judged} episodes to be judged; what actions do is told from at least {MIN_EPISODES}. {why}"
 
 
 def _hold_out_more(settings: JobSettings, episodes: int) -> str:
-    """How to have FEWEST of so many held out."""
+    """How to have MIN_EPISODES of so many held out."""
     for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
         count = count_held_out(episodes, settings.val_fraction, AT_LEAST, max(AT_LEAST, settings.max_val), share)
-        if count >= FEWEST:
+        if count >= MIN_EPISODES:
             return (
                 "It is judged on episodes that it was not trained on: tokenise and train in another --out, with --set "
                 f"store.min_val={AT_LEAST}{more} from the first command on ({count} of {episodes} are held out then)"
             )
     return (
-        f"No setting holds out {FEWEST} of {episodes}, half of them at most: record more, or name the dataset's own "
+        f"No setting holds out {MIN_EPISODES} of {episodes}, half of them at most: record more, or name the dataset's own "
         "validation split in its entry (split and val_split), if it has one"
     )
 

@@ -40,7 +40,7 @@ from experiments.progress import say, step
 from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
-from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
+from hma_jax.evaluation.detector import Detections, DetectorParams, detect, init_detector, points_loss
 from hma_jax.kernels.random import key_of
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.robots import Robot
@@ -79,20 +79,20 @@ BLOCK = 64
 class Detector:
     """Trained weights, and the robots they were trained on, in the order of the weights."""
 
-    def __init__(self, weights: Weights, robots: Sequence[str]):
+    def __init__(self, weights: DetectorParams, robots: Sequence[str]):
         self.weights, self.robots = weights, tuple(robots)
-        self._watch = jax.jit(watch)
+        self._detect = jax.jit(detect)
 
-    def detect(self, robot: str, frames: np.ndarray) -> Found:
+    def detect(self, robot: str, frames: np.ndarray) -> Detections:
         """The robot's P points in frames uint8 [n, H, W, 3]. Raises ConfigError for one it was not trained on."""
         require(robot in self.robots, f"the detector was not trained on {robot}; it knows {', '.join(self.robots)}")
         index, count, parts = self.robots.index(robot), len(point_names(SPECS[robot])), []
         for first in range(0, len(frames), BLOCK):
             part = frames[first : first + BLOCK]
             filled = np.concatenate([part, np.repeat(part[-1:], BLOCK - len(part), 0)])
-            found = self._watch(self.weights, filled, index)
+            found = self._detect(self.weights, filled, index)
             parts.append([np.asarray(x)[: len(part), :count] for x in found])
-        return Found(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+        return Detections(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     def save(self, path: Path) -> None:
         weights = {name: np.asarray(x, np.float16) for name, x in self.weights.items()}

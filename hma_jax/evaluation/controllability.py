@@ -4,13 +4,14 @@
   the same robot, in nats per token (continuous: in units of the diffusion loss, at common noise). Paired, over all
   tokens, and in distribution, where random actions of delta PSNR are none that the robot was ever given.
 * retrieval: how often the true actions give the recorded frames the highest likelihood among them and those of the
-  other episodes. Of sequences that are equally likely each is taken with equal chance: a model that is deaf to
-  actions finds the true ones one time in sixteen, exactly.
+  other episodes. Of sequences that are equally likely each is taken with equal chance: a model that
+  ignores actions finds the true ones one time in sixteen, exactly.
 * counterfactual PSNR: a rollout under another episode's actions against the true frames under those actions, where a
   simulator made them. Its gain is over the rollout under the recorded actions, compared with the same frames: more
   than zero only if the model goes where the other actions lead.
 
-Every sequence is judged by one program, one after the other, so that equal likelihoods are equal to the last bit.
+Every sequence is evaluated by the same program, one after the other, so that equal likelihoods are equal to the last
+bit.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 
 from hma_jax.evaluation.metrics import mean_over_frames, psnr
 
-OPTIONAL = (
+OPTIONAL_METRICS = (
     "action_nats",
     "retrieval",
     "retrieval_rank",
@@ -34,23 +35,23 @@ OPTIONAL = (
     "action_error_of_mean",
     "action_gain",
 )
-"""Metrics that some windows have not (nan): there is no other episode, nobody simulates their robot, or it has no
-actions to predict."""
+"""Metrics that are nan for some windows: there is no other episode, no simulator of the robot, or it has no actions to
+predict."""
 
 
-def under_each(
-    judge: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BNTU: jax.Array
+def for_each_sequence(
+    evaluate: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BNTU: jax.Array
 ) -> dict[str, jax.Array]:
-    """`judge`, which maps actions [B, T, U] to numbers of each window [B], of the true ones and all others:
-    [1 + N, B]."""
+    """`evaluate`, which maps actions [B, T, U] to metrics of each window [B], applied to the true sequence and to each
+    of the others, in turn: [1 + N, B]."""
     sequences = jnp.concatenate([actions_BTU[:, None], others_BNTU], axis=1)
-    return jax.lax.map(judge, jnp.moveaxis(sequences, 1, 0))
+    return jax.lax.map(evaluate, jnp.moveaxis(sequences, 1, 0))
 
 
-def told_apart(loss_NB: jax.Array, valid_BN: jax.Array) -> dict[str, jax.Array]:
+def action_metrics(loss_NB: jax.Array, valid_BN: jax.Array) -> dict[str, jax.Array]:
     """Action-nats and retrieval, [B] each, nan where no other sequence is valid.
 
-    `loss_NB` [1 + N, B]: of the true actions, then of the others, of which those count that `valid_BN` says.
+    `loss_NB` [1 + N, B]: under the true actions, then under the others, of which those marked in `valid_BN` count.
     """
     truth, others, valid = loss_NB[0], loss_NB[1:], valid_BN.T
     count = jnp.sum(valid, axis=0)

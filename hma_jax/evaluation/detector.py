@@ -1,7 +1,7 @@
-"""A small network that finds points in a robot's frames, by heatmaps: its tools, and objects by their colour.
+"""A keypoint detector: a small network that finds a robot's tools, and objects by their colour, by heatmaps.
 
-One trunk for all robots, an output of its own for each. The peak of a point's heatmap says whether it is there at all,
-the cells around the peak where. Pure functions of arrays; who trains it, and on what, is not its business.
+One backbone for all robots, and an output layer for each. The height of a heatmap's peak is the point's confidence, the
+cells around the peak give its position. Pure functions of arrays; training data and loop are the caller's.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-Weights = dict[str, jax.Array]
+DetectorParams = dict[str, jax.Array]
 
 CELL = 2
 """Pixels of a frame per cell of a heatmap."""
 
-SPREAD = 1.0
-"""Standard deviation of a point's heat, in cells."""
+HEAT_STD = 1.0
+"""Standard deviation of a point's target heat, in cells."""
 
-AROUND = 2
-"""Cells on each side of the peak that say where it is."""
+PEAK_RADIUS = 2
+"""Cells on each side of the peak that its position is averaged over."""
 
 LAYERS = {
     "half": (4, 3, 16), "half2": (3, 16, 24), "quarter": (3, 24, 32), "quarter2": (3, 32, 32), "eighth": (3, 32, 64),
@@ -30,14 +30,15 @@ LAYERS = {
 """Convolutions: side, channels in, channels out."""
 
 
-class Found(NamedTuple):
-    """P points in n frames: float32 [n, P, 2] in pixels (column, row), and how sure it is there, [n, P] in [0, 1]."""
+class Detections(NamedTuple):
+    """P points in n frames: float32 [n, P, 2] in pixels (column, row), and the confidence that each is there, [n, P] in
+    [0, 1]."""
 
     position: jax.Array
     confidence: jax.Array
 
 
-def init_detector(key: jax.Array, robots: int, points: int) -> Weights:
+def init_detector(key: jax.Array, robots: int, points: int) -> DetectorParams:
     """For `robots` robots of at most `points` points, and frames whose sides are multiples of 8 pixels."""
     shapes = {name: (side, side, a, b) for name, (side, a, b) in LAYERS.items()}
     shapes["heads"] = (robots, LAYERS["merge_half"][2], points)
@@ -50,7 +51,7 @@ def init_detector(key: jax.Array, robots: int, points: int) -> Weights:
     return weights | {"heads_bias": jnp.full((robots, points), -4.0, jnp.float32)}
 
 
-def _conv(weights: Weights, name: str, x: jax.Array, stride: int = 1) -> jax.Array:
+def _conv(weights: DetectorParams, name: str, x: jax.Array, stride: int = 1) -> jax.Array:
     dims = ("NHWC", "HWIO", "NHWC")
     out = jax.lax.conv_general_dilated(x, weights[name], (stride, stride), "SAME", dimension_numbers=dims)
     return out + weights[name + "_bias"]
@@ -60,7 +61,7 @@ def _twice(x: jax.Array) -> jax.Array:
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
 
 
-def look(weights: Weights, images: jax.Array, robot_n: jax.Array) -> jax.Array:
+def heat_logits(weights: DetectorParams, images: jax.Array, robot_n: jax.Array) -> jax.Array:
     """Heat logits [n, H / 2, W / 2, P] of frames [n, H, W, 3] in 0..255."""
     act = jax.nn.relu
     x = images.astype(jnp.float32) / 127.5 - 1.0
@@ -73,41 +74,46 @@ def look(weights: Weights, images: jax.Array, robot_n: jax.Array) -> jax.Array:
     return heat + weights["heads_bias"][robot_n][:, None, None]
 
 
-def watch(weights: Weights, film: jax.Array, robot: jax.Array) -> Found:
-    """Points in all frames of one robot's film [n, H, W, 3]."""
-    return locate(look(weights, film, jnp.full(len(film), robot)))
+def detect(weights: DetectorParams, frames: jax.Array, robot: jax.Array) -> Detections:
+    """Points in frames [n, H, W, 3] of one `robot`, its index."""
+    return locate_peaks(heat_logits(weights, frames, jnp.full(len(frames), robot)))
 
 
-def locate(heat: jax.Array) -> Found:
-    """Points from heat logits [n, h, w, P]: where the heat around the highest cell has its middle."""
+def locate_peaks(heat: jax.Array) -> Detections:
+    """Points from heat logits [n, h, w, P]: the centroid of the heat around the highest cell."""
     count, height, width, points = heat.shape
     warm = jax.nn.sigmoid(heat)
     peak = jnp.argmax(warm.reshape(count, -1, points), axis=1)  # [n, P]
     row, column = (x[:, None, None] for x in (peak // width, peak % width))
     rows, columns = jnp.arange(height)[None, :, None, None], jnp.arange(width)[None, None, :, None]
-    near = (jnp.abs(rows - row) <= AROUND) & (jnp.abs(columns - column) <= AROUND)
+    near = (jnp.abs(rows - row) <= PEAK_RADIUS) & (jnp.abs(columns - column) <= PEAK_RADIUS)
     part = jnp.where(near, warm, 0.0)
     total = part.sum((1, 2))
     middle = jnp.stack([(part * columns).sum((1, 2)), (part * rows).sum((1, 2))], -1) / total[..., None]
-    return Found(middle * CELL + (CELL - 1) / 2, warm.max((1, 2)))
+    return Detections(middle * CELL + (CELL - 1) / 2, warm.max((1, 2)))
 
 
-def heat_of(position: jax.Array, there: jax.Array, cells: int) -> jax.Array:
-    """The heat [n, cells, cells, P] that points at `position` [n, P, 2] should have; none where not `there` [n, P]."""
+def target_heat(position: jax.Array, there: jax.Array, cells: int) -> jax.Array:
+    """Target heat [n, cells, cells, P] of points at `position` [n, P, 2]: Gaussians, 0 where not `there` [n, P]."""
     at = (position - (CELL - 1) / 2) / CELL
     column, row = at[:, None, None, :, 0], at[:, None, None, :, 1]
     grid = jnp.arange(cells, dtype=jnp.float32)
     away = (grid[None, None, :, None] - column) ** 2 + (grid[None, :, None, None] - row) ** 2
-    return jnp.exp(-away / (2 * SPREAD**2)) * there[:, None, None]
+    return jnp.exp(-away / (2 * HEAT_STD**2)) * there[:, None, None]
 
 
 def points_loss(
-    weights: Weights, images: jax.Array, robot_n: jax.Array, position: jax.Array, there: jax.Array, known: jax.Array
+    weights: DetectorParams,
+    images: jax.Array,
+    robot_n: jax.Array,
+    position: jax.Array,
+    there: jax.Array,
+    known: jax.Array,
 ) -> jax.Array:
     """Of frames [n, H, W, 3] with points [n, P, 2], there or not [n, P], of which `known` [n, P] are the robot's: the
     cross-entropy of all cells, above its least value."""
-    heat = look(weights, images, robot_n)
-    wanted = heat_of(position, there, heat.shape[1])
+    heat = heat_logits(weights, images, robot_n)
+    wanted = target_heat(position, there, heat.shape[1])
     cost = jax.nn.softplus(heat) - wanted * heat
     least = jax.scipy.special.entr(wanted) + jax.scipy.special.entr(1 - wanted)
     asked = known[:, None, None]

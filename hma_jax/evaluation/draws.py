@@ -33,7 +33,7 @@ def window_keys(
 ) -> jax.Array:
     """A key for each window, [B]."""
     base = jax.random.fold_in(key_of(seed), get_args(Purpose).index(purpose))
-    name_E = jnp.asarray([_number(name) for name in table.names], jnp.uint32)
+    name_E = jnp.asarray([_hash_of(name) for name in table.names], jnp.uint32)
 
     def one(*name: jax.Array) -> jax.Array:
         key = base
@@ -54,8 +54,8 @@ def random_actions(
 ) -> jax.Array:
     """[B, draws, T = frames, U]: N(mean, std) of each robot's own actions; 0 in the padding.
 
-    `statistics`, float32 [B, U] each, are to be of all recorded actions, for a table may be of those only that a
-    model was trained on; without, they are the table's.
+    `statistics` (mean, std), float32 [B, U] each, should be of all recorded actions: a table's may be of the training
+    subset only. None: the table's.
 
     Every value of a chunk has a key of its own: a wider robot in the table adds keys and changes none.
     Bit for bit the same in batches of any shape.
@@ -64,13 +64,13 @@ def random_actions(
     of_window = jax.vmap(jax.random.fold_in, (None, 0))
     key_BU = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
     noise = jnp.moveaxis(draw_flat(_normal, key_BU, (draws, frames)), 1, -1)
-    mean_BU, std_BU = statistics or own_statistics(embodiment_B, table)
+    mean_BU, std_BU = statistics or table_statistics(embodiment_B, table)
     # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
     from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)
     return mean_BU[:, None, None] + from_mean
 
 
-def own_statistics(embodiment_B: jax.Array, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
+def table_statistics(embodiment_B: jax.Array, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
     """(mean, std), [B, U] each, of the table."""
     mean_EU, std_EU = table.statistics()
     return jnp.asarray(mean_EU)[embodiment_B], jnp.asarray(std_EU)[embodiment_B]
@@ -92,6 +92,6 @@ def _normal(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Arr
     return jnp.asarray(_quantiles(), dtype)[jax.random.bits(key, shape, jnp.uint32) >> 16]
 
 
-def _number(name: str) -> np.uint32:
-    """The same for a name everywhere and always."""
+def _hash_of(name: str) -> np.uint32:
+    """The same on every machine and in every version: results depend on it."""
     return np.frombuffer(hashlib.sha256(name.encode()).digest()[:4], "<u4")[0]

@@ -1,9 +1,9 @@
 """What each action dimension does to a model's frames, and whether that is what it did when they were recorded.
 
-Recorded frames are judged under the recorded actions and under changed ones: one dimension held still, negated,
-scaled, or exchanged with another. A dimension that the model listens to makes the recorded frames less likely when it
-is held still; one whose sign, scale or place differs from what the model learnt makes them *more* likely when it is
-changed back. No simulator and no other recording is needed: the frames themselves say what the action did.
+The loss of recorded frames is compared under the recorded actions and under changed ones: one dimension held still,
+negated, scaled, or exchanged with another. If the model uses a dimension, holding it still makes the recorded frames
+less likely; if a dimension's sign, scale or position differs from the training data, changing it back makes them *more*
+likely. No simulator and no other recording is needed: the frames show what the action did.
 
 Changes are of raw values, as a robot's driver would get them wrong. Differences are paired by window and their errors
 clustered by episode.
@@ -37,17 +37,17 @@ Kind = Literal["still", "negated", "scaled", "swapped"]
 FACTORS = (1 / 50, 1 / 10, 1 / 3, 3.0, 10.0, 50.0)
 """By which a dimension is scaled to see whether the frames fit better then."""
 
-PAIRS = 45
+MAX_SWAPS = 45
 """Exchanges of two dimensions that are tried at most: all of up to ten; of more dimensions, those between the ones that
 make the frames no likelier as they are."""
 
-LISTENS, DIFFERS = 2.0, 3.0
-"""Standard errors from which on a difference counts: of holding a dimension still, and (of many changes the best one)
-of a change back."""
+MIN_LOSS_ERRORS, MIN_GAIN_ERRORS = 2.0, 3.0
+"""Standard errors from which on a difference counts: of the loss from holding a dimension still, and of the gain from
+the best of many changes."""
 
 
-FEWEST = 4
-"""Episodes: of fewer their spread is hardly known."""
+MIN_EPISODES = 4
+"""Episodes that a standard error needs at least."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Change:
     other: int = -1  # of `swapped`
 
     @property
-    def concerns(self) -> tuple[int, ...]:
+    def dimensions(self) -> tuple[int, ...]:
         """The dimensions whose values it changes."""
         return (self.dimension, self.other) if self.kind == "swapped" else (self.dimension,)
 
@@ -107,40 +107,43 @@ class Effect:
 
     @property
     def ignored(self) -> bool:
-        """Nothing is lost without it."""
-        return self.worth.errors < LISTENS
+        """Whether holding the dimension still costs nothing that counts."""
+        return self.worth.errors < MIN_LOSS_ERRORS
 
 
-Judge = Callable[[np.ndarray], np.ndarray]
+LossFn = Callable[[np.ndarray], np.ndarray]
 """Losses [n] of recorded windows under actions [n, T, stride, A]."""
 
 
-def find_effects(judge: Judge, actions: np.ndarray, mean: np.ndarray, episode: Sequence[int]) -> list[Effect]:
+def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode: Sequence[int]) -> list[Effect]:
     """One per dimension of `actions` [n, T, stride, A], whose windows are of `episode` [n].
 
-    What helps most is changed back first, and the rest is judged again: a wrong dimension makes others look wrong.
-    Raises ConfigError for fewer than FEWEST episodes, too few for a standard error.
+    Greedy: the change that helps most is applied first, then the rest is evaluated again, since a wrong dimension makes
+    others look wrong.
+    Raises ConfigError for fewer than MIN_EPISODES episodes, too few for a standard error.
     """
     there = len(set(episode))
-    require(there >= FEWEST, f"{there} episodes; what actions do is told from at least {FEWEST}")
-    count, losses = actions.shape[-1], judge(actions)
+    require(there >= MIN_EPISODES, f"{there} episodes; what actions do is told from at least {MIN_EPISODES}")
+    count, losses = actions.shape[-1], loss_of(actions)
     found: dict[int, tuple[Change, Difference]] = {}
     while len(found) < count:
-        still = [judge(Change(d, "still")(actions, mean)) for d in range(count)]
+        still = [loss_of(Change(d, "still")(actions, mean)) for d in range(count)]
         tried: dict[Change, np.ndarray] = {}
         for change in _changes(count, found, still, losses, episode):
-            after = judge(change(actions, mean))
-            helps = _clustered(after - losses, episode).errors < -DIFFERS
-            # A value that is merely harmful is best left out, whatever else is done to it.
-            if helps and all(_clustered(after - still[d], episode).errors < -LISTENS for d in change.concerns):
+            after = loss_of(change(actions, mean))
+            helps = _clustered(after - losses, episode).errors < -MIN_GAIN_ERRORS
+            # If holding it still helps as much, the value is merely harmful, not changed in this way.
+            if helps and all(
+                _clustered(after - still[d], episode).errors < -MIN_LOSS_ERRORS for d in change.dimensions
+            ):
                 tried[change] = after
         if not tried:
             break
         best = min(tried, key=lambda change: float(tried[change].mean()))
         gain = _clustered(tried[best] - losses, episode)
-        found |= dict.fromkeys(best.concerns, (best, gain))
+        found |= dict.fromkeys(best.dimensions, (best, gain))
         actions, losses = best(actions, mean), tried[best]
-    worth = [_clustered(judge(Change(d, "still")(actions, mean)) - losses, episode) for d in range(count)]
+    worth = [_clustered(loss_of(Change(d, "still")(actions, mean)) - losses, episode) for d in range(count)]
     return [Effect(d, worth[d], *found.get(d, (None, None))) for d in range(count)]
 
 
@@ -153,9 +156,9 @@ def _changes(
         yield Change(d, "negated")
         yield from (Change(d, "scaled", factor) for factor in FACTORS)
     pairs = list(itertools.combinations(left, 2))
-    if len(pairs) > PAIRS:
-        doubtful = [d for d in left if _clustered(still[d] - losses, episode).errors < LISTENS]
-        pairs = list(itertools.combinations(doubtful, 2))[:PAIRS]
+    if len(pairs) > MAX_SWAPS:
+        doubtful = [d for d in left if _clustered(still[d] - losses, episode).errors < MIN_LOSS_ERRORS]
+        pairs = list(itertools.combinations(doubtful, 2))[:MAX_SWAPS]
     yield from (Change(d, "swapped", other=other) for d, other in pairs)
 
 

@@ -32,14 +32,15 @@ from hma_jax.runtime.rows import lay_out
 from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain
 
 T = TypeVar("T")
-ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
-"""What of a batch goes to the devices."""
+REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
+"""Arrays of a batch that go to the devices."""
 
-PERHAPS = ("real", "action_mean", "action_std", "other_actions", "other_valid", "other_images", "other_seen")
-"""And this, where a batch has it."""
+OPTIONAL_ARRAYS = ("real", "action_mean", "action_std", "other_actions", "other_valid", "other_images", "other_seen")
+"""Further ones, where a batch has them."""
 
-Judges = tuple[Params, Params | None]
-"""Parameters of the tokenizer, which makes images of tokens, and of `lpips`, where it is asked for."""
+MetricParams = tuple[Params, Params | None]
+"""Parameters that metrics need: of the tokenizer, which decodes tokens to images, and of `lpips` where it is asked
+for."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def evaluate(
 
     A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
     and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is
-    what the model was trained for. `progress` is told the windows done so far. With several processes
+    what the model was trained for. `progress` is called with the number of windows done so far. With several processes
     (`runtime.processes`) all call this with the same batches, and each gets the whole result. A model that was trained
     for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for a model
     whose predictions are not finite, or as `lpips.load_lpips`.
@@ -77,17 +78,17 @@ def evaluate(
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     declared = declare_model(model, table, execution)
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
-    judges = (tokenizer.params, load_lpips() if config.lpips else None)
-    judges = lay_out(judges, NamedSharding(mesh, PartitionSpec()))
+    metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
+    metric_params = lay_out(metric_params, NamedSharding(mesh, PartitionSpec()))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
         for batch in batches:
             groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, batch_ways(mesh))
             _check_lengths(batch, config)
-            arrays = (*ARRAYS, *(name for name in PERHAPS if name in batch))
+            arrays = (*REQUIRED_ARRAYS, *(name for name in OPTIONAL_ARRAYS if name in batch))
             on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
             with jax.set_mesh(mesh):
-                found = evaluator(weights, judges, on_devices)
+                found = evaluator(weights, metric_params, on_devices)
             yield batch, found
 
     tables: list[WindowTable] = []
@@ -100,11 +101,14 @@ def evaluate(
                 # Read whole: rows picked on the devices would wait for the next batch.
                 real = batch["real"][row] if "real" in batch else np.ones(len(batch["images"][row]), bool)
                 clips = (batch["images"][row], np.asarray(predicted.tokens)[row])
-                random = None if predicted.random is None else held(np.asarray(predicted.random)[row], real)
+                random = None if predicted.random is None else hold_last_frame(np.asarray(predicted.random)[row], real)
                 other = (None, None)
                 if predicted.other is not None and batch["other_seen"][row]:
-                    other = (held(np.asarray(predicted.other)[row], real), held(batch["other_images"][row], real))
-                own.append(Sample(*(held(clip, real) for clip in clips), random, *other))
+                    other = (
+                        hold_last_frame(np.asarray(predicted.other)[row], real),
+                        hold_last_frame(batch["other_images"][row], real),
+                    )
+                own.append(Sample(*(hold_last_frame(clip, real) for clip in clips), random, *other))
         if progress is not None:
             progress(sum(map(len, tables)))
     windows = join(tables)
@@ -120,8 +124,8 @@ def make_evaluator(
     execution: ExecutionConfig,
     decode: Decode,
     piece: int,
-) -> Callable[[Params, Judges, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
-    """A jitted f(parameters, Judges, batch with images) -> (metrics {name: [B]}, Predicted).
+) -> Callable[[Params, MetricParams, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
+    """A jitted f(parameters, MetricParams, batch with images) -> (metrics {name: [B]}, Predicted).
 
     Runs under `jax.set_mesh`. Of B windows `plan_groups` says how many are in memory at a time; B is a
     multiple of that. Raises ConfigError as `make_predictor`.
@@ -130,24 +134,24 @@ def make_evaluator(
     predict = make_predictor(model, table, config, setting, execution)
 
     def compare(
-        judges: Judges, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None, Any]
+        metric_params: MetricParams, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None, Any]
     ) -> dict[str, jax.Array]:
-        (decoder_params, lpips_params), (images, real, others) = judges, recorded
+        (decoder_params, lpips_params), (images, real, others) = metric_params, recorded
         return image_metrics(decode, piece, decoder_params, predicted, images, config, real, others, lpips_params)
 
-    def evaluate_group(params: Params, judges: Judges, batch: dict[str, jax.Array]):
+    def evaluate_group(params: Params, metric_params: MetricParams, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
         metrics, predicted = predict(params, batch)
         if predicted is None:
             return metrics, None
         others = (batch["other_images"], batch["other_seen"]) if "other_images" in batch else None
         recorded = batch["images"], batch.get("real"), others
-        compared = _on_each_device(compare, mesh)(judges, predicted, recorded)
+        compared = _on_each_device(compare, mesh)(metric_params, predicted, recorded)
         return metrics | compared, predicted
 
-    def evaluate_batch(params: Params, judges: Judges, batch: dict[str, jax.Array]):
+    def evaluate_batch(params: Params, metric_params: MetricParams, batch: dict[str, jax.Array]):
         groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, batch_ways(mesh))
-        return in_groups(lambda rows: evaluate_group(params, judges, rows), batch, groups)
+        return in_groups(lambda rows: evaluate_group(params, metric_params, rows), batch, groups)
 
     return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
 
@@ -165,8 +169,8 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
     )
 
 
-def held(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
-    """The last frames of a window of len(real), [n, ...], its last real one in place of what follows it."""
+def hold_last_frame(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """The last n frames of a window of len(real) frames, [n, ...], with padding replaced by the last real frame."""
     first = len(real) - len(clip)
     return clip[np.minimum(np.arange(len(clip)), int(real.sum()) - 1 - first)]
 
@@ -194,7 +198,7 @@ def in_groups(function: Callable[[Any], Any], batch: Any, groups: int) -> Any:
 
 
 def one_ahead(items: Iterable[T]) -> Iterator[T]:
-    """The same items, each when the next one has been made."""
+    """The same items, each yielded after the next one was dispatched."""
     waiting: list[T] = []
     for item in items:
         waiting.append(item)

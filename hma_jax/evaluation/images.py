@@ -71,11 +71,11 @@ def image_metrics(
     first = config.first_predicted
     future, last = images[:, first:], last_frames(images, real_BT)
     real = None if real_BT is None else real_BT[:, first:]
-    # The image that a model has before it which repeats the last one it is given.
+    # What copying shows: the last image that the model was given.
     before = images[:, first - 1 : -1] if config.context == "recorded" else images[:, first - 1 : first]
     # Under recorded actions and random ones in one array: equal images get equal numbers, to the last bit.
     shown_last = last_frames(shown, real)[:, None]
-    of_last = psnr(jnp.concatenate([shown_last, random_last], axis=1), _beside(last, 1 + random_last.shape[1]))
+    of_last = psnr(jnp.concatenate([shown_last, random_last], axis=1), _repeated(last, 1 + random_last.shape[1]))
     of_last = jax.lax.optimization_barrier(of_last)
     psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
     copied = jnp.broadcast_to(before, future.shape)
@@ -104,7 +104,7 @@ def _finite(tokens: jax.Array, real_BT: jax.Array | None) -> jax.Array:
     return (finite if real_BT is None else finite | ~real_BT).all(1)
 
 
-def _beside(images: jax.Array, count: int) -> jax.Array:
+def _repeated(images: jax.Array, count: int) -> jax.Array:
     """[B, ...] -> [B, count, ...]"""
     return jnp.broadcast_to(images[:, None], (len(images), count, *images.shape[1:]))
 

@@ -36,10 +36,10 @@ STRIDES, PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 POOLED = (False, True, True, False, False)
 """Whether a layer sees the maximum over 3 x 3 positions, every second one, of what the layer before gave."""
 
-NOTHING = 1e-10
+EPSILON = 1e-10
 """Added to the length of a feature vector, which may be zero."""
 
-AT_ONCE = 16
+PAIRS_AT_ONCE = 16
 """Pairs of images of which features are in memory: 3 MB for each of 256 x 256 pixels."""
 
 
@@ -85,12 +85,14 @@ def lpips(params: Params, a: jax.Array, b: jax.Array) -> jax.Array:
     require(a.shape == b.shape, f"LPIPS compares images of one size, got {a.shape} and {b.shape}")
 
     def of_pair(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        ours, theirs = (_features(params, image[None]) for image in pair)
+        features_a, features_b = (_features(params, image[None]) for image in pair)
         weights = [params[f"layer{i}"]["weight"] for i in range(len(LAYERS))]
-        return sum(jnp.mean(jnp.sum(w * (x - y) ** 2, -1)) for x, y, w in zip(ours, theirs, weights, strict=True))
+        return sum(
+            jnp.mean(jnp.sum(w * (x - y) ** 2, -1)) for x, y, w in zip(features_a, features_b, weights, strict=True)
+        )
 
     flat = tuple(x.reshape(-1, *x.shape[-3:]) for x in (a, b))
-    return jax.lax.map(of_pair, flat, batch_size=AT_ONCE).reshape(a.shape[:-3])
+    return jax.lax.map(of_pair, flat, batch_size=PAIRS_AT_ONCE).reshape(a.shape[:-3])
 
 
 def _features(params: Params, images: jax.Array) -> list[jax.Array]:
@@ -110,7 +112,7 @@ def _features(params: Params, images: jax.Array) -> list[jax.Array]:
             precision=jax.lax.Precision.HIGHEST,  # GPUs and TPUs would round to fewer bits, and differ from each other
         )
         x = jax.nn.relu(x + own["bias"])
-        found.append(x / (jnp.linalg.norm(x, axis=-1, keepdims=True) + NOTHING))
+        found.append(x / (jnp.linalg.norm(x, axis=-1, keepdims=True) + EPSILON))
     return found
 
 

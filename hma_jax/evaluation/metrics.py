@@ -32,7 +32,7 @@ MAX_PSNR = 100.0
 
 SSIM_WINDOW = 7
 
-LONGEST_ROW, MOST_ROWS = (2**31 - 1) // PEAK**2, 2**15
+MAX_ROW_VALUES, MAX_ROWS = (2**31 - 1) // PEAK**2, 2**15
 """Values in a row of pixels, and rows, whose squared errors still add up in an int32 (`psnr`)."""
 
 # --- Images ----------------------------------------------------------------------------------
@@ -47,8 +47,8 @@ def psnr(a: Any, b: Any) -> Any:
     xp, a, b = _whole_numbers(a, b)
     height, width, channels = a.shape[-3:]
     require(
-        height <= MOST_ROWS and width * channels <= LONGEST_ROW,
-        f"PSNR takes images of up to {MOST_ROWS} rows of up to {LONGEST_ROW} values, got {a.shape[-3:]}",
+        height <= MAX_ROWS and width * channels <= MAX_ROW_VALUES,
+        f"PSNR takes images of up to {MAX_ROWS} rows of up to {MAX_ROW_VALUES} values, got {a.shape[-3:]}",
     )
     rows = xp.sum((a - b) ** 2, axis=(-2, -1))
     # The sum over rows may exceed an int32, its halves do not.

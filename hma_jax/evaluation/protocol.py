@@ -36,8 +36,8 @@ import jax.numpy as jnp
 
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.config.training import PREDICT_ACTIONS, PREDICT_FRAMES
-from hma_jax.evaluation.controllability import told_apart, under_each
-from hma_jax.evaluation.draws import Purpose, own_statistics, random_actions, window_keys
+from hma_jax.evaluation.controllability import action_metrics, for_each_sequence
+from hma_jax.evaluation.draws import Purpose, random_actions, table_statistics, window_keys
 from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
 from hma_jax.model.embodiments import EmbodimentTable, normalise
@@ -84,18 +84,18 @@ def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) 
     actions, window = batch["actions"], (batch["embodiment"], batch["episode"], batch["start"])
     frames, first_free = actions.shape[1], config.first_predicted - 1
     key_B = window_keys(config.seed, "actions", table, *window)
-    statistics = judged_by(batch, table)
+    statistics = action_statistics(batch, table)
     other = random_actions(key_B, batch["embodiment"], table, config.random_actions, frames, statistics)
     other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
     decoding_B = window_keys(config.seed, "decoding", table, *window)
     return jnp.concatenate([actions[:, None], other], axis=1), decoding_B
 
 
-def judged_by(batch: Batch, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
+def action_statistics(batch: Batch, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
     """(mean, std) of each window's actions, [B, U] each, the same for every model."""
     if "action_mean" in batch:
         return batch["action_mean"], batch["action_std"]
-    return own_statistics(batch["embodiment"], table)
+    return table_statistics(batch["embodiment"], table)
 
 
 def make_predictor(
@@ -131,9 +131,9 @@ def make_predictor(
 
         metrics, predicted = {}, None
         if predicts_frames(setting):
-            metrics, predicted = _judge_frames(hma, window, batch, table, config, setting, keys("likelihood"))
+            metrics, predicted = _frame_metrics(hma, window, batch, table, config, setting, keys("likelihood"))
         if predicts_actions(model, setting):
-            causally, statistics = setting != "inverse", judged_by(batch, table)
+            causally, statistics = setting != "inverse", action_statistics(batch, table)
             metrics |= _policy_errors(hma, *window, keys("policy"), config, causally, statistics, seen)
             if predicted is None:
                 judged = (statistics[1] > 0).any(-1)
@@ -145,7 +145,7 @@ def make_predictor(
     return predict
 
 
-def _judge_frames(
+def _frame_metrics(
     hma: HMA,
     window: tuple[jax.Array, jax.Array, jax.Array],
     batch: Batch,
@@ -163,11 +163,11 @@ def _judge_frames(
     shown = None if hidden is None else hidden[:, : model.frames]
     followed = None if real is None else real[:, 1 : model.frames]
 
-    def judge(out: jax.Array) -> dict[str, jax.Array]:
+    def likelihood(out: jax.Array) -> dict[str, jax.Array]:
         return _likelihood(hma, out, window[0][:, 1:], key_B, followed)
 
-    def judge_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
-        return judge(next_frame_outputs(hma, window[0], actions_BTU, robots, shown))
+    def likelihood_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
+        return likelihood(next_frame_outputs(hma, window[0], actions_BTU, robots, shown))
 
     if config.context == "recorded":
         require(
@@ -187,10 +187,10 @@ def _judge_frames(
         last = last_frames(random, ahead, axis=2)
         predicted = Predicted(made[:, 0], last, random[:, 0], made[:, -1] if counterfactual else None)
     if "other_actions" in batch:
-        found = under_each(judge_under, window[1], batch["other_actions"][:, :, : model.frames])
+        found = for_each_sequence(likelihood_under, window[1], batch["other_actions"][:, :, : model.frames])
         loss = found["diffusion_loss" if model.diffusion else "cross_entropy"]
-        return {name: x[0] for name, x in found.items()} | told_apart(loss, batch["other_valid"]), predicted
-    return judge_under(window[1]) if config.context == "generated" else judge(out), predicted
+        return {name: x[0] for name, x in found.items()} | action_metrics(loss, batch["other_valid"]), predicted
+    return likelihood_under(window[1]) if config.context == "generated" else likelihood(out), predicted
 
 
 def _after_recorded(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import require
-from hma_jax.evaluation.controllability import OPTIONAL
+from hma_jax.evaluation.controllability import OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import (
     Clusters,
     Estimate,
@@ -54,7 +54,7 @@ class Summary:
 def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
     """Means over the windows of each dataset, and its perplexities; errors clustered by episode.
 
-    Of what some windows have not (`controllability.OPTIONAL`) the mean is over those that have it; a dataset
+    Of what some windows have not (`controllability.OPTIONAL_METRICS`) the mean is over those that have it; a dataset
     without any has no such metric.
     `perplexity_group` is the number of windows per exp(mean loss) of the official perplexity.
     """
@@ -78,19 +78,21 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
     require(len(shared) > 0, "two evaluations without a common dataset cannot be compared")
     found = {}
     for name in shared:
-        mine = a.of(name)
-        other = b.of(name).matched_to(mine)
-        ours, theirs = (_estimates(x, perplexity_group) for x in (mine, other))
-        clusters = clusters_of(mine.episode)
-        found[name] = {m: stat_of(e.minus(theirs[m]), clusters) for m, e in ours.items() if m in theirs}
-        both = [m for m in OPTIONAL if m in mine.metrics and m in other.metrics]
-        found[name] |= _of_some(mine, {m: mine.metrics[m] - other.metrics[m] for m in both}, clusters)
+        own_a = a.of(name)
+        own_b = b.of(name).matched_to(own_a)
+        estimates_a, estimates_b = (_estimates(x, perplexity_group) for x in (own_a, own_b))
+        clusters = clusters_of(own_a.episode)
+        found[name] = {
+            m: stat_of(e.minus(estimates_b[m]), clusters) for m, e in estimates_a.items() if m in estimates_b
+        }
+        both = [m for m in OPTIONAL_METRICS if m in own_a.metrics and m in own_b.metrics]
+        found[name] |= _of_some(own_a, {m: own_a.metrics[m] - own_b.metrics[m] for m in both}, clusters)
     return Summary(found)
 
 
 def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimate]:
     """Of one dataset: the mean of each metric, and for discrete tokens the perplexities."""
-    own = {metric: column for metric, column in windows.metrics.items() if metric not in OPTIONAL}
+    own = {metric: column for metric, column in windows.metrics.items() if metric not in OPTIONAL_METRICS}
     estimates = {metric: estimate_mean(column) for metric, column in own.items()}
     if "cross_entropy" in windows.metrics:
         losses = windows.metrics["cross_entropy"]
@@ -103,7 +105,7 @@ def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray], clusters: 
     """Means of the optional metrics in `columns`, of the windows that have them; `clusters` are those of all
     windows."""
     found = {}
-    for metric, column in ((m, columns[m]) for m in OPTIONAL if m in columns):
+    for metric, column in ((m, columns[m]) for m in OPTIONAL_METRICS if m in columns):
         there = ~np.isnan(column)
         if there.all():
             found[metric] = stat_of(estimate_mean(column), clusters)

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FILE = "windows.parquet"
-FORMER = "windows.csv.gz"
-"""What versions before it wrote."""
+LEGACY_FILE = "windows.csv.gz"
+"""What earlier versions wrote."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,17 @@ class WindowTable:
         `other` has others, or one of them twice."""
         if self.stands_as(other):  # as trials of one study do
             return self
-        mine, theirs = self.names, other.names
-        at = {name: i for i, name in enumerate(mine)}
-        for names in (mine, theirs):
+        own, wanted = self.names, other.names
+        at = {name: i for i, name in enumerate(own)}
+        for names in (own, wanted):
             require(len(set(names)) == len(names), f"a window stands twice in an evaluation: {_first_twice(names)}")
-        strangers = sorted(set(mine) ^ set(theirs))
+        unmatched = sorted(set(own) ^ set(wanted))
         require(
-            not strangers,
-            f"only one of two evaluations has window {strangers and strangers[0]} (and {len(strangers) - 1} others); "
+            not unmatched,
+            f"only one of two evaluations has window {unmatched and unmatched[0]} (and {len(unmatched) - 1} others); "
             "compare evaluations on one frozen set of windows",
         )
-        return self.rows(np.asarray([at[name] for name in theirs], np.int64))
+        return self.rows(np.asarray([at[name] for name in wanted], np.int64))
 
     def to_arrow(self, trial: str) -> pa.Table:
         """The long form, of the windows of `trial`."""
@@ -169,8 +169,8 @@ class WindowTable:
         try:
             return cls.from_arrow(read_arrow(path))
         except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-            former = Path(path).with_name(FORMER)
-            reason = f"{former.name} beside it is of an earlier version" if former.exists() else error
+            legacy = Path(path).with_name(LEGACY_FILE)
+            reason = f"{legacy.name} beside it is of an earlier version" if legacy.exists() else error
             raise ConfigError(f"{path}: no table of windows can be read ({reason}). Evaluate again.") from error
 
 

@@ -28,7 +28,7 @@ from experiments.applications.in_place import CLOSE_PX, EPISODES, VIEWS, in_plac
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
-from hma_jax.evaluation.detector import Found, init_detector
+from hma_jax.evaluation.detector import Detections, init_detector
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
 
@@ -43,7 +43,7 @@ def simulator(tmp_path_factory):
 class Oracle(Detector):
     """Finds what it is told, in frames that it keeps."""
 
-    def __init__(self, found: list[Found]):
+    def __init__(self, found: list[Detections]):
         self.found, self.films = found, []
 
     def detect(self, robot, film):
@@ -55,7 +55,7 @@ class Oracle(Detector):
 def test_places_at_the_end_are_those_of_the_true_simulator(simulator):
     robot = simulator.robots["pusher_sand"]
     points = len(point_names(SPECS[robot.name]))
-    nowhere = Found(np.zeros((EPISODES, points, 2), np.float32), np.ones((EPISODES, points), np.float32))
+    nowhere = Detections(np.zeros((EPISODES, points, 2), np.float32), np.ones((EPISODES, points), np.float32))
     oracle = Oracle([nowhere] * len(VIEWS))
     rows = measure_ends(simulator, oracle, robot)
     assert [film.shape for film in oracle.films] == [(EPISODES, 64, 64, 3)] * len(VIEWS)

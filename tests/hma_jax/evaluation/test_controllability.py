@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import DecodeConfig, EvalConfig, SamplerConfig
-from hma_jax.evaluation.controllability import OPTIONAL, counterfactual, told_apart, under_each
+from hma_jax.evaluation.controllability import OPTIONAL_METRICS, action_metrics, counterfactual, for_each_sequence
 from hma_jax.evaluation.evaluate import Evaluation, evaluate
 from hma_jax.evaluation.metrics import MAX_PSNR, psnr
 from hma_jax.evaluation.summary import paired_difference
@@ -78,7 +78,7 @@ def test_the_likelihood_is_the_same_with_and_without_others(models):
     alone = evaluate(lively_params(config)[1], config, TABLE, TOKENIZER, make_batches(config, each=4), EVAL)
     for metric, column in alone.windows.metrics.items():
         np.testing.assert_allclose(reads.windows.metrics[metric], column, rtol=1e-5, atol=1e-5, err_msg=metric)
-    assert not set(OPTIONAL) & set(alone.windows.metrics)
+    assert not set(OPTIONAL_METRICS) & set(alone.windows.metrics)
 
 
 def test_what_a_window_has_not_is_left_out_of_means(models):
@@ -117,27 +117,27 @@ def test_a_model_that_reads_actions_finds_the_true_ones():
     def judge(given):
         return {"loss": jnp.square(given - actions).mean((1, 2))}
 
-    losses = under_each(judge, actions, others)["loss"]
-    tell_apart = jax.jit(told_apart)
+    losses = for_each_sequence(judge, actions, others)["loss"]
+    tell_apart = jax.jit(action_metrics)
     found = tell_apart(losses, jnp.ones((5, 15), bool))
     assert losses.shape == (16, 5)
     np.testing.assert_array_equal(found["retrieval"], 1)
     np.testing.assert_array_equal(found["retrieval_rank"], 1)
     np.testing.assert_allclose(found["action_nats"], losses[1:].mean(0), rtol=1e-6)
-    shifted = tell_apart(under_each(judge, others[:, 0], others)["loss"], jnp.ones((5, 15), bool))
+    shifted = tell_apart(for_each_sequence(judge, others[:, 0], others)["loss"], jnp.ones((5, 15), bool))
     assert (shifted["retrieval_rank"] > 1).all()  # the control: they made other frames
 
 
 def test_ranks_count_better_ones_and_halve_ties():
     losses = jnp.asarray([[2.0], [1.0], [2.0], [3.0], [0.0]])  # the truth, then four others
     valid = jnp.asarray([[True, True, True, False]])
-    tell_apart = jax.jit(told_apart)
+    tell_apart = jax.jit(action_metrics)
     found = {name: float(x[0]) for name, x in tell_apart(losses, valid).items()}
     assert found == {"action_nats": 0.0, "retrieval": 0.0, "retrieval_rank": 2.5, "retrieval_chance": 0.25}
     tied = tell_apart(jnp.asarray([[1.0], [1.0], [4.0]]), jnp.ones((1, 2), bool))
     assert float(tied["retrieval"][0]) == 0.5
     nobody = tell_apart(losses, jnp.zeros((1, 4), bool))
-    assert all(np.isnan(x).all() for x in nobody.values()) and set(nobody) < set(OPTIONAL)
+    assert all(np.isnan(x).all() for x in nobody.values()) and set(nobody) < set(OPTIONAL_METRICS)
 
 
 def test_a_rollout_that_goes_where_the_other_actions_lead_gains():

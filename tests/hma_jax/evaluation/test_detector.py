@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.evaluation.detector import heat_of, init_detector, locate, points_loss, watch
+from hma_jax.evaluation.detector import detect, init_detector, locate_peaks, points_loss, target_heat
 
 
 def logits(heat: jax.Array) -> jax.Array:
@@ -15,7 +15,7 @@ def logits(heat: jax.Array) -> jax.Array:
 def test_a_point_is_found_where_its_heat_is_and_is_sure_only_if_it_is_there():
     position = jnp.array([[[10.0, 40.5], [31.3, 7.2]], [[55.0, 20.0], [3.0, 62.0]]])
     there = jnp.array([[1.0, 1.0], [1.0, 0.0]])
-    found = jax.jit(lambda: locate(logits(heat_of(position, there, 32))))()
+    found = jax.jit(lambda: locate_peaks(logits(target_heat(position, there, 32))))()
     np.testing.assert_allclose(found.position[there > 0], position[there > 0], atol=0.2)
     assert (np.asarray(found.confidence[there > 0]) > 0.75).all() and found.confidence[1, 1] < 1e-3
 
@@ -23,7 +23,7 @@ def test_a_point_is_found_where_its_heat_is_and_is_sure_only_if_it_is_there():
 def test_robots_have_outputs_of_their_own():
     weights = init_detector(jax.random.key(0), robots=2, points=3)
     film = jax.random.uniform(jax.random.key(1), (5, 16, 16, 3)) * 255
-    run = jax.jit(watch)
+    run = jax.jit(detect)
     found, other = run(weights, film, 0), run(weights, film, 1)
     assert found.position.shape == (5, 3, 2) and (other.confidence != found.confidence).any()
     moved = weights | {"heads": weights["heads"].at[1].add(1.0)}

@@ -15,7 +15,7 @@ from experiments.running.workspace import Workspace
 from hma_jax.config import ConfigError, EvalConfig
 from hma_jax.evaluation import lpips as module
 from hma_jax.evaluation.images import image_metrics
-from hma_jax.evaluation.lpips import AT_ONCE, LAYERS, PADDING, POOLED, STRIDES, load_lpips, lpips
+from hma_jax.evaluation.lpips import LAYERS, PADDING, PAIRS_AT_ONCE, POOLED, STRIDES, load_lpips, lpips
 from hma_jax.evaluation.protocol import Predicted
 
 PUBLISHED = {(31, 31): 0.07153969, (64, 64): 0.16925675, (48, 80): 0.12652700}
@@ -107,10 +107,10 @@ def test_the_network_is_alexnet_position_by_position(weights):
 
 def test_any_number_of_pairs_each_by_itself(weights):
     rng = np.random.default_rng(1)
-    a, b = rng.integers(0, 256, (2, AT_ONCE + 1, 31, 31, 3), np.uint8)
+    a, b = rng.integers(0, 256, (2, PAIRS_AT_ONCE + 1, 31, 31, 3), np.uint8)
     compare = jax.jit(lpips)
     found = np.asarray(compare(weights, a, b))
-    assert found.shape == (AT_ONCE + 1,) and (found > 0).all()
+    assert found.shape == (PAIRS_AT_ONCE + 1,) and (found > 0).all()
     np.testing.assert_allclose(compare(weights, a[::-1], b[::-1])[::-1], found, rtol=1e-5)
     assert not np.asarray(compare(weights, a, a)).any()
 
