@@ -1,8 +1,7 @@
-"""Several processes as one program, on one host or on many: its start, who writes, what all of them learn of each.
+"""Several processes as one program, on one host or on many: start, collectives of text and numbers, the one writer.
 
-Nothing here is needed or costs anything where one process works by itself: `start` is not called then, and every
-other function answers at once. Who is lost, and what becomes of the others, is told in `runtime.watchdog`; for
-users, docs/hosts.md says all of it.
+A single process needs nothing of it: `start` is not called then, and every other function returns at once. How a lost
+process is noticed, and how the others end, is in `runtime.watchdog`; docs/hosts.md is for users.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ misses, and is left for the case that this process's watchdog is stuck. Twice, f
 half its patience only, and counts from the last one."""
 
 
-# With what the messages of collectives and of the coordination service begin.
+# How error messages of collectives and of the coordination service begin.
 STATUSES = ("ABORTED:", "CANCELLED:", "DEADLINE_EXCEEDED:", "INTERNAL:", "UNAVAILABLE:", "UNKNOWN:")
 
 
@@ -105,7 +104,7 @@ def start(asked: Processes) -> None:
     so and ends here."""
     if not asked.several:
         return
-    # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `Agreement` sees both.
+    # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `AgreedMaximum` sees both.
     jax.config.update("jax_enable_preemption_service", False)
     failed: list[Exception] = []
 
@@ -129,17 +128,17 @@ def start(asked: Processes) -> None:
         joining.start()
         joining.join(asked.start_timeout)
     except KeyboardInterrupt as request:
-        _leave("stopped while it waited for the other processes", exit_of_interrupt(request))
+        _exit_now("stopped while it waited for the other processes", exit_of_interrupt(request))
     if joining.is_alive():
-        _leave(f"error: {_apart(asked, 'not all are there')}", Exit.REFUSED)
+        _exit_now(f"error: {_join_failure(asked, 'not all are there')}", Exit.REFUSED)
     if failed:
         reason = " ".join(str(failed[0]).split())[:300]
-        raise ConfigError(_apart(asked, reason)) from failed[0]
+        raise ConfigError(_join_failure(asked, reason)) from failed[0]
     if jax.process_count() > 1:
         _watch(asked.lost_after)
 
 
-def _apart(asked: Processes, reason: str) -> str:
+def _join_failure(asked: Processes, reason: str) -> str:
     return (
         f"the processes did not come together within {asked.start_timeout:.0f} s at "
         f"{asked.coordinator or 'the address that was detected'} ({reason}); see that all were started with the "
@@ -147,47 +146,49 @@ def _apart(asked: Processes, reason: str) -> str:
     )
 
 
-def _leave(message: str, code: int) -> None:
-    """Ends the process beside a thread that hangs in a call of JAX, which would hold up any other end."""
+def _exit_now(message: str, code: int) -> None:
+    """Ends the process at once: a thread that hangs in a call of JAX would keep a normal exit waiting."""
     print(message, file=sys.stderr, flush=True)
     os._exit(code)
 
 
 def _watch(lost_after: float) -> None:
-    me, hosts = jax.process_index(), tell("host", socket.gethostname())
+    me, hosts = jax.process_index(), all_gather("host", socket.gethostname())
     word, host = secrets.token_hex(8), _state().coordinator_address.rpartition(":")[0]
     if me == 0:
         board = watchdog.Board(word)
-        from_writer("watchdog", f"{board.port} {word}")
+        broadcast_from_writer("watchdog", f"{board.port} {word}")
         exchange, port = board.exchange, board.port
     else:
-        said, word = from_writer("watchdog", "").split()
-        port = int(said)
+        port_text, word = broadcast_from_writer("watchdog", "").split()
+        port = int(port_text)
         exchange = partial(watchdog.visit, host.strip("[]"), port, word)
     watchdog.watch(watchdog.Signs(me, hosts, f"{host}:{port}", lost_after), exchange)
 
 
 def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
-    """At the end of a process. Several end together if all is well; one that failed tells the others why, and
-    ends here with `code`, for a thread that hangs in a collective holds up any other end. `show`: prints where
-    the error comes from.
+    """Called at the end of every process. Without an error all end together; one that failed reports why to the others,
+    and exits here with `code`, since a thread that hangs in a collective would keep a normal exit waiting. `show`:
+    prints the traceback.
     """
     if jax.distributed.is_initialized() and jax.process_count() > 1:
         if error is None:
-            meet("end")
+            barrier("end")
             watchdog.finish()
             return
         if show:
             traceback.print_exception(error)
-        watchdog.finish(" ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=_of_others(error))
+        watchdog.finish(
+            " ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=_may_be_due_to_others(error)
+        )
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
 
 
-def _of_others(error: BaseException | None) -> bool:
-    """Whether an error may come of another process's end: what a collective or the coordination service says. Both
-    begin with the name of a status, in whatever type of exception."""
+def _may_be_due_to_others(error: BaseException | None) -> bool:
+    """Whether an error may be due to the end of another process: it comes from a collective or from the coordination
+    service, whose messages begin with a status, whatever the type of exception."""
     while error is not None:
         if str(error).startswith(STATUSES):
             return True
@@ -200,72 +201,75 @@ def is_writer() -> bool:
     return jax.process_index() == 0
 
 
-def tell(name: str, text: str) -> list[str]:
-    """Every process's `text`, in their order; all call it at the same place, under the same `name`.
+def all_gather(name: str, text: str) -> list[str]:
+    """The `text` of every process, by process index; all must call it in the same order, under the same `name`.
 
-    Waits for the slowest however long it takes: one that is lost ends the others (`runtime.watchdog`).
+    Waits for the slowest without a limit: one that is lost ends the others (`runtime.watchdog`).
     """
     if jax.process_count() == 1:
         return [text]
     client = _state().client
-    turn = _turns[name] = _turns.get(name, 0) + 1
-    key = f"hma/tell/{name}/{turn}"
+    call = _call_counts[name] = _call_counts.get(name, 0) + 1
+    key = f"hma/all_gather/{name}/{call}"
     client.key_value_set(f"{key}/{jax.process_index()}", f"={text}")
     return [_wait_for(client, f"{key}/{p}")[1:] for p in range(jax.process_count())]
 
 
-def meet(name: str) -> None:
-    """Waits until all processes are here. Before a program runs for the first time: its collectives wait for those
+def barrier(name: str) -> None:
+    """Waits until all processes have called it. Needed before a program first runs: its collectives wait for processes
     that still compile it, on CPUs for 30 seconds only."""
-    tell(name, "")
+    all_gather(name, "")
 
 
-def from_writer(name: str, text: str) -> str:
-    """What process 0 says; the others' `text` does not count. Called by all, as `tell`."""
-    return tell(name, text if is_writer() else "")[0]
+def broadcast_from_writer(name: str, text: str) -> str:
+    """The `text` of process 0, in every process; that of the others is ignored. Called by all, as `all_gather`."""
+    return all_gather(name, text if is_writer() else "")[0]
 
 
 @contextmanager
 def writer_first(name: str) -> Iterator[None]:
     """Process 0 goes through the block before the others do: `with writer_first("data"): prepare()`."""
     if not is_writer():
-        meet(f"first/{name}")
+        barrier(f"first/{name}")
     yield
     if is_writer():
-        meet(f"first/{name}")
+        barrier(f"first/{name}")
 
 
-class Agreement:
-    """A number that any process may wish for, known to all of them at the same step.
+class AgreedMaximum:
+    """The largest number that any process requests in a step, known to all processes at the same step.
 
-    With several processes the largest wish of one step is known after the next one was dispatched: no process
-    waits for another more than the steps themselves do.
+    With several processes the maximum over one step is read after the next one was dispatched: no process waits for
+    another more than the steps themselves do.
     """
 
     def __init__(self):
-        self._count: Callable[[jax.Array], jax.Array] | None = None
-        self._cast: jax.Array | None = None
+        self._maximum: Callable[[jax.Array], jax.Array] | None = None
+        self._submitted: jax.Array | None = None
         if jax.process_count() > 1:
             mesh = Mesh(np.array(jax.devices()), ("devices",))
-            self._each = NamedSharding(mesh, PartitionSpec("devices"))
-            count = jax.jit(lambda wishes: wishes.max(), out_shardings=NamedSharding(mesh, PartitionSpec()))
-            shape = jax.ShapeDtypeStruct((jax.device_count(),), np.int32, sharding=self._each)
-            self._count = count.lower(shape).compile()
+            self._per_device = NamedSharding(mesh, PartitionSpec("devices"))
+            maximum = jax.jit(lambda requests: requests.max(), out_shardings=NamedSharding(mesh, PartitionSpec()))
+            shape = jax.ShapeDtypeStruct((jax.device_count(),), np.int32, sharding=self._per_device)
+            self._maximum = maximum.lower(shape).compile()
 
-    def cast(self, wish: Callable[[], int]) -> None:
-        """Once a step, by all."""
-        if self._count is not None:
-            mine = np.full(jax.device_count(), wish(), np.int32)
-            self._cast = self._count(jax.make_array_from_callback(mine.shape, self._each, lambda at: mine[at]))
+    def submit(self, request: Callable[[], int]) -> None:
+        """Starts the reduction of this step's request; called once a step by all processes."""
+        if self._maximum is not None:
+            own = np.full(jax.device_count(), request(), np.int32)
+            self._submitted = self._maximum(
+                jax.make_array_from_callback(own.shape, self._per_device, lambda at: own[at])
+            )
 
-    def outcome(self, wish: Callable[[], int]) -> int:
-        """What was cast last, of all processes the largest. A single process has its `wish` of this moment."""
-        if self._count is None:
-            return wish()
-        return 0 if self._cast is None else int(self._cast)
+    def result(self, request: Callable[[], int]) -> int:
+        """The largest of the requests that were submitted last, 0 before the first; a single process gets its own
+        present one."""
+        if self._maximum is None:
+            return request()
+        return 0 if self._submitted is None else int(self._submitted)
 
 
-_turns: dict[str, int] = {}
+_call_counts: dict[str, int] = {}
 
 
 def _wait_for(client: Any, key: str) -> str:

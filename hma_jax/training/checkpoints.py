@@ -26,7 +26,7 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
-from hma_jax.runtime.processes import from_writer, is_writer, writer_first
+from hma_jax.runtime.processes import broadcast_from_writer, is_writer, writer_first
 from hma_jax.training.claim import require_plain
 from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
@@ -102,7 +102,7 @@ class Checkpoints:
 
     def agree_on_latest(self) -> int | None:
         """The latest step as process 0 sees it: a shared disk may show the others an older state of the directory."""
-        latest = from_writer("latest checkpoint", "" if self.latest_step is None else str(self.latest_step))
+        latest = broadcast_from_writer("latest checkpoint", "" if self.latest_step is None else str(self.latest_step))
         return int(latest) if latest else None
 
     # --- Saving ------------------------------------------------------------------------------

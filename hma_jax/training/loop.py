@@ -33,7 +33,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.exits import Exit, hand_on, lost_request
 from hma_jax.runtime.locks import Lock
-from hma_jax.runtime.processes import Agreement, is_writer, meet
+from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.claim import CHECKPOINTS, locked_run
 from hma_jax.training.divergence import Records, require_finite
@@ -159,15 +159,15 @@ def fit(
             began = clock()
             compiled = step_fn.lower(state, batch).compile()
             compile_seconds = clock() - began
-            agreement = Agreement()
-            meet("compiled")
+            agreement = AgreedMaximum()
+            barrier("compiled")
 
             began = saved = clock()
             watching = 0.0  # seconds
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
 
-            def wish() -> int:
+            def request() -> int:
                 return STOP if stop.is_set() else SAVE if _is_late(clock() - saved, options) else 0
 
             for step in range(start + 1, steps + 1):
@@ -178,7 +178,7 @@ def fit(
                     _report(log, *pending, about.records)
                 pending = (step, metrics)
                 checkpoints.raise_failure()
-                wanted = agreement.outcome(wish)
+                wanted = agreement.result(request)
                 last, stopping = step == steps, wanted == STOP
                 to_watch = watch is not None and (last or step % watch.every == 0)
                 to_save = last or wanted or _is_due(step, options)
@@ -195,7 +195,7 @@ def fit(
                     _require_held(lock, run_dir, step)
                     checkpoints.save(step, state)
                     saved = clock()
-                agreement.cast(wish)
+                agreement.submit(request)
                 if stopping and not last:
                     checkpoints.wait()
                     raise Interrupted(
@@ -233,7 +233,7 @@ def _require_held(lock: Lock | None, run_dir: Path, step: int) -> None:
 
 
 STOP, SAVE = 2, 1
-"""What a process may wish for between two steps; the larger one counts."""
+"""What a process may request between two steps; the largest request counts (`AgreedMaximum`)."""
 
 
 def _is_due(step: int, options: LoopOptions) -> bool:

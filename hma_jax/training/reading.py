@@ -18,7 +18,7 @@ import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.processes import tell
+from hma_jax.runtime.processes import all_gather
 from hma_jax.training.claim import list_steps
 from hma_jax.training.hashes import Chosen, Damaged, verify
 
@@ -72,16 +72,16 @@ def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _verify_together(checkpoint: Path, chosen: Chosen) -> None:
-    """Each of several processes reads its share of the files; what one finds damaged, all refuse."""
-    mine: Damaged | None = None
+    """Each of several processes verifies its share of the files; damage that one finds is raised in all."""
+    own: Damaged | None = None
     try:
         verify(checkpoint, chosen, (jax.process_index(), jax.process_count()))
     except Damaged as damage:
-        mine = damage
-    found = tell("damage", json.dumps(mine and [str(mine.path), mine.reason]))
+        own = damage
+    found = all_gather("damage", json.dumps(own and [str(own.path), own.reason]))
     for damage in map(json.loads, found):
         if damage:
-            raise mine or Damaged(Path(damage[0]), damage[1])
+            raise own or Damaged(Path(damage[0]), damage[1])
 
 
 def has_item(checkpoint: Path, name: str) -> bool:

@@ -1,4 +1,4 @@
-"""Processes that meet without training; each prints what it learnt as one line of JSON."""
+"""Processes that start without training; each prints what it learnt as one line of JSON."""
 
 import json
 import os
@@ -10,7 +10,16 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MeshConfig
 from hma_jax.runtime.mesh import make_mesh
-from hma_jax.runtime.processes import Agreement, Processes, end, from_writer, is_writer, start, tell, writer_first
+from hma_jax.runtime.processes import (
+    AgreedMaximum,
+    Processes,
+    all_gather,
+    broadcast_from_writer,
+    end,
+    is_writer,
+    start,
+    writer_first,
+)
 from hma_jax.runtime.rows import lay_out, own_rows
 
 
@@ -22,16 +31,16 @@ def main(path: str) -> None:
             with open(path, "w") as file:
                 file.write("here")
         seen = open(path).read()
-    agreement, agreed = Agreement(), []
+    agreement, agreed = AgreedMaximum(), []
     for step in range(4):
-        agreed.append(agreement.outcome(lambda: -1))
-        agreement.cast(lambda: me * step)
+        agreed.append(agreement.result(lambda: -1))
+        agreement.submit(lambda: me * step)
     whole = NamedSharding(make_mesh(MeshConfig()), PartitionSpec())
     laid = lay_out({"x": np.arange(3.0), "y": jax.numpy.ones(2)}, whole)
     report = {
         "seen": seen,
-        "told": tell("name", f"p{me}"),
-        "from_writer": from_writer("chief", f"p{me}"),
+        "told": all_gather("name", f"p{me}"),
+        "from_writer": broadcast_from_writer("chief", f"p{me}"),
         "agreed": agreed,
         "sum": float(jax.jit(lambda t: t["x"].sum() + t["y"].sum(), out_shardings=whole)(laid)),
         "rows": {f"{m}": own_rows(MeshConfig(*m), 8).tolist() for m in ((-1, 1, 1), (1, 2, 1), (1, 1, 2))},

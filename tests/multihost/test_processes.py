@@ -27,7 +27,7 @@ def test_two_processes_meet(said, tmp_path: Path):
     assert second["rows"] == {"(-1, 1, 1)": [4, 5, 6, 7], "(1, 2, 1)": [4, 5, 6, 7], "(1, 1, 2)": [*range(8)]}
     for report in (first, second):
         assert report["seen"] == "here" and report["told"] == ["p0", "p1"] and report["from_writer"] == "p0"
-        assert report["agreed"] == [0, 0, 1, 2]  # of each step the largest wish, a step later
+        assert report["agreed"] == [0, 0, 1, 2]  # of each step the largest request, a step later
         assert report["sum"] == 5.0
 
 
@@ -78,7 +78,7 @@ def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, mes
         raise Left(f"{how}: {said}")
 
     monkeypatch.setattr(processes.jax.distributed, "initialize", initialize)
-    monkeypatch.setattr(processes, "_leave", leave)
+    monkeypatch.setattr(processes, "_exit_now", leave)
     asked = Processes("a:1", 2, 0, start_timeout=1.0)
     with pytest.raises(Left, match=f"{code}: {message}"), terminated_like_interrupted():
         processes.start(asked)
