@@ -31,9 +31,9 @@ COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCE
 """Environment variables for what is not given otherwise."""
 
 MARGIN = 20.0
-"""Seconds by which JAX's own patience exceeds twice `lost_after`: it ends a process without a word about whom it
-misses, and is left for the case that this process's watchdog is stuck. Twice, for JAX gives a sign of its own after
-half its patience only, and counts from the last one."""
+"""Seconds by which JAX's own heartbeat timeout exceeds twice `lost_after`: it ends a process without naming the lost
+one, and is the fallback if this process's watchdog is stuck. Twice, because JAX sends its own heartbeat after half its
+timeout only, and counts from the last one."""
 
 
 # How error messages of collectives and of the coordination service begin.
@@ -52,7 +52,7 @@ class Processes:
     process: int | None = None  # this one's number, from 0
     detect: bool = False
     start_timeout: float = 300.0  # seconds until all must have come
-    lost_after: float = 90.0  # seconds without a sign of life after which a process is lost
+    lost_after: float = 90.0  # seconds without a heartbeat after which a process is lost
 
     def __post_init__(self):
         require(self.start_timeout >= 1, f"--start-timeout must be at least 1 second, got {self.start_timeout}")
@@ -154,16 +154,16 @@ def _exit_now(message: str, code: int) -> None:
 
 def _watch(lost_after: float) -> None:
     me, hosts = jax.process_index(), all_gather("host", socket.gethostname())
-    word, host = secrets.token_hex(8), _state().coordinator_address.rpartition(":")[0]
+    token, host = secrets.token_hex(8), _state().coordinator_address.rpartition(":")[0]
     if me == 0:
-        board = watchdog.Board(word)
-        broadcast_from_writer("watchdog", f"{board.port} {word}")
-        exchange, port = board.exchange, board.port
+        server = watchdog.HeartbeatServer(token)
+        broadcast_from_writer("watchdog", f"{server.port} {token}")
+        exchange, port = server.exchange, server.port
     else:
-        port_text, word = broadcast_from_writer("watchdog", "").split()
+        port_text, token = broadcast_from_writer("watchdog", "").split()
         port = int(port_text)
-        exchange = partial(watchdog.visit, host.strip("[]"), port, word)
-    watchdog.watch(watchdog.Signs(me, hosts, f"{host}:{port}", lost_after), exchange)
+        exchange = partial(watchdog.send_heartbeat, host.strip("[]"), port, token)
+    watchdog.watch(watchdog.Heartbeats(me, hosts, f"{host}:{port}", lost_after), exchange)
 
 
 def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:

@@ -1,10 +1,10 @@
-"""Several processes watch over each other: one that is lost, or fails, ends all of them, by name.
+"""Heartbeats between processes: when one is lost or fails, all of them end, with an error that names it.
 
-A collective waits for ever for a process that is gone, on most platforms without a word. So every process gives a
-sign of life to the coordinator (process 0) once a second, in a connection of its own, and is told those of the
-others. A process whose sign has not changed for `lost_after` seconds is lost; so is the coordinator if it has not
-answered for as long, or refuses connections, which only one that has ended does. Who finds that out says whom it
-misses and ends with Exit.LOST: nothing of what was computed since the last checkpoint could be saved without it.
+A collective waits for ever for a process that is gone, on most platforms without a message. So every process sends a
+heartbeat to the coordinator (process 0) once a second, over a connection of its own, and receives the latest heartbeats
+of the others. A process whose heartbeat has not changed for `lost_after` seconds is lost; so is the coordinator if it
+has not answered for as long, or refuses connections, which only one that has ended does. A process that finds another
+one lost prints which and exits with Exit.LOST: nothing computed since the last checkpoint could be saved without it.
 
 A cut of the network that is shorter than `lost_after` does nothing: connections go on when it is over. (JAX's own
 heartbeats name nobody, and its service closes connections that are silent in the middle of an answer for 20
@@ -28,162 +28,173 @@ from typing import Any
 
 from hma_jax.runtime.exits import Exit
 
-EVERY = 1.0  # seconds between two signs of life
-GRACE = 2.0  # seconds: all may fail in the same way, and then each says so itself
-PATIENCE = 3.0  # seconds for one exchange of signs
-LONGEST = 2**12  # bytes of a sign
+INTERVAL = 1.0  # seconds between two heartbeats
+GRACE = 2.0  # seconds: all may fail in the same way, and then each reports its own error
+EXCHANGE_TIMEOUT = 3.0  # seconds for one exchange of heartbeats
+MAX_BYTES = 2**12  # of a heartbeat
 DONE, FAILED = "done", "failed"
 
-Sign = list[Any]
+Heartbeat = list[Any]
 """[count], [DONE] or [FAILED, message]."""
 
 
 @dataclass
-class Signs:
-    """What one process knows of all, by its own clock: no two clocks are compared."""
+class Heartbeats:
+    """The latest heartbeat of every process, as one process knows them, timed by its own clock: clocks are not
+    compared."""
 
     process: int
     hosts: list[str]
     address: str  # of the coordinator
     lost_after: float  # seconds
     clock: Callable[[], float] = time.monotonic
-    last: dict[int, tuple[Sign, float]] = field(default_factory=dict)  # of each process, and when it came
-    answered: float = 0.0  # when the coordinator was heard of last
-    refused: bool = False  # it takes no connections any more
+    last: dict[int, tuple[Heartbeat, float]] = field(default_factory=dict)  # of each process, and when it changed
+    answered: float = 0.0  # when the coordinator answered last
+    refused: bool = False  # the coordinator takes no connections any more
 
     def __post_init__(self):
         self.answered = self.clock()
         self.last = {p: ([], self.answered) for p in range(len(self.hosts))}
 
-    def hear(self, signs: dict[int, Sign]) -> None:
-        """The coordinator answered with everybody's last sign."""
+    def receive(self, heartbeats: dict[int, Heartbeat]) -> None:
+        """Records an answer of the coordinator: the latest heartbeats of all."""
         now = self.answered = self.clock()
         self.refused = False
-        for p, sign in signs.items():
-            if self.last[p][0] != sign:
-                self.last[p] = (sign, now)
+        for p, heartbeat in heartbeats.items():
+            if self.last[p][0] != heartbeat:
+                self.last[p] = (heartbeat, now)
 
-    def excuse(self, seconds: float) -> None:
-        """This process itself stood still for so long: nobody could be heard meanwhile."""
+    def extend_deadlines(self, seconds: float) -> None:
+        """For `seconds` in which this process itself was suspended and could not receive any heartbeat."""
         self.answered += seconds
-        self.last = {p: (sign, when + seconds) for p, (sign, when) in self.last.items()}
+        self.last = {p: (heartbeat, when + seconds) for p, (heartbeat, when) in self.last.items()}
 
-    def verdict(self) -> str | None:
+    def failure(self) -> str | None:
         """Why this process must end; None: it need not."""
         now, others = self.clock(), {p: x for p, x in self.last.items() if p != self.process}
         again = "start all processes again: they go on from the last checkpoint"
-        for p, (sign, when) in others.items():
-            if sign[:1] == [FAILED] and now - when > GRACE:
-                return f"{self._named(p)} ended with an error: {sign[1]}"
+        for p, (heartbeat, when) in others.items():
+            if heartbeat[:1] == [FAILED] and now - when > GRACE:
+                return f"{self._name_of(p)} ended with an error: {heartbeat[1]}"
         silent = now - self.answered
         if self.process and self.last[0][0] != [DONE] and (self.refused or silent > self.lost_after):
             why = "has ended" if self.refused else f"has not answered for {silent:.0f} s"
-            return f"lost {self._named(0)}, the coordinator at {self.address}: it {why}; {again}"
-        if silent > 5 * EVERY:
-            return None  # what the others did meanwhile is not known
-        for p, (sign, when) in others.items():
-            if sign != [DONE] and now - when > self.lost_after:
-                return f"lost {self._named(p)}: no sign of life for {now - when:.0f} s; {again}"
+            return f"lost {self._name_of(0)}, the coordinator at {self.address}: it {why}; {again}"
+        if silent > 5 * INTERVAL:
+            return None  # the others' heartbeats are as old as the coordinator's last answer
+        for p, (heartbeat, when) in others.items():
+            if heartbeat != [DONE] and now - when > self.lost_after:
+                return f"lost {self._name_of(p)}: no sign of life for {now - when:.0f} s; {again}"
         return None
 
-    def _named(self, process: int) -> str:
+    def _name_of(self, process: int) -> str:
         return f"process {process} of {len(self.hosts)} on host {self.hosts[process]}"
 
 
-class Board(socketserver.ThreadingTCPServer):
-    """Where process 0 keeps everybody's last sign: whoever brings one, and the program's `word`, is told all of
-    them."""
+class HeartbeatServer(socketserver.ThreadingTCPServer):
+    """In process 0: keeps the latest heartbeat of every process. A client that sends one, with the program's `token`,
+    gets all of them back."""
 
     daemon_threads, allow_reuse_address, request_queue_size = True, True, 1024
 
-    def __init__(self, word: str):
-        super().__init__(("", 0), _Visit)
-        self.word, self.signs = word, dict[int, Sign]()
-        threading.Thread(target=self.serve_forever, name="signs of life", daemon=True).start()
+    def __init__(self, token: str):
+        super().__init__(("", 0), _HeartbeatHandler)
+        self.token, self.heartbeats = token, dict[int, Heartbeat]()
+        threading.Thread(target=self.serve_forever, name="heartbeats", daemon=True).start()
 
     @property
     def port(self) -> int:
         return self.server_address[1]
 
-    def exchange(self, process: int, sign: Sign) -> dict[int, Sign]:
-        self.signs[process] = sign
-        return dict(self.signs)
+    def exchange(self, process: int, heartbeat: Heartbeat) -> dict[int, Heartbeat]:
+        self.heartbeats[process] = heartbeat
+        return dict(self.heartbeats)
 
     def handle_error(self, *_: Any) -> None:
-        """A visitor that broke off comes again."""
+        """Ignored: a client whose connection broke sends its next heartbeat on a new one."""
 
 
-class _Visit(socketserver.StreamRequestHandler):
-    timeout = PATIENCE
+class _HeartbeatHandler(socketserver.StreamRequestHandler):
+    timeout = EXCHANGE_TIMEOUT
 
     def handle(self) -> None:
-        word, process, sign = json.loads(self.rfile.readline(LONGEST))
-        if word == self.server.word:
-            self.wfile.write(json.dumps([*self.server.exchange(process, sign).items()]).encode() + b"\n")
+        token, process, heartbeat = json.loads(self.rfile.readline(MAX_BYTES))
+        if token == self.server.token:
+            self.wfile.write(json.dumps([*self.server.exchange(process, heartbeat).items()]).encode() + b"\n")
 
 
-def visit(host: str, port: int, word: str, process: int, sign: Sign) -> dict[int, Sign]:
-    """Brings a sign to the board there. Raises OSError; ConnectionRefusedError means that its process has ended."""
-    with socket.create_connection((host, port), timeout=PATIENCE) as line, line.makefile("rb") as answers:
-        line.sendall(json.dumps([word, process, sign]).encode() + b"\n")
+def send_heartbeat(host: str, port: int, token: str, process: int, heartbeat: Heartbeat) -> dict[int, Heartbeat]:
+    """Sends a heartbeat to a `HeartbeatServer`; returns those of all. Raises OSError; ConnectionRefusedError means that
+    the server's process has ended."""
+    with (
+        socket.create_connection((host, port), timeout=EXCHANGE_TIMEOUT) as connection,
+        connection.makefile("rb") as answers,
+    ):
+        connection.sendall(json.dumps([token, process, heartbeat]).encode() + b"\n")
         answer = answers.readline()
     if not answer.endswith(b"\n"):
         raise ConnectionResetError("it broke off")
-    return {int(p): sign for p, sign in json.loads(answer)}
+    return {int(p): heartbeat for p, heartbeat in json.loads(answer)}
 
 
 class Watchdog:
-    """Gives this process's signs and judges those of the others, in threads of its own."""
+    """Sends this process's heartbeats and checks those of the others, in threads of its own."""
 
-    def __init__(self, signs: Signs, exchange: Callable[[int, Sign], dict[int, Sign]], leave: Callable[[str], None]):
-        """`exchange(process, sign)` is `Board.exchange` or `visit`; `leave` is told the verdict."""
-        self.signs, self._exchange, self._leave = signs, exchange, leave
-        self._over = threading.Event()
-        for work in (self._beat, self._judge):
+    def __init__(
+        self,
+        heartbeats: Heartbeats,
+        exchange: Callable[[int, Heartbeat], dict[int, Heartbeat]],
+        on_failure: Callable[[str], None],
+    ):
+        """`exchange(process, heartbeat)` is `HeartbeatServer.exchange` or `send_heartbeat`; `on_failure` is called with
+        `Heartbeats.failure`, if there is one."""
+        self.heartbeats, self._exchange, self._on_failure = heartbeats, exchange, on_failure
+        self._ended = threading.Event()
+        for work in (self._beat, self._check):
             threading.Thread(target=work, name=f"watchdog{work.__name__}", daemon=True).start()
 
-    def end(self, sign: Sign) -> None:
-        """The last sign of this process, which judges no more."""
-        self._over.set()
+    def end(self, heartbeat: Heartbeat) -> None:
+        """Stops both threads and sends `heartbeat`, DONE or FAILED, as the last one of this process."""
+        self._ended.set()
         try:
-            self._exchange(self.signs.process, sign)
+            self._exchange(self.heartbeats.process, heartbeat)
         except OSError as error:
             print(f"note: the other processes could not be told ({error})", file=sys.stderr)
 
     def _beat(self) -> None:
         count = 0
-        while not self._over.is_set():
+        while not self._ended.is_set():
             count += 1
             try:
-                self.signs.hear(self._exchange(self.signs.process, [count]))
+                self.heartbeats.receive(self._exchange(self.heartbeats.process, [count]))
             except ConnectionRefusedError:
-                self.signs.refused = True
-            except (OSError, ValueError):  # for now; `_judge` counts for how long
+                self.heartbeats.refused = True
+            except (OSError, ValueError):  # for now; `_check` counts for how long
                 pass
-            self._over.wait(EVERY)
+            self._ended.wait(INTERVAL)
 
-    def _judge(self) -> None:
-        looked = self.signs.clock()
-        while not self._over.wait(EVERY / 2):
-            slept, looked = self.signs.clock() - looked, self.signs.clock()
-            if slept > 5 * EVERY:  # stopped, or a machine that was
-                self.signs.excuse(slept)
-            verdict = self.signs.verdict()
-            if verdict is not None and not self._over.is_set():
-                self._leave(verdict)
+    def _check(self) -> None:
+        checked = self.heartbeats.clock()
+        while not self._ended.wait(INTERVAL / 2):
+            slept, checked = self.heartbeats.clock() - checked, self.heartbeats.clock()
+            if slept > 5 * INTERVAL:  # stopped, or a machine that was
+                self.heartbeats.extend_deadlines(slept)
+            failure = self.heartbeats.failure()
+            if failure is not None and not self._ended.is_set():
+                self._on_failure(failure)
 
 
-def watch(signs: Signs, exchange: Callable[[int, Sign], dict[int, Sign]]) -> None:
+def watch(heartbeats: Heartbeats, exchange: Callable[[int, Heartbeat], dict[int, Heartbeat]]) -> None:
     """From now on this process ends with Exit.LOST when another one is lost."""
     global _watchdog
-    _keep_aborting_threads()
-    _watchdog = Watchdog(signs, exchange, _leave)
+    _delay_aborts()
+    _watchdog = Watchdog(heartbeats, exchange, _exit_lost)
 
 
 def finish(error: str | None = None, *, perhaps_lost: bool = False) -> None:
-    """At the end of this process: the others need not wait for it, or learn why it failed.
+    """At the end of this process: tells the others that it is done, or why it failed.
 
-    `perhaps_lost`: the error may come of another process's end; then the watchdog has time to say whose.
+    `perhaps_lost`: the error may be due to the loss of another process; the watchdog then gets the time to find which.
     """
     global _watchdog
     watchdog, _watchdog = _watchdog, None
@@ -193,24 +204,25 @@ def finish(error: str | None = None, *, perhaps_lost: bool = False) -> None:
         watchdog.end([DONE])
         return
     if perhaps_lost:
-        time.sleep(watchdog.signs.lost_after + GRACE + EVERY)
-    watchdog.end([FAILED, error[: LONGEST // 8]])
-    time.sleep(GRACE + 2 * EVERY)  # the others read it before the coordinator may be gone
+        time.sleep(watchdog.heartbeats.lost_after + GRACE + INTERVAL)
+    watchdog.end([FAILED, error[: MAX_BYTES // 8]])
+    time.sleep(GRACE + 2 * INTERVAL)  # the others read it before the coordinator may be gone
 
 
 _watchdog: Watchdog | None = None
 
 
-def _leave(verdict: str) -> None:
-    print(f"error: {verdict} (exit code {Exit.LOST})", file=sys.stderr, flush=True)
-    os._exit(Exit.LOST)  # threads wait inside of collectives and would hold up any other end
+def _exit_lost(failure: str) -> None:
+    print(f"error: {failure} (exit code {Exit.LOST})", file=sys.stderr, flush=True)
+    os._exit(Exit.LOST)  # threads that wait in collectives would keep a normal exit waiting
 
 
-def _keep_aborting_threads() -> None:
-    """JAX aborts a process as soon as its connection to the coordinator breaks, without naming anyone.
+def _delay_aborts() -> None:
+    """Delays JAX's abort of a process whose connection to the coordinator broke, which names no process.
 
-    The thread that aborts sleeps first (six seconds, the number of the signal), in which the watchdog
-    says who is missing. No Python runs in a thread that may have broken off anywhere.
+    The C function `sleep` is installed as the handler of SIGABRT: the aborting thread sleeps for six seconds, the
+    number of the signal, in which the watchdog reports the lost process. It is C because the thread may have stopped
+    anywhere, where Python cannot run.
     """
     libc = ctypes.CDLL(None)
     libc.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)

@@ -15,7 +15,7 @@ from hma_jax.config import ConfigError
 from hma_jax.runtime import processes
 from hma_jax.runtime.exits import terminated_like_interrupted
 from hma_jax.runtime.processes import Processes
-from hma_jax.runtime.watchdog import DONE, FAILED, Board, Signs, Watchdog, visit
+from hma_jax.runtime.watchdog import DONE, FAILED, Heartbeats, HeartbeatServer, Watchdog, send_heartbeat
 from tests.multihost.processes import by_address, by_slurm, run
 
 
@@ -85,17 +85,17 @@ def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, mes
 
 
 class World:
-    """Signs of process `me` of three, and a clock that stands until it is told."""
+    """Heartbeats of process `me` of three, and a clock that stands until it is told."""
 
     def __init__(self, me: int):
         self.now = 0.0
-        self.signs = Signs(me, ["a", "b", "c"], "a:1", lost_after=90.0, clock=lambda: self.now)
+        self.heartbeats = Heartbeats(me, ["a", "b", "c"], "a:1", lost_after=90.0, clock=lambda: self.now)
 
     def after(self, seconds: float, heard: dict[int, list] | None = None) -> str | None:
         self.now += seconds
         if heard is not None:
-            self.signs.hear(heard)
-        return self.signs.verdict()
+            self.heartbeats.receive(heard)
+        return self.heartbeats.failure()
 
 
 def test_a_silent_process_is_lost_by_name_when_its_time_is_over():
@@ -118,7 +118,7 @@ def test_a_silent_coordinator_is_lost_and_nobody_else_is_blamed_for_its_silence(
 
 def test_a_coordinator_that_refuses_connections_is_lost_at_once():
     world = World(1)
-    world.signs.refused = True
+    world.heartbeats.refused = True
     assert "the coordinator at a:1: it has ended" in world.after(1)
 
 
@@ -133,7 +133,7 @@ def test_a_process_that_stood_still_itself_blames_nobody():
     world = World(1)
     assert world.after(1, {0: [1], 1: [1], 2: [1]}) is None
     world.now += 200
-    world.signs.excuse(200)
+    world.heartbeats.extend_deadlines(200)
     assert world.after(80) is None
     assert "lost process 0" in world.after(20)
 
@@ -142,7 +142,7 @@ def test_whoever_is_done_is_not_missed():
     world = World(1)
     assert world.after(1, {0: [DONE], 1: [1], 2: [DONE]}) is None
     assert world.after(500) is None
-    world.signs.refused = True
+    world.heartbeats.refused = True
     assert world.after(1) is None
 
 
@@ -153,22 +153,22 @@ def test_an_error_elsewhere_is_told_unless_this_process_has_it_too():
     assert World(2).after(9, {2: [FAILED, "disk full"], 0: [1], 1: [1]}) is None
 
 
-def test_signs_are_brought_to_the_board_and_those_of_all_come_back():
-    board = Board("word")
-    assert board.exchange(0, [1]) == {0: [1]}
-    assert visit("127.0.0.1", board.port, "word", 1, [7]) == {0: [1], 1: [7]}
+def test_heartbeats_are_sent_to_the_server_and_those_of_all_come_back():
+    server = HeartbeatServer("word")
+    assert server.exchange(0, [1]) == {0: [1]}
+    assert send_heartbeat("127.0.0.1", server.port, "word", 1, [7]) == {0: [1], 1: [7]}
     with pytest.raises(ConnectionResetError):
-        visit("127.0.0.1", board.port, "of another program", 1, [8])
-    with socket.create_connection(("127.0.0.1", board.port)) as stranger:
+        send_heartbeat("127.0.0.1", server.port, "of another program", 1, [8])
+    with socket.create_connection(("127.0.0.1", server.port)) as stranger:
         stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
-    assert visit("127.0.0.1", board.port, "word", 2, [1]) == {0: [1], 1: [7], 2: [1]}
-    board.shutdown()
-    board.server_close()
+    assert send_heartbeat("127.0.0.1", server.port, "word", 2, [1]) == {0: [1], 1: [7], 2: [1]}
+    server.shutdown()
+    server.server_close()
     with pytest.raises(ConnectionRefusedError):
-        visit("127.0.0.1", board.port, "word", 1, [9])
+        send_heartbeat("127.0.0.1", server.port, "word", 1, [9])
 
 
-def test_a_watchdog_leaves_with_the_verdict_and_not_after_its_own_end():
+def test_a_watchdog_ends_its_process_with_the_failure_and_not_after_its_own_end():
     heard, left = {1: [1]}, threading.Event()
     verdicts: list[str] = []
 
@@ -179,7 +179,7 @@ def test_a_watchdog_leaves_with_the_verdict_and_not_after_its_own_end():
     def exchange(process: int, sign: list) -> dict[int, list]:
         return heard | {process: sign}
 
-    dog = Watchdog(Signs(0, ["a", "b"], "a:1", lost_after=0.5), exchange, leave)
+    dog = Watchdog(Heartbeats(0, ["a", "b"], "a:1", lost_after=0.5), exchange, leave)
     assert left.wait(10) and "lost process 1 of 2 on host b" in verdicts[0]
     dog.end([DONE])
     seen = len(verdicts)
