@@ -12,7 +12,7 @@ from collections.abc import Callable
 from experiments.progress import errors
 from experiments.run_study import TrialsFailed
 from hma_jax.config import ConfigError
-from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
 
 
 def guarded(
@@ -32,7 +32,7 @@ def guarded(
     if own_process and not debug:
         _silence_background()
     try:
-        with terminated_like_interrupted():
+        with sigterm_as_interrupt():
             try:
                 work()
             except SystemExit:  # of --help

@@ -17,7 +17,7 @@ from rich.table import Column, Table
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.runner import Job, Monitor
-from hma_jax.runtime.exits import raise_lost_request
+from hma_jax.runtime.exits import raise_pending_stop
 
 
 class _Output(Console):
@@ -69,7 +69,7 @@ def step(title: str) -> Iterator[Update]:
 
         def update(done: int, total: int, note: str = "") -> None:
             nonlocal said
-            raise_lost_request()
+            raise_pending_stop()
             bars.update(task, completed=done, total=total, note=note)
             if not console.is_terminal and time.monotonic() - said >= SAY_EVERY:
                 said = time.monotonic()

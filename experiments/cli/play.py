@@ -15,7 +15,7 @@ from experiments.progress import console, say
 from experiments.setting import UNSET
 from experiments.words import few
 from hma_jax.config import ConfigError, ExecutionConfig, require
-from hma_jax.runtime.exits import raise_lost_request
+from hma_jax.runtime.exits import raise_pending_stop
 
 if TYPE_CHECKING:
     from data_pipelines.true_simulator import TrueSimulator
@@ -82,7 +82,7 @@ def play(
         say(f"note: {DEAF}")
     say(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling")
     warm_up(simulator, together=1)
-    raise_lost_request()
+    raise_pending_stop()
 
     def truth(robot: Robot) -> TrueSimulator | None:
         # What draws a physics simulator belongs to one thread; turns are taken in several.

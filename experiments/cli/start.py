@@ -3,7 +3,7 @@
 import faulthandler
 import sys
 
-from hma_jax.runtime.exits import exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt
 from hma_jax.runtime.host_memory import restart_keeping_pages
 
 
@@ -11,7 +11,7 @@ def start() -> None:
     faulthandler.enable()  # what each thread did, when a library ends the process by a signal
     restart_keeping_pages()
     try:
-        with terminated_like_interrupted():
+        with sigterm_as_interrupt():
             from experiments.cli.main import main
 
             code = main()

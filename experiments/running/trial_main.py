@@ -18,7 +18,7 @@ from pathlib import Path
 
 from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, RUN, attempt
 from experiments.running.children import enter_child
-from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_pending_stop, sigterm_as_interrupt
 
 POLL_SECONDS = 30.0
 """Seconds between two checks that the trial is still ours."""
@@ -29,7 +29,7 @@ def main(directory: Path) -> int:
     written; STOPPED or INTERRUPTED: the next attempt goes on from here."""
     enter_child()  # before anything imports JAX
     try:
-        with terminated_like_interrupted(), attempt(directory) as lock:
+        with sigterm_as_interrupt(), attempt(directory) as lock:
             if (directory / RESULT).exists():  # another attempt finished while this one waited
                 return Exit.DONE
             return _run(directory, lock.lost)
@@ -123,7 +123,7 @@ class _ProgressFile:
         self.polled = time.monotonic()
 
     def __call__(self, phase: str, done: int, total: int) -> None:
-        raise_lost_request()
+        raise_pending_stop()
         now = time.monotonic()
         if now - self.polled >= POLL_SECONDS:
             self.polled = now

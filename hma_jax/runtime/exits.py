@@ -1,4 +1,4 @@
-"""How every program of this project ends: its exit codes, declared here and listed in docs/reliability.md."""
+"""Exit codes of every program of this project, listed in docs/reliability.md, and how signals stop it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ IMPORTER = "<frozen importlib._bootstrap>"
 COMPILER = "compile_or_get_cached"
 """JAX's function around the compiler, in its file compiler.py."""
 
-LOOK_EVERY = 0.05
-"""Seconds between two looks whether what a request to stop waits for has ended."""
+RETRY_EVERY = 0.05
+"""Seconds after which a signal that came during an import or a compilation is delivered again."""
 
 
 class Exit(IntEnum):
@@ -37,77 +37,78 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM, as schedulers send it: a program ends as it does on Ctrl-C."""
 
 
-_raised: list[Exit] = []
-"""Requests whose exceptions were raised in a block that has not ended, or that were handed on there."""
+_pending: list[Exit] = []
+"""Stop requests of the running blocks whose exceptions may have been swallowed, or that `leave_stop_pending` kept."""
 
-_blocks = 0
-"""Of `terminated_like_interrupted`, that have not ended."""
+_active_blocks = 0
+"""How many blocks of `sigterm_as_interrupt` are running."""
 
 
 @contextmanager
-def terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM raises Terminated in the main thread while the block runs; by default the process would just be gone.
+def sigterm_as_interrupt() -> Iterator[None]:
+    """SIGTERM raises Terminated in the main thread while the block runs; by default it would end the process at once.
 
-    It waits for imports to end, and so does Ctrl-C: an exception in the middle of one is lost where a library tries
-    what it can import, leaves half a module, or ends the process by a signal in a library's C code. It waits for the
-    compiler too, which cannot be interrupted: raised between its end and the use of the program that it made, an
-    exception loses the program, and the process ends by a segmentation fault.
+    Both signals are held back during imports: an exception in the middle of one is swallowed where a library tries
+    whether a module exists, leaves a module half initialised, or crashes a library's C code. They are held back during
+    compilation too, which cannot be interrupted: an exception raised before the compiled program is used ends the
+    process by a segmentation fault.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _waits(frame):
-            again = threading.Timer(LOOK_EVERY, os.kill, (os.getpid(), number))
+        if _in_import_or_compiler(frame):
+            again = threading.Timer(RETRY_EVERY, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
             return
-        _raised.append(Exit(128 + number))
+        _pending.append(Exit(128 + number))
         raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
-    global _blocks
+    global _active_blocks
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may install handlers
         return
     before = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # otherwise it is ignored, or handled already
         before[signal.SIGINT] = signal.signal(signal.SIGINT, stop)
-    _blocks += 1
+    _active_blocks += 1
     try:
         yield
     finally:
-        _blocks -= 1
-        _raised.clear()
+        _active_blocks -= 1
+        _pending.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-def hand_on(request: Exit) -> None:
-    """A request to stop that came too late for what had taken the signals for itself: `lost_request` tells what comes
-    after it. Where no block of `terminated_like_interrupted` asks for that, it is forgotten."""
-    if _blocks:
-        _raised.append(request)
+def leave_stop_pending(request: Exit) -> None:
+    """Keeps a stop request that came too late for code with signal handlers of its own (the training loop in its last
+    step): `take_pending_stop` returns it. Outside of `sigterm_as_interrupt` it is dropped."""
+    if _active_blocks:
+        _pending.append(request)
 
 
-def lost_request() -> Exit | None:
-    """A request to stop whose exception has come to nothing, as it does in a callback of a library, or that was handed
-    on; told once.
+def take_pending_stop() -> Exit | None:
+    """The stop request that is pending, once: its exception was swallowed, as in a callback of a library, or it was
+    left pending. None if there is none.
 
-    For what takes long to ask now and then, before it ends a block of `terminated_like_interrupted` itself.
+    Long computations inside a block of `sigterm_as_interrupt` should ask from time to time.
     """
-    request = _raised[-1] if _raised else None
-    _raised.clear()
+    request = _pending[-1] if _pending else None
+    _pending.clear()
     return request
 
 
-def raise_lost_request() -> None:
-    """In the main thread; others have no requests."""
+def raise_pending_stop() -> None:
+    """Raises the pending stop request, if there is one. Does nothing outside the main thread, which alone gets
+    signals."""
     if threading.current_thread() is not threading.main_thread():
         return
-    if (request := lost_request()) is not None:
+    if (request := take_pending_stop()) is not None:
         raise KeyboardInterrupt if request == Exit.INTERRUPTED else Terminated
 
 
-def _waits(frame: FrameType | None) -> bool:
-    """Whether it imports or compiles."""
+def _in_import_or_compiler(frame: FrameType | None) -> bool:
+    """Whether the interrupted code is inside an import or the compiler."""
     while frame is not None:
         code = frame.f_code
         if code.co_filename == IMPORTER or (code.co_name == COMPILER and code.co_filename.endswith("compiler.py")):

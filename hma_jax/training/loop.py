@@ -31,7 +31,7 @@ import numpy as np
 
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.cores import usable_cores
-from hma_jax.runtime.exits import Exit, hand_on, lost_request
+from hma_jax.runtime.exits import Exit, leave_stop_pending, take_pending_stop
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
@@ -263,34 +263,34 @@ def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:
 class _Stop(threading.Event):
     """Set when the run is asked to stop; `exit` says how."""
 
-    exit = Exit.STOPPED  # of a process that another one tells
+    exit = Exit.STOPPED  # where another process of the program was asked
 
 
 @contextmanager
 def _stop_requests() -> Iterator[_Stop]:
-    """An event set by SIGINT or SIGTERM; a second signal acts as usual. A request that the block has not heeded is for
-    what comes after it."""
+    """An event set by SIGINT or SIGTERM; a second signal acts as usual. A request that the block did not act on is left
+    pending for the code after it."""
     event = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield event  # only the main thread may install handlers
         return
     previous = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
 
-    def request(number: int, frame: object) -> None:
+    def on_signal(number: int, frame: object) -> None:
         del frame
         event.exit = Exit(128 + number)
         event.set()
         signal.signal(number, previous[number])
 
     for number in previous:
-        signal.signal(number, request)
-    if (lost := lost_request()) is not None:  # of the time before, when it should have raised an exception
-        event.exit = lost
+        signal.signal(number, on_signal)
+    if (pending := take_pending_stop()) is not None:  # of a signal before this block whose exception was swallowed
+        event.exit = pending
         event.set()
     try:
         yield event
         if event.is_set():  # in the last step, after which there is nothing left to stop here
-            hand_on(event.exit)
+            leave_stop_pending(event.exit)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -16,7 +16,7 @@ from experiments.running.children import enter_child
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job, run_missing
-from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
 
 THREE = [Job(f"t{i}", f"trial {i}", {"steps": 8, "seconds": 0.05, "end": "result"}) for i in range(3)]
 
@@ -68,7 +68,7 @@ if __name__ == "__main__":
     else:
         enter_child()
         try:
-            with terminated_like_interrupted(), attempt(Path(sys.argv[1])):
+            with sigterm_as_interrupt(), attempt(Path(sys.argv[1])):
                 sys.exit(count_to_the_end(Path(sys.argv[1])))
         except KeyboardInterrupt as request:
             sys.exit(exit_of_interrupt(request))

@@ -12,7 +12,7 @@ import jax
 import pytest
 from jax._src import compiler
 
-from hma_jax.runtime.exits import Exit, Terminated, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, Terminated, exit_of_interrupt, raise_pending_stop, sigterm_as_interrupt
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
 
@@ -26,7 +26,7 @@ def test_every_code_is_documented():
 
 def test_sigterm_ends_a_block_as_ctrl_c_does_with_a_code_of_its_own():
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+    with pytest.raises(KeyboardInterrupt) as stopped, sigterm_as_interrupt():
         os.kill(os.getpid(), signal.SIGTERM)
     assert stopped.type is Terminated and exit_of_interrupt(stopped.value) == Exit.STOPPED == 143
     assert exit_of_interrupt(KeyboardInterrupt()) == Exit.INTERRUPTED == 130
@@ -40,7 +40,7 @@ def test_a_request_to_stop_waits_for_the_import_that_it_meets(number, code, tmp_
     (tmp_path / f"{name}.py").write_text(f"import os\nos.kill(os.getpid(), {int(number)})\nwhole = sum(range(10**5))\n")
     monkeypatch.syspath_prepend(tmp_path)
     before = signal.getsignal(number)
-    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+    with pytest.raises(KeyboardInterrupt) as stopped, sigterm_as_interrupt():
         try:
             module = __import__(name)
         except BaseException as error:
@@ -61,7 +61,7 @@ def test_a_request_to_stop_waits_for_the_program_that_is_compiled(number, code, 
 
     monkeypatch.setattr(compiler, "backend_compile_and_load", compile_and_load)
     monkeypatch.setattr(compiler.compilation_cache, "is_cache_used", lambda backend: False)
-    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+    with pytest.raises(KeyboardInterrupt) as stopped, sigterm_as_interrupt():
         jax.jit(lambda x: x + int(number))(1.0)
         time.sleep(10)
     assert len(compiled) == 1 and exit_of_interrupt(stopped.value) == code
@@ -70,10 +70,10 @@ def test_a_request_to_stop_waits_for_the_program_that_is_compiled(number, code, 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
 def test_a_request_that_came_to_nothing_is_raised_again_once(number, code):
     """In a callback of a library, a finaliser say, exceptions are lost."""
-    raise_lost_request()
-    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+    raise_pending_stop()
+    with pytest.raises(KeyboardInterrupt) as stopped, sigterm_as_interrupt():
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), number)
-        raise_lost_request()
+        raise_pending_stop()
     assert exit_of_interrupt(stopped.value) == code
-    raise_lost_request()
+    raise_pending_stop()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.exits import Exit, Terminated, raise_lost_request, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, Terminated, raise_pending_stop, sigterm_as_interrupt
 from hma_jax.training.claim import RunBusy, locked_run
 from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions, Watch
@@ -271,7 +271,7 @@ def test_states_of_a_run_and_a_resumed_run_are_equal_bit_for_bit(tmp_path: Path)
 
 
 def test_a_request_that_was_lost_before_training_stops_it_after_a_step(tmp_path: Path):
-    with terminated_like_interrupted():
+    with sigterm_as_interrupt():
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
         with pytest.raises(Interrupted) as stopped:
@@ -286,10 +286,10 @@ def test_a_request_in_the_last_step_stops_what_comes_after_training(tmp_path: Pa
         if step == steps:
             signal.raise_signal(signal.SIGTERM)
 
-    with terminated_like_interrupted():
+    with sigterm_as_interrupt():
         fit_toy(tmp_path / "trial", progress=stop)
         assert list_steps(tmp_path / "trial" / "checkpoints") == [6]
         with pytest.raises(Terminated):
-            raise_lost_request()
+            raise_pending_stop()
     fit_toy(tmp_path / "by itself", progress=stop)
     fit_toy(tmp_path / "the next", steps=3)  # is not stopped by what nobody asked for

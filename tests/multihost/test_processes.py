@@ -13,7 +13,7 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime import processes
-from hma_jax.runtime.exits import terminated_like_interrupted
+from hma_jax.runtime.exits import sigterm_as_interrupt
 from hma_jax.runtime.processes import Processes
 from hma_jax.runtime.watchdog import DONE, FAILED, Heartbeats, HeartbeatServer, Watchdog, send_heartbeat
 from tests.multihost.processes import by_address, by_slurm, run
@@ -80,7 +80,7 @@ def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, mes
     monkeypatch.setattr(processes.jax.distributed, "initialize", initialize)
     monkeypatch.setattr(processes, "_exit_now", leave)
     asked = Processes("a:1", 2, 0, start_timeout=1.0)
-    with pytest.raises(Left, match=f"{code}: {message}"), terminated_like_interrupted():
+    with pytest.raises(Left, match=f"{code}: {message}"), sigterm_as_interrupt():
         processes.start(asked)
 
 

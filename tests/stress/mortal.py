@@ -24,7 +24,7 @@ import hma_jax.tokenizers.train
 import hma_jax.training.train  # noqa: F401
 from experiments.cli.main import main
 from experiments.running import children
-from hma_jax.runtime.exits import exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt
 from tests.stress.tokenize_process import end_in_save, write
 
 
@@ -40,7 +40,7 @@ def run(
     os.dup2(said, 2)
     steps = end_in_save(log, ends_in, how)
     try:
-        with terminated_like_interrupted():
+        with sigterm_as_interrupt():
             begun.set()
             code = main(arguments)
     except KeyboardInterrupt as request:  # a moment before `main` was ready for it
