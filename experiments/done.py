@@ -26,7 +26,7 @@ from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
-from hma_jax.training.claim import CHECKPOINTS, list_steps
+from hma_jax.training.run_lock import CHECKPOINTS, list_steps
 
 UNKNOWN = Provenance("", "", "")
 """Stands in where nothing is known of it, and only the trials' own fields matter."""

@@ -23,7 +23,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import Study, on_tokenizer, on_user_data
 from experiments.words import few
 from hma_jax.config import ConfigError, ModelConfig
-from hma_jax.training.claim import is_address
+from hma_jax.training.run_lock import is_address
 
 Preset = Literal[
     "smoke",

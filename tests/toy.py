@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.training.divergence import Records
-from hma_jax.training.loop import FitResult, Start, fit
+from hma_jax.training.loop import FitResult, RunInfo, fit
 from hma_jax.training.state import FINITE, TrainState
 
 SIZE = (1000,)
@@ -53,11 +53,11 @@ def fit_toy(
     *,
     step: Any = toy_step,
     make: Batches = toy_batches,
-    about: dict[str, Any] | None = None,
+    info: dict[str, Any] | None = None,
     records: Records = lambda index: (),
     **options: Any,
 ) -> FitResult:
     """Trains, or goes on; `step` is jitted here unless it can be lowered as it is."""
     step_fn = step if hasattr(step, "lower") else jax.jit(step, donate_argnums=0)
-    start = Start(about or {"toy": 1}, records=records)
-    return fit(step_fn, toy_shapes(), toy_state, make, steps=steps, run_dir=run_dir, about=start, **options)
+    start = RunInfo(info or {"toy": 1}, records=records)
+    return fit(step_fn, toy_shapes(), toy_state, make, steps=steps, run_dir=run_dir, info=start, **options)

@@ -18,7 +18,7 @@ from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import FILE, WindowTable
-from hma_jax.training.claim import CHECKPOINTS
+from hma_jax.training.run_lock import CHECKPOINTS
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,8 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 from hma_jax.training.checkpoints import Checkpoints
-from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.hashes import write_list
+from hma_jax.training.run_lock import CHECKPOINTS
 from hma_jax.training.runs import describe_run, load_run
 
 REPORT, CLIP = "report.json", "clip.gif"

@@ -66,7 +66,7 @@ def evaluate_model(
     """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may
     be replaced."""
     from hma_jax.runtime.processes import is_writer
-    from hma_jax.training.claim import EVALUATION, locked_run
+    from hma_jax.training.run_lock import EVALUATION, locked_run
     from hma_jax.training.runs import load_model
 
     require_local("--to", to)

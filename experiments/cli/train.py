@@ -22,7 +22,7 @@ from experiments.words import counted, few
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.config.json import diff
-from hma_jax.training.claim import CHECKPOINTS, require_plain
+from hma_jax.training.run_lock import CHECKPOINTS, require_plain
 
 if TYPE_CHECKING:
     from experiments.running.run_trial import PreparedData

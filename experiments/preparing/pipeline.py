@@ -22,7 +22,7 @@ from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from hma_jax.evaluation.lpips import require_lpips
-from hma_jax.training.claim import require_plain
+from hma_jax.training.run_lock import require_plain
 
 
 def prepare(

@@ -15,7 +15,7 @@ from experiments.running.sealed import RESULT, read_result
 from experiments.running.trial import trial_id
 from experiments.words import few
 from hma_jax.config import ConfigError, require
-from hma_jax.training.claim import CHECKPOINTS
+from hma_jax.training.run_lock import CHECKPOINTS
 
 
 @dataclass

@@ -62,10 +62,10 @@ def begin_shared(directory: Path, before: Iterable[tuple[str, int]]) -> tuple[st
     Its record then has the sources and machines of both. Returns whose it was and its step; None if it begins by
     itself, or has begun.
     """
-    from hma_jax.training.branch import begin_from, has_begun
+    from hma_jax.training.branch import begin_from, has_checkpoint
 
     best, step = latest_common(directory.parent, before)
-    if not step or has_begun(directory / RUN):
+    if not step or has_checkpoint(directory / RUN):
         return None
     record_origin(directory, directory.parent / best)  # first: a copy that is cut short is made again
     begin_from(directory.parent / best / RUN, directory / RUN, step)

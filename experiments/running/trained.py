@@ -17,7 +17,7 @@ from experiments.running.closure import Closure, changed
 from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of, read_record
 from experiments.running.trial import Trial, trial_id
-from hma_jax.training.claim import CHECKPOINTS
+from hma_jax.training.run_lock import CHECKPOINTS
 
 
 def find_trained(

@@ -13,8 +13,8 @@ from hma_jax.convert.atomic import atomic_directory
 from hma_jax.model.params import Use
 from hma_jax.runtime.files import write_file
 from hma_jax.training.checkpoints import Checkpoints
-from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.optimizer import AdamState
+from hma_jax.training.run_lock import CHECKPOINTS
 from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState
 

@@ -135,7 +135,7 @@ def start(asked: Processes) -> None:
         reason = " ".join(str(failed[0]).split())[:300]
         raise ConfigError(_join_failure(asked, reason)) from failed[0]
     if jax.process_count() > 1:
-        _watch(asked.lost_after)
+        _start_watchdog(asked.lost_after)
 
 
 def _join_failure(asked: Processes, reason: str) -> str:
@@ -152,7 +152,7 @@ def _exit_now(message: str, code: int) -> None:
     os._exit(code)
 
 
-def _watch(lost_after: float) -> None:
+def _start_watchdog(lost_after: float) -> None:
     me, hosts = jax.process_index(), all_gather("host", socket.gethostname())
     token, host = secrets.token_hex(8), _state().coordinator_address.rpartition(":")[0]
     if me == 0:

@@ -28,7 +28,7 @@ from hma_jax.tokenizers.network import from_pixels
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
 from hma_jax.tokenizers.shared import require_images
 from hma_jax.training.divergence import Records
-from hma_jax.training.loop import LoopOptions, Progress, Start, fit
+from hma_jax.training.loop import LoopOptions, Progress, RunInfo, fit
 from hma_jax.training.state import FINITE, TrainState, all_finite, with_sharding
 
 
@@ -71,7 +71,7 @@ def train_tokenizer(
         make_batches,
         steps=train.steps,
         run_dir=run_dir,
-        about=Start(described, modernise=_modernise, records=records),
+        info=RunInfo(described, modernise=_modernise, records=records),
         put_batch=put,
         options=options,
         progress=progress,

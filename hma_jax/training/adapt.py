@@ -1,7 +1,7 @@
 """New robots for a trained model: their own slices are appended, what was there stays.
 
-Everything a robot owns has an embodiment axis, and widths of actions are padded to U, so a
-wider newcomer adds rows of zeros that nobody's padded actions ever meet.
+All per-robot parameters have an embodiment axis, and actions are padded to U. A new robot with wider actions adds rows
+to the old robots' slices; these are zeros, and so are the padded actions that they multiply.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def add_embodiments(
 ) -> tuple[Params, EmbodimentTable]:
     """Parameters and table with the `new` robots after those of `table`.
 
-    What the model says of the old robots does not change by a bit. The new slices are drawn as
+    Predictions for the old robots do not change by a bit. The new slices are drawn as
     in a model that had the robots from the start, from `seed`. Raises ConfigError for a name that
     the table has already.
     """

@@ -10,10 +10,10 @@ from hma_jax.training.optimizer import Presence
 
 
 def update_average(ema: Params, params: Params, specs: Params, presence: Presence, decay: float) -> Params:
-    """decay * ema + (1 - decay) * params, for what the step concerned.
+    """decay * ema + (1 - decay) * params, for the parameters that the step updates (`Presence`).
 
-    An average starts as the first parameters. A robot without an example keeps its average as it
-    keeps its parameters: its average counts the steps in which it was there.
+    The average starts as a copy of the initial parameters. A robot without an example keeps its average as it keeps its
+    parameters: its average is over the steps that had examples of it.
     """
 
     def update(spec: ParamSpec, old: jax.Array, new: jax.Array) -> jax.Array:

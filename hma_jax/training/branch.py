@@ -1,4 +1,4 @@
-"""A run that begins where another one was: what both have in common is trained once.
+"""A run that starts from a checkpoint of another: the steps that both have in common are trained once.
 
 With the schedule wsd, runs that differ in their number of steps alone are the same until the earlier one decays
 (`optimizer.steps_in_common`). A run that continues from there leaves the same bytes as one that was trained from its
@@ -11,8 +11,8 @@ import os
 import shutil
 from pathlib import Path
 
-from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.reading import list_steps
+from hma_jax.training.run_lock import CHECKPOINTS
 
 LOGS = ("metrics.jsonl", "validation.jsonl", "timing.jsonl")
 """Cut after the step from which a run goes on when it starts (`log.RunLog`)."""
@@ -23,7 +23,7 @@ def last_step(run_dir: Path, latest: int) -> int:
     return max((step for step in list_steps(run_dir / CHECKPOINTS) if step <= latest), default=0)
 
 
-def has_begun(run_dir: Path) -> bool:
+def has_checkpoint(run_dir: Path) -> bool:
     """Whether a run has a checkpoint."""
     return bool(list_steps(run_dir / CHECKPOINTS))
 
@@ -35,7 +35,7 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
     checkpoint appears whole or not at all. Whether the two runs agree is checked when it is restored. Raises OSError.
     """
     step = last_step(source, latest)
-    if not step or has_begun(run_dir):
+    if not step or has_checkpoint(run_dir):
         return None
     place = run_dir / CHECKPOINTS / str(step)
     place.parent.mkdir(parents=True, exist_ok=True)

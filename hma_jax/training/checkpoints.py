@@ -27,7 +27,6 @@ from orbax.checkpoint import v1 as ocp
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
 from hma_jax.runtime.processes import broadcast_from_writer, is_writer, writer_first
-from hma_jax.training.claim import require_plain
 from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
     CheckpointError,
@@ -37,6 +36,7 @@ from hma_jax.training.reading import (
     load_items,
     read_description,
 )
+from hma_jax.training.run_lock import require_plain
 
 Description = dict[str, Any]
 log = logging.getLogger(__name__)

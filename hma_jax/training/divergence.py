@@ -1,4 +1,4 @@
-"""A step whose numbers are not finite: what is said of it, and of the batch that it was given.
+"""A step whose numbers are not finite: the error, and the record of the batch that it was given.
 
 DIFFERS: the release goes on after a loss that is NaN, with a gradient of zeros (reference section 4.1).
 """
@@ -15,7 +15,7 @@ from hma_jax.runtime.files import write_file
 from hma_jax.training.state import FINITE
 
 FILE = "diverged.json"
-SAID = 4
+MAX_LISTED = 4
 """Records of a batch in the message; the file has all."""
 
 Records = Callable[[int], Sequence[str]]
@@ -44,8 +44,8 @@ def require_finite(step: int, values: Mapping[str, float], run_dir: Path | None,
         _write(run_dir / FILE, {"step": step, "what": what, "records": batch})
     few = ""
     if batch:
-        more = f" and {len(batch) - SAID} more, listed in {FILE} of the run" if len(batch) > SAID else ""
-        few = f"its batch was {'; '.join(batch[:SAID])}{more}; if these are sound, "
+        more = f" and {len(batch) - MAX_LISTED} more, listed in {FILE} of the run" if len(batch) > MAX_LISTED else ""
+        few = f"its batch was {'; '.join(batch[:MAX_LISTED])}{more}; if these are sound, "
     raise DivergedError(
         f"{what}; {few}lower the learning rate or lengthen the warm-up, in a new output directory: that is another run "
         "(the last checkpoint of this one is kept)"

@@ -15,8 +15,8 @@ from typing import Any, TextIO
 from hma_jax.config import ConfigError
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.processes import is_writer
-from hma_jax.training.board import Board
 from hma_jax.training.checkpoints import SaveError
+from hma_jax.training.tensorboard import TensorBoardWriter
 
 Progress = Callable[[int, int, dict[str, float]], None]
 """Called as progress(step, steps, metrics) after every step; once the run was validated, with the latest
@@ -84,7 +84,7 @@ class RunLog:
         self.mark, self.flushed = (clock(), start), clock()
         self.files: dict[str, TextIO] = {}
         with self._writing("tensorboard"):
-            self.board = Board(run_dir / "tensorboard", start + 1)
+            self.tensorboard = TensorBoardWriter(run_dir / "tensorboard", start + 1)
 
     def _cut(self, name: str, step: int) -> list[dict[str, Any]]:
         """Drops what comes after `step`, and a torn line. Returns the records kept."""
@@ -117,7 +117,7 @@ class RunLog:
         self._append("metrics.jsonl", {"step": step, **values})
         if step % self.every == 0 or step == self.steps:
             self._write_timing(step)
-            self._show(step, values)
+            self._write_tensorboard(step, values)
         if self.clock() - self.flushed > FLUSH_SECONDS:
             self.flush()
         if self.progress is not None:
@@ -126,7 +126,7 @@ class RunLog:
     def write_validation(self, step: int, values: Mapping[str, float]) -> None:
         self._append("validation.jsonl", {"step": step, **values})
         self.validation = {f"validation/{name}": value for name, value in values.items()}
-        self._show(step, self.validation)
+        self._write_tensorboard(step, self.validation)
 
     def _write_timing(self, step: int) -> None:
         now = self.clock()
@@ -138,11 +138,11 @@ class RunLog:
             if self.peak_flops:
                 record["mfu"] = record["flops_per_second"] / self.peak_flops
         self._append("timing.jsonl", {"step": step, **record})
-        self._show(step, {f"timing/{name}": value for name, value in record.items()})
+        self._write_tensorboard(step, {f"timing/{name}": value for name, value in record.items()})
 
-    def _show(self, step: int, values: Mapping[str, float]) -> None:
+    def _write_tensorboard(self, step: int, values: Mapping[str, float]) -> None:
         with self._writing("tensorboard"):
-            self.board.show(step, values)
+            self.tensorboard.write(step, values)
 
     def _append(self, name: str, record: Mapping[str, Any]) -> None:
         with self._writing(name):
@@ -158,11 +158,11 @@ class RunLog:
                 file.flush()
                 os.fsync(file.fileno())
         with self._writing("tensorboard"):
-            self.board.flush()
+            self.tensorboard.flush()
 
     def close(self) -> None:
         """Does not fail: what matters was flushed before, and a full disk reported."""
-        for file in (*self.files.values(), self.board):
+        for file in (*self.files.values(), self.tensorboard):
             with suppress(OSError):
                 file.close()
 

@@ -6,13 +6,13 @@ before it reads the metrics of step n, so the device never waits for the log.
 Files of a run directory:
     metrics.jsonl     one line per step, deterministic fields only: a run that was killed and
                       resumed leaves the same bytes as one that was not
-    validation.jsonl  what the run was watched on, every so many steps; the same holds
+    validation.jsonl  held-out loss, every so many steps; deterministic too
     timing.jsonl      seconds, throughput, utilisation: whatever depends on the machine
     execution.jsonl   one line per start of the run: from which step, how and on what it is computed
     tensorboard/      the same for TensorBoard
-    checkpoints/      see `checkpoints`; damaged/ holds those that were passed over
+    checkpoints/      see `checkpoints`; damaged/ holds those that were skipped
     diverged.json     of the last step that was not finite: its number, and the records of its batch
-    .lock             held by the process that trains, see `claim`
+    .lock             held by the process that trains, see `run_lock`
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from hma_jax.runtime.exits import Exit, leave_stop_pending, take_pending_stop
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
-from hma_jax.training.claim import CHECKPOINTS, locked_run
 from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Listener, Progress, RunLog, open_log
+from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 from hma_jax.training.state import FINITE
 
 
@@ -64,7 +64,7 @@ class LoopOptions:
     log_every: int = 10  # steps between lines of timing.jsonl
     flops_per_step: float = 0.0  # by formula, for achieved FLOP/s; 0: unknown
     peak_flops: float | None = None  # of all devices together, for MFU
-    # Fields of the description that may change where a run resumes: asked with what the checkpoint says, and its step.
+    # may_change(the checkpoint's description, its step) -> names of fields that may differ when a run resumes.
     may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: ()
     clock: Callable[[], float] = time.perf_counter  # seconds
 
@@ -74,22 +74,22 @@ class LoopOptions:
 
 
 @dataclass(frozen=True)
-class Watch:
-    """Something measured of the state every `every` steps and after the last, written to validation.jsonl."""
+class ValidationHook:
+    """Metrics of the state, measured every `every` steps and after the last, written to validation.jsonl."""
 
     every: int
     measure: Callable[[Any], Mapping[str, float]]
 
 
 @dataclass(frozen=True)
-class Start:
-    """What a run says of itself when it starts."""
+class RunInfo:
+    """What identifies a run, and how it is computed."""
 
-    description: Description  # what it is: compared with the checkpoint's
+    description: Description  # its identity: compared with the checkpoint's
     execution: Mapping[str, Any] = field(default_factory=dict)  # how it is computed: recorded only
     # Brings a description that an earlier version wrote to today's form.
     modernise: Callable[[Description], Description] = lambda described: described
-    # Asked when a step was not finite.
+    # Called for the error message when a step was not finite.
     records: Records = lambda index: ()
 
 
@@ -110,10 +110,10 @@ def fit(
     *,
     steps: int,
     run_dir: Path,
-    about: Start,
+    info: RunInfo,
     put_batch: Callable[[Any], Any] = jax.device_put,
     options: LoopOptions = LoopOptions(),
-    watch: Watch | None = None,
+    validation: ValidationHook | None = None,
     progress: Progress | None = None,
 ) -> FitResult:
     """Runs `step_fn` until `steps`, resuming from the latest checkpoint in `run_dir`.
@@ -123,7 +123,7 @@ def fit(
     `shapes` are the state's, with shardings; `make_state()` is called only when nothing is restored,
     so that there never are two. `make_batches(start)` yields host batches from step `start` on.
     With several processes (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin
-    with this start. A stop that any of them was asked for, and saves by the minute, come after the same step for all.
+    with this start. When any of them is asked to stop, or a save by the minute is due, all do so after the same step.
     Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy, and ConfigError for batches that end before
     the steps do.
     """
@@ -132,7 +132,7 @@ def fit(
     with (
         locked_run(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
-            run_dir / CHECKPOINTS, about.description, options.keep_checkpoints, about.modernise, options.keep_steps
+            run_dir / CHECKPOINTS, info.description, options.keep_checkpoints, info.modernise, options.keep_steps
         ) as checkpoints,
         _stop_requests() as stop,
     ):
@@ -153,7 +153,7 @@ def fit(
         with closing(log):
             if start >= steps:
                 return FitResult(state, log.losses, 0.0, 0.0, start)
-            log.write_start(_describe_start(start, about.execution))
+            log.write_start(_describe_start(start, info.execution))
             batches = make_batches(start)
             batch = put_batch(_next(batches, start, steps))
             began = clock()
@@ -163,7 +163,7 @@ def fit(
             barrier("compiled")
 
             began = saved = clock()
-            watching = 0.0  # seconds
+            validation_seconds = 0.0  # seconds
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
 
@@ -175,21 +175,21 @@ def fit(
                 if step < steps:
                     batch = put_batch(_next(batches, step, steps))
                 if pending is not None:
-                    _report(log, *pending, about.records)
+                    _report(log, *pending, info.records)
                 pending = (step, metrics)
                 checkpoints.raise_failure()
                 wanted = agreement.result(request)
                 last, stopping = step == steps, wanted == STOP
-                to_watch = watch is not None and (last or step % watch.every == 0)
+                to_validate = validation is not None and (last or step % validation.every == 0)
                 to_save = last or wanted or _is_due(step, options)
-                if to_watch or to_save:
-                    _report(log, *pending, about.records)  # a diverged step is neither watched nor saved
+                if to_validate or to_save:
+                    _report(log, *pending, info.records)  # a diverged step is neither validated nor saved
                     pending = None
-                if to_watch:
+                if to_validate:
                     before = clock()
-                    log.write_validation(step, watch.measure(state))
+                    log.write_validation(step, validation.measure(state))
                     log.discount(clock() - before)
-                    watching += clock() - before
+                    validation_seconds += clock() - before
                 if to_save:
                     log.flush()
                     _require_held(lock, run_dir, step)
@@ -202,7 +202,7 @@ def fit(
                         f"stopped at step {step} of {steps}; the same command resumes from {run_dir}", stop.exit
                     )
             jax.block_until_ready(state)
-            seconds = clock() - began - watching
+            seconds = clock() - began - validation_seconds
             checkpoints.wait()
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 
@@ -216,7 +216,7 @@ def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
 
 
 def _report(log: RunLog | Listener, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
-    """Writes a step's metrics. Raises DivergedError, and writes none of them, if it was not finite."""
+    """Writes a step's metrics. Raises DivergedError, and writes nothing, if they are not finite."""
     # With as many digits as single precision has: half the bytes of a log, and nothing is lost.
     values = {name: float(str(np.float32(value))) for name, value in jax.device_get(metrics).items()}
     require_finite(step, values, log.run_dir, records)

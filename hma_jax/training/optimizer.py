@@ -1,4 +1,4 @@
-"""AdamW, and Muon for matrices, with muP multipliers; what a step does not concern stands still.
+"""AdamW, and Muon for matrices, with muP multipliers; parameters without an example in a step are not updated.
 
 Multipliers, decay mask, embodiment axes and uses are read off the parameter declarations. A
 robot without an example in the global batch keeps its slices, moments and bias-correction
@@ -23,7 +23,7 @@ from hma_jax.training.robots import Active
 
 
 class Presence(NamedTuple):
-    """What a step concerns: per use of a parameter, whether it has any example, and each robot's."""
+    """Which parameters a step updates: for each `Use`, whether the batch has an example of it, and for which robots."""
 
     shared: dict[Use, jax.Array]  # bool []
     robots: dict[Use, jax.Array]  # bool [E]
@@ -45,9 +45,9 @@ class AdamState(NamedTuple):
 def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
     """Learning rate at the muP base width for each step, linear warm-up first.
 
-    `constant` holds, `cosine` falls towards final_fraction over the whole run, `wsd` holds and then
-    falls towards it linearly during the last decay_fraction of the steps. Both would be there with the step after the
-    last: of a decay over n steps by wsd the last one is an n-th of the way above it.
+    `constant` holds, `cosine` falls towards final_fraction over the whole run, `wsd` holds and then falls towards it
+    linearly during the last decay_fraction of the steps. Both would reach it one step after the last: the last of n
+    decay steps of wsd is still 1 / n of the way above it.
     """
     peak, end = config.learning_rate, config.learning_rate * config.final_fraction
     warmup = min(config.warmup_steps, steps)

@@ -19,8 +19,8 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.processes import all_gather
-from hma_jax.training.claim import list_steps
 from hma_jax.training.hashes import Chosen, Damaged, verify
+from hma_jax.training.run_lock import list_steps
 
 WHOLE_STATE = "state"
 """The one item of checkpoints that were written before there were several."""

@@ -17,8 +17,8 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params, inference_params
 from hma_jax.runtime.devices import default_device
-from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.reading import CheckpointError, has_item, list_steps, load_items, read_description
+from hma_jax.training.run_lock import CHECKPOINTS
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def micro_batches(batch: Any, accumulate: int) -> Any:
 
 
 def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
-    """Raises ConfigError if nothing of these robots is predicted: every loss would be a mean over no target, 0."""
+    """Raises ConfigError if these robots have no targets: every loss would be a mean over none, 0."""
     frames = masking.predicts_frames and any(robot.video_targets for robot in robots)
     actions = masking.predicts_actions and any(robot.chunk for robot in robots)
     predicted = "frames" if masking.predicts_frames else "actions"
@@ -147,7 +147,7 @@ def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
 
 
 def check_own(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
-    """Raises ConfigError if nothing that only these robots have would move, however long it is trained."""
+    """Raises ConfigError if no per-robot parameter of these robots would ever be updated."""
     shown = not masking.ignores_actions or masking.action_leak != "none"
     require(
         shown and any(robot.chunk for robot in robots),
@@ -166,11 +166,11 @@ def find_presence(
     real_BT: jax.Array | None = None,
     leak: ActionLeak = "none",
 ) -> Presence:
-    """Which parameters a batch concerns. Only `trained_E` robots' own are moved, and the shared
-    ones not at all unless `everything` is trained. Frames that are not `real_BT` concern none. Through a `leak`
-    actions are shown that are hidden."""
+    """Which parameters a batch updates. Of per-robot parameters only those of `trained_E`; shared ones not at all
+    unless `everything` is trained. Padding frames (not `real_BT`) do not count. Through a `leak` hidden actions are
+    shown."""
     hidden_BT = masked.hidden_T
-    # Where actions are tokens alone, that of blocks has nothing to show.
+    # Blocks without conditioning have nothing to leak into.
     leaks = leak == "all" or (leak == "conditioning" and model.conditioning != "concat")
     real_BT = jnp.ones_like(hidden_BT) if real_BT is None else real_BT
     rows: dict[Use, jax.Array] = {

@@ -26,12 +26,12 @@ from hma_jax.runtime.mesh import check_mesh, make_mesh
 from hma_jax.runtime.rows import own_rows
 from hma_jax.runtime.sharding import put_batch
 from hma_jax.training.divergence import Records
-from hma_jax.training.loop import FitResult, LoopOptions, Progress, Start, fit
+from hma_jax.training.loop import FitResult, LoopOptions, Progress, RunInfo, fit
 from hma_jax.training.optimizer import steps_in_common
 from hma_jax.training.runs import describe_run, modernise
 from hma_jax.training.state import init_state, state_shapes
 from hma_jax.training.step import make_train_step
-from hma_jax.training.validation import Validation, make_watch
+from hma_jax.training.validation import Validation, make_validation_hook
 
 
 def train_model(
@@ -52,13 +52,12 @@ def train_model(
 ) -> FitResult:
     """Trains to `config.steps`, resuming what is in `run_dir`.
 
-    `make_batches(start)` yields this process's rows (`runtime.rows.own_rows`) of the global batches from step
-    `start` on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what
-    data the batches come from; resuming on other data is refused, and `modernise_provenance` brings what
-    an earlier version said to today's form before they are compared. `execution` says how it is computed,
-    `validation` on what it is watched: both may be others each time. `records` names what a batch is made of,
-    for the message when its step is not finite. Raises ConfigError, CheckpointError, SaveError, DivergedError,
-    Interrupted.
+    `make_batches(start)` yields this process's rows (`runtime.rows.own_rows`) of the global batches from step `start`
+    on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what data the
+    batches come from; resuming on other data is refused, and `modernise_provenance` brings a provenance that an earlier
+    version wrote to today's form before the two are compared. `execution` and `validation` may differ when a run
+    resumes. `records` names what a batch is made of, for the message when its step is not finite. Raises ConfigError,
+    CheckpointError, SaveError, DivergedError, Interrupted.
     """
     declared = declare_model(model, table, execution)
     mesh = execution.mesh
@@ -86,8 +85,8 @@ def train_model(
         seed = jax.device_put(jax.random.key_data(key_of(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
-            """A run may go on for more steps, or fewer, from where the rate did not depend on their number; not if it
-            has more of them already."""
+            """A run may be resumed with more or fewer steps from a step at which the learning rate did not depend on
+            their number, unless it has taken more already."""
             same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
             return ("train.steps",) if step <= min(same, config.steps) else ()
 
@@ -98,7 +97,7 @@ def train_model(
             make_batches,
             steps=config.steps,
             run_dir=run_dir,
-            about=Start(describe_run(model, config, table, provenance), to_dict(execution), modernised, records),
+            info=RunInfo(describe_run(model, config, table, provenance), to_dict(execution), modernised, records),
             put_batch=put_checked,
             options=replace(
                 options,
@@ -106,7 +105,7 @@ def train_model(
                 peak_flops=peak_flops(execution.dtype),
                 may_change=extendable,
             ),
-            watch=validation and make_watch(validation, model, table, config.masking, execution, put),
+            validation=validation and make_validation_hook(validation, model, table, config.masking, execution, put),
             progress=progress,
         )
 

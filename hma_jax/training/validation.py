@@ -1,4 +1,4 @@
-"""Held-out loss while a run trains: on the same windows and masks each time, and no part of what the run is."""
+"""Held-out loss during training, on the same windows and masks each time; no part of a run's identity."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
-from hma_jax.training.loop import Watch
+from hma_jax.training.loop import ValidationHook
 from hma_jax.training.state import TrainState
 from hma_jax.training.step import micro_batches
 
@@ -32,7 +32,7 @@ class Validation:
     """What a run is validated on.
 
     `batches()` yields this process's rows of a few global batches, as large as in training, perhaps with `valid`
-    bool [B] (False: a row that only fills up) and `real` bool [B, T] (False: such a frame). It is read once; the
+    bool [B] (False: a padding row) and `real` bool [B, T] (False: a padding frame). It is read once; the
     windows stay in memory of the host.
     """
 
@@ -43,14 +43,14 @@ class Validation:
         require(self.every >= 1, f"a run is validated every step or more rarely, got {self.every}")
 
 
-def make_watch(
+def make_validation_hook(
     validation: Validation,
     model: ModelConfig,
     table: EmbodimentTable,
     masking: MaskingConfig,
     execution: ExecutionConfig,
     put_batch: Callable[[Any], Any],
-) -> Watch:
+) -> ValidationHook:
     """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one."""
     compute = _jitted_sums(model, table, masking, execution, jax.sharding.get_mesh())
     held: list[dict[str, np.ndarray]] = []
@@ -70,7 +70,7 @@ def make_watch(
             values |= {f"ema_{name}": value for name, value in mean(state.ema).items()}
         return values
 
-    return Watch(validation.every, measure)
+    return ValidationHook(validation.every, measure)
 
 
 @lru_cache(maxsize=4)

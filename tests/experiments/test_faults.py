@@ -23,9 +23,9 @@ from experiments.running.shared_runs import Shared
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
-from hma_jax.training.claim import EVALUATION, locked_run
 from hma_jax.training.log import RunLog
 from hma_jax.training.reading import find_damage, list_steps
+from hma_jax.training.run_lock import EVALUATION, locked_run
 from hma_jax.training.runs import load_model, load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, LENGTHS, SMOKE, idle_training  # noqa: F401

@@ -27,8 +27,8 @@ from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.training import train as model_training
-from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
+from hma_jax.training.run_lock import locked_run
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.windows.test_evalset import small_store

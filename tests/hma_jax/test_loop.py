@@ -17,10 +17,10 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, Terminated, raise_pending_stop, sigterm_as_interrupt
-from hma_jax.training.claim import RunBusy, locked_run
 from hma_jax.training.divergence import DivergedError
-from hma_jax.training.loop import Interrupted, LoopOptions, Watch
+from hma_jax.training.loop import Interrupted, LoopOptions, ValidationHook
 from hma_jax.training.reading import list_steps
+from hma_jax.training.run_lock import RunBusy, locked_run
 from tests.toy import fit_toy, toy_batches, toy_step
 
 EVERY_STEP = LoopOptions(checkpoint_every=1, log_every=1)
@@ -172,7 +172,12 @@ def test_timing_and_utilisation_are_of_steps_alone(tmp_path: Path):
 
     options = LoopOptions(log_every=1, clock=clock, flops_per_step=6.0, peak_flops=4.0)
     result = fit_toy(
-        tmp_path, 5, step=SlowToCompile(clock), make=clock.after(2.0), options=options, watch=Watch(2, measure)
+        tmp_path,
+        5,
+        step=SlowToCompile(clock),
+        make=clock.after(2.0),
+        options=options,
+        validation=ValidationHook(2, measure),
     )
     assert result.compile_seconds == 1000 and result.seconds == 4 * 2.0
     timing = lines(tmp_path / "timing.jsonl")
@@ -195,12 +200,12 @@ def test_every_start_of_a_run_is_recorded(tmp_path: Path):
 
 def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path):
     seen = []
-    watch = Watch(2, lambda state: {"loss": float(state.params["w"][0])})
+    validation = ValidationHook(2, lambda state: {"loss": float(state.params["w"][0])})
 
     def show(step, steps, values):
         seen.append(values.get("validation/loss"))
 
-    fit_toy(tmp_path / "whole", 7, watch=watch, progress=show)
+    fit_toy(tmp_path / "whole", 7, validation=validation, progress=show)
     whole = (tmp_path / "whole" / "validation.jsonl").read_bytes()
     assert [json.loads(line)["step"] for line in whole.splitlines()] == [2, 4, 6, 7]
     assert seen[1] is None and seen[2] == seen[3] is not None
@@ -212,8 +217,8 @@ def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path)
             yield batch
 
     with pytest.raises(OSError, match="went away"):
-        fit_toy(tmp_path / "broken", 7, make=dying, watch=watch, options=LoopOptions(checkpoint_every=3))
-    fit_toy(tmp_path / "broken", 7, watch=watch, options=LoopOptions(checkpoint_every=3))
+        fit_toy(tmp_path / "broken", 7, make=dying, validation=validation, options=LoopOptions(checkpoint_every=3))
+    fit_toy(tmp_path / "broken", 7, validation=validation, options=LoopOptions(checkpoint_every=3))
     assert (tmp_path / "broken" / "validation.jsonl").read_bytes() == whole
 
 

@@ -13,7 +13,7 @@ import pytest
 from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
-from hma_jax.training.validation import Validation, make_sums, make_watch
+from hma_jax.training.validation import Validation, make_sums, make_validation_hook
 from tests.tiny import (
     DIFFUSION,
     SMALLER,
@@ -115,7 +115,9 @@ def test_held_out_loss_is_of_micro_batches_where_training_is():
 
 
 def test_a_validation_without_windows_is_refused_by_words(tmp_path: Path):
-    watch = make_watch(Validation(1, list), MODEL, TABLE, MaskingConfig(), ExecutionConfig(), lambda batch: batch)
+    watch = make_validation_hook(
+        Validation(1, list), MODEL, TABLE, MaskingConfig(), ExecutionConfig(), lambda batch: batch
+    )
     with pytest.raises(ConfigError, match="no window to validate on"):
         watch.measure(None)
     with pytest.raises(ConfigError, match="every step or more rarely, got 0"):

@@ -18,8 +18,8 @@ from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
-from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.hashes import NAME as HASHES
+from hma_jax.training.run_lock import CHECKPOINTS
 
 IMAGE, ACTION = "observation/image", "action"
 

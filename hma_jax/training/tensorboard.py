@@ -1,4 +1,4 @@
-"""TensorBoard scalars, written by whoever shows them."""
+"""TensorBoard scalars, written in the calling thread."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
 
 
-class Board:
-    """An event file in `directory`; what earlier files say of `first_step` and after is hidden.
+class TensorBoardWriter:
+    """An event file in `directory`; events of earlier files from `first_step` on are hidden.
 
     The library's SummaryWriter hands events to a thread through a queue of ten. When the disk is full
     that thread dies, and a run would wait for ever; here the error is raised. Raises OSError.
@@ -23,7 +23,7 @@ class Board:
         self._writer = EventsWriter(str(directory / "events"))
         self._writer.write_event(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
 
-    def show(self, step: int, values: Mapping[str, float]) -> None:
+    def write(self, step: int, values: Mapping[str, float]) -> None:
         for name, value in values.items():
             event = Event(wall_time=time.time(), step=step, summary=scalar(name, value))
             self._writer.write_event(event)

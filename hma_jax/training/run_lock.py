@@ -1,4 +1,4 @@
-"""One process trains in a run directory at a time, and one evaluates what is in it."""
+"""The locks of a run directory: one process trains in it at a time, and one writes its evaluation."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hma_jax.runtime.locks import Held, Lock, exclusive
 NAME, EVALUATION = ".lock", ".evaluation.lock"
 
 CHECKPOINTS = "checkpoints"
-"""The folder of a run directory with a folder for each; named, and listed, where nothing is imported that reads
-them."""
+"""The folder of a run directory with a folder per checkpoint. Named and listed here, so that a program that only lists
+them does not import Orbax."""
 
 
 def list_steps(directory: Path) -> list[int]:
@@ -29,7 +29,7 @@ class RunBusy(Held):
 
 
 def is_address(path: Path) -> bool:
-    """Whether a path was made of an address such as gs://bucket/run, of which `Path` keeps one slash."""
+    """Whether a path was made from a URL such as gs://bucket/run, of which `Path` keeps one slash."""
     return re.match(r"[a-z][a-z0-9+.-]+:/", str(path)) is not None
 
 
