@@ -118,7 +118,7 @@ class TrueSimulator(ABC, Generic[W]):
             if action is None:
                 continue
             world, robot = self._begun(b)
-            chunk, beyond = robot.confine(robot.chunk(action), self.outside)
+            chunk, beyond = robot.clip_to_range(robot.chunk(action), self.outside)
             clipped[b] = tuple(np.array(robot.dimensions)[beyond].tolist())
             asked[b] = world, chunk
         self.clipped = clipped
@@ -135,8 +135,8 @@ class TrueSimulator(ABC, Generic[W]):
         which = chosen_episodes(episodes, len(self))
         worlds = {b: self._begun(b)[0] for b in which}
         for b in which:
-            reach = self.reach(b)
-            require(0 <= frames <= reach, f"episode {b} can be taken back by {reach} frames, not by {frames}")
+            max_rewind = self.max_rewind(b)
+            require(0 <= frames <= max_rewind, f"episode {b} can be taken back by {max_rewind} frames, not by {frames}")
         for b, world in worlds.items():
             before = self._before[b]
             if frames:
@@ -145,7 +145,7 @@ class TrueSimulator(ABC, Generic[W]):
             self._draw(b, world)
         return self.images
 
-    def reach(self, b: int) -> int:
+    def max_rewind(self, b: int) -> int:
         """By how many frames episode b can be taken back."""
         return len(self._before[b])
 

@@ -40,7 +40,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params
 from hma_jax.runtime.files import write_file
-from hma_jax.simulator.folder import USUAL
+from hma_jax.simulator.folder import DEFAULT_DECODE
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -196,10 +196,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="directory that is replaced")
-    parser.add_argument("--unmask-steps", type=int, default=USUAL.unmask_steps, help="looks at a frame")
-    parser.add_argument("--temperature", type=float, default=USUAL.temperature, help="of drawing tokens")
+    parser.add_argument("--unmask-steps", type=int, default=DEFAULT_DECODE.unmask_steps, help="looks at a frame")
+    parser.add_argument("--temperature", type=float, default=DEFAULT_DECODE.temperature, help="of drawing tokens")
     args = parser.parse_args()
-    decode = replace(USUAL, unmask_steps=args.unmask_steps, temperature=args.temperature)
+    decode = replace(DEFAULT_DECODE, unmask_steps=args.unmask_steps, temperature=args.temperature)
     ship(args.run, args.out, decode, describe)
 
 

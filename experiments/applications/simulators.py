@@ -20,7 +20,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.config.base import require_choice
 from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, save_decode, save_robots
 from hma_jax.simulator.interface import AnySimulator
-from hma_jax.simulator.robots import Robot, rest_of
+from hma_jax.simulator.robots import Robot, rest_action
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import FILE as STARTS
 from hma_jax.simulator.starts import Start, save_starts
@@ -51,7 +51,7 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
         options["tokenizer"] = study.tokenizer
     simulator = Simulator.load(run, **options)
     if not (run / ROBOTS).exists():
-        simulator.describe(describe_robots(simulator, study))
+        simulator.update_robots(describe_robots(simulator, study))
     if own_starts:
         return simulator
     if not (run / STARTS).exists():
@@ -144,7 +144,7 @@ def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:
     if entry.name in SPECS:
         return suite_robot(entry.name, low, high, entry.mean, entry.stride, recorded=recorded)
     hz = manifest.spec.hz if manifest is not None else 0.0
-    return Robot(entry.name, entry.stride, low, high, rest_of(low, high, entry.mean), hz=hz, recorded=recorded)
+    return Robot(entry.name, entry.stride, low, high, rest_action(low, high, entry.mean), hz=hz, recorded=recorded)
 
 
 def keep_places(simulator: Simulator, run: Path | str) -> None:
@@ -158,7 +158,7 @@ def keep_places(simulator: Simulator, run: Path | str) -> None:
         return
     store = TokenStore(study.store)
     told = [robot for robot in simulator.robots.values() if robot.name not in SPECS and robot.name in store.names]
-    simulator.describe([replace(robot, keeps=True) for robot in told if _goes_to_places(store, robot.name)])
+    simulator.update_robots([replace(robot, keeps=True) for robot in told if _goes_to_places(store, robot.name)])
 
 
 def _goes_to_places(store: TokenStore, name: str) -> bool:

@@ -252,7 +252,7 @@ def load_passive(run: Path, robot: Robot) -> Simulator:
     require(
         setting == "passive", f"{run} was trained with train.masking.setting={setting}, not without actions (passive)"
     )
-    passive.describe([robot])
+    passive.update_robots([robot])
     return passive
 
 

@@ -19,13 +19,13 @@ from hma_jax.model.trunk import TemporalCache
 
 
 class FrameCache(NamedTuple):
-    """Room for the finished frames of a window."""
+    """A key-value cache of a window's finished frames."""
 
-    layers: TemporalCache  # keys and values [N, B, room, P, H, I], and what cross-attention needs
-    valid: jax.Array  # bool [room]: slots that hold a frame
+    layers: TemporalCache  # keys and values [N, B, capacity, P, H, I], and what cross-attention needs
+    valid: jax.Array  # bool [capacity]: slots that hold a frame
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         return self.valid.shape[0]
 
     def write(self, layers: TemporalCache, slot: int | jax.Array) -> FrameCache:
@@ -53,7 +53,7 @@ class Window(NamedTuple):
         shape = chunks_BTU.shape[:2]
         return cls(model, model.align(chunks_BTU), model.align_hidden(hidden_BT, shape), embodiment_B)
 
-    def empty(self, batch: int, room: int) -> FrameCache:
+    def empty(self, batch: int, capacity: int) -> FrameCache:
         """A cache without frames."""
         blank = blank_frame(self.model.config, batch)
 
@@ -61,13 +61,13 @@ class Window(NamedTuple):
             return self._pass(blank.values[:, None], blank.masked[:, None], 0, cache_frames=1).cache
 
         shapes = jax.eval_shape(one_frame)
-        layers = jax.tree.map(lambda x: jnp.zeros((*x.shape[:2], room, *x.shape[3:]), x.dtype), shapes)
-        return FrameCache(layers, jnp.zeros(room, bool))
+        layers = jax.tree.map(lambda x: jnp.zeros((*x.shape[:2], capacity, *x.shape[3:]), x.dtype), shapes)
+        return FrameCache(layers, jnp.zeros(capacity, bool))
 
-    def start(self, frames: jax.Array, room: int) -> FrameCache:
-        """The cache of finished frames [B, T', S (, C)] at the first positions, with `room` in all."""
+    def start(self, frames: jax.Array, capacity: int) -> FrameCache:
+        """The cache of finished frames [B, T', S (, C)] at the first positions, with `capacity` slots in all."""
         batch, count = frames.shape[:2]
-        cache = self.empty(batch, room)
+        cache = self.empty(batch, capacity)
         return (
             cache.write(self._pass(frames, None, 0, cache_frames=count, predict_from=count).cache, 0)
             if count
@@ -102,7 +102,7 @@ class Window(NamedTuple):
             out = self._pass(values, masked, at, cache_frames=count, predict_from=count)
             return FrameCache(out.cache, jnp.ones(count, bool)), out.predictions[:, 0]
         # What `finished` takes the place of was still before it, but is past the masked frame's window.
-        slots = jnp.arange(cache.room)
+        slots = jnp.arange(cache.capacity)
         remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
         earlier = jnp.stack([cache.valid] * count + [remaining])
         visible = jnp.concatenate([earlier, causal_mask(count + 1)], axis=1)

@@ -1,8 +1,7 @@
-"""Many simulated episodes at once, each of its own length: sessions of one example side by side.
+"""Many simulated episodes at once, each of its own length: a batch of sessions of one example.
 
-Every array of `Episodes` has a leading axis B of its own, so an episode may begin, wait, be copied or go back
-while the others stay where they are. What is computed is `session`'s, for one example at a time; XLA makes one
-program of them.
+Every array of `Episodes` has a leading axis B, so an episode may start, wait, be copied or be rewound independently of
+the others. The computation is `session`'s for one example, under `jax.vmap`.
 """
 
 from __future__ import annotations
@@ -43,9 +42,9 @@ def start_each(
     def one(frames: jax.Array, chunks: jax.Array, robot: jax.Array, given: jax.Array, count: jax.Array) -> Session:
         unseen = jnp.full((1, len(chunks)), hidden)
         session = start(model, frames[None], chunks[None], robot[None], hidden_BT=unseen)
-        room = session.cache.room
-        # Attention is causal: what is arbitrary was seen by nothing that is kept.
-        cache = session.cache._replace(valid=jnp.arange(room) < given - 1)
+        capacity = session.cache.capacity
+        # Attention is causal: no frame that is kept attended to the arbitrary ones after it.
+        cache = session.cache._replace(valid=jnp.arange(capacity) < given - 1)
         # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it.
         turned = [jnp.roll(x, count - given, axis=axis) for x, axis in _slots(cache)]
         cache = jax.tree.unflatten(jax.tree.structure(cache), turned)
@@ -55,7 +54,7 @@ def start_each(
 
 
 def _slots(cache: object) -> Sequence[tuple[jax.Array, int]]:
-    """Every array of a cache and its axis of slots: `valid` is [room], the others are [N, B, room, ...]."""
+    """Every array of a cache and its axis of slots: `valid` is [capacity], the others are [N, B, capacity, ...]."""
     return [(x, 0 if x.ndim == 1 else 2) for x in jax.tree.leaves(cache)]
 
 

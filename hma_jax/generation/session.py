@@ -1,4 +1,4 @@
-"""One frame at a time, for whoever acts on what it sees: the same frames as `rollout`'s.
+"""Rollouts one frame at a time, for callers that choose actions by the frames: the same frames as `rollout`'s.
 
 A session's arrays keep their shapes, so one compiled `advance` serves an episode of any length:
 
@@ -24,9 +24,9 @@ Phase = Literal["filling", "sliding"]
 
 
 class Session(NamedTuple):
-    """Where B simulated episodes stand; all are equally long."""
+    """The state of B simulated episodes of equal length."""
 
-    cache: FrameCache  # of finished frames but the newest, room for T - 1
+    cache: FrameCache  # of finished frames but the newest; T - 1 slots
     frames: jax.Array  # the newest T - 1, oldest first: [B, T - 1, S (, C)]
     chunks_BTU: jax.Array  # raw, the one executed after each of them, then one spare
     hidden_BT: jax.Array  # chunks the model is not shown
@@ -47,8 +47,8 @@ def start(
     `chunks_BTU` [B, T' - 1, U] are those executed between its frames. Raises ConfigError for shapes that do not fit the
     model or each other.
     """
-    room, count = model.config.frames - 1, prompt.shape[1]
-    require(room >= 1, "a model of one frame cannot continue anything")
+    capacity, count = model.config.frames - 1, prompt.shape[1]
+    require(capacity >= 1, "a model of one frame cannot continue anything")
     require(count >= 1, "a session starts from 1 prompt frame or more, got 0")
     between = (len(prompt), count - 1)
     hidden = jnp.zeros(between, bool) if hidden_BT is None else hidden_BT
@@ -62,10 +62,10 @@ def start(
             "robots": between[:1],
         },
     )
-    old = max(count - room, 0)
-    chunks, hidden = (_padded(x[:, old:], room + 1) for x in (chunks_BTU, hidden))
-    past = Window.over(model, chunks, hidden, embodiment_B).start(prompt[:, old:-1], room)
-    return Session(past, _padded(prompt[:, old:], room), chunks, hidden, embodiment_B, jnp.int32(count - old))
+    old = max(count - capacity, 0)
+    chunks, hidden = (_padded(x[:, old:], capacity + 1) for x in (chunks_BTU, hidden))
+    past = Window.over(model, chunks, hidden, embodiment_B).start(prompt[:, old:-1], capacity)
+    return Session(past, _padded(prompt[:, old:], capacity), chunks, hidden, embodiment_B, jnp.int32(count - old))
 
 
 def advance(
@@ -86,7 +86,7 @@ def advance(
     (as the release's simulator does). `hidden_B` marks chunks the model is not shown. A caller who knows
     which `phase` the session is in saves the program of the other. Raises ConfigError as `start`.
     """
-    room, t = model.config.frames - 1, session.count
+    capacity, t = model.config.frames - 1, session.count
     batch, _, width = session.chunks_BTU.shape
     hidden_B = jnp.zeros(batch, bool) if hidden_B is None else hidden_B
     next_chunk_BU = chunk_BU if next_chunk_BU is None else next_chunk_BU
@@ -100,7 +100,7 @@ def advance(
             "keys": (batch, *jnp.shape(key_B)[1:]),
         },
     )
-    last = jnp.minimum(t, room) - 1
+    last = jnp.minimum(t, capacity) - 1
     both = jnp.stack([chunk_BU, next_chunk_BU], axis=1)
     chunks = _written(session.chunks_BTU, both, last)
     hidden = _written(session.hidden_BT, jnp.stack([hidden_B, hidden_B], axis=1), last)
@@ -117,12 +117,12 @@ def advance(
         return session.cache, steps.slide(window, session.frames, keys, decode)
 
     if phase is None:
-        cache, frame = jax.lax.cond(t <= room, within_the_window, past_the_window)
+        cache, frame = jax.lax.cond(t <= capacity, within_the_window, past_the_window)
     else:
         cache, frame = within_the_window() if phase == "filling" else past_the_window()
-    full = t >= room  # then the oldest frame makes place
+    full = t >= capacity  # then the oldest frame is dropped
     frames, chunks, hidden = (jnp.where(full, jnp.roll(x, -1, axis=1), x) for x in (session.frames, chunks, hidden))
-    frames = _written(frames, frame[:, None], jnp.minimum(t, room - 1))
+    frames = _written(frames, frame[:, None], jnp.minimum(t, capacity - 1))
     return Session(cache, frames, chunks, hidden, session.embodiment_B, t + 1), frame
 
 

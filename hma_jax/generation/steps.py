@@ -37,7 +37,7 @@ def stream(
 
     Approximate: those frames were computed at other positions and had seen older ones.
     """
-    end = cache.room
+    end = cache.capacity
     oldest = (t - 1) % end  # the slot of frame t - T, which leaves the window
     positions = jnp.array([end, end])  # frame t - 1 was at the last position when it was made
     cache, predictions = window.extend_and_query(cache, last[:, None], end - 1, oldest, positions)

@@ -1,4 +1,4 @@
-"""What the host knows of a simulated episode: enough to take it back, and to say where it stands."""
+"""The host's record of a simulated episode: enough to rewind it."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class Episode:
     robot: Robot
     index: int  # of the robot in the model's table
     seed: int
-    count: int  # frames so far, of those that the model saw
+    count: int  # frames so far, those of the start that the model did not see excluded
     frames: deque[np.ndarray]  # tokens [S (, C)] of the newest of them
     chunks: deque[np.ndarray]  # [U], between them: one fewer
-    pending: list[np.ndarray] = field(default_factory=list)  # native actions [A] that no frame has come of yet
+    pending: list[np.ndarray] = field(default_factory=list)  # native actions [A] of a chunk that is not complete yet
 
-    def reach(self, room: int) -> int:
-        """By how many frames it can be taken back: to its first, or to where the window of `room` is still kept."""
+    def max_rewind(self, capacity: int) -> int:
+        """By how many frames it can be rewound: to its first, or as far as a window of `capacity` frames is kept."""
         kept = len(self.frames)
-        return kept - (1 if kept == self.count else room)
+        return kept - (1 if kept == self.count else capacity)
 
-    def earlier(self, frames: int) -> Episode:
-        """A copy that stands so many frames before."""
+    def rewound(self, frames: int) -> Episode:
+        """A copy, so many frames earlier."""
         other = copy.deepcopy(self)
         for _ in range(frames):
             other.frames.pop()
@@ -44,25 +44,27 @@ class Episode:
         return other
 
 
-def begin_episode(robot: Robot, index: int, start: Start, seed: int, room: int, history: int, width: int) -> Episode:
-    """An episode that has seen the last `room` frames of `start` at most, its chunks padded to `width`; its tokens
-    are still missing. Raises ConfigError for actions that do not fit the frames."""
+def begin_episode(
+    robot: Robot, index: int, start: Start, seed: int, capacity: int, history: int, width: int
+) -> Episode:
+    """The record of an episode that starts from the last `capacity` frames of `start` at most, its chunks padded to
+    `width`; `frames` is still empty. Raises ConfigError for actions that do not fit the frames."""
     between = len(start.images) - 1
     require(
         start.actions.shape == (between * robot.stride, robot.action_dim),
         f"a start of {robot.name}: {between + 1} frames have {between} x {robot.stride} actions of "
         f"{robot.action_dim} values between them, got {start.actions.shape}",
     )
-    seen = min(between + 1, room)
+    seen = min(between + 1, capacity)
     chunks = np.zeros((seen - 1, width), np.float32)
     flat = start.actions.reshape(between, robot.stride * robot.action_dim)
     chunks[:, : flat.shape[1]] = flat[between + 1 - seen :]
-    kept = room + history
+    kept = capacity + history
     return Episode(robot, index, seed, seen, deque(maxlen=kept), deque(chunks, maxlen=kept - 1))
 
 
-CHANGING = ("frames", "chunks", "pending")
-"""What of an episode grows while it goes on, besides its count."""
+GROWING_FIELDS = ("frames", "chunks", "pending")
+"""Fields of an episode that grow with every frame, besides its count."""
 
 
 class Snapshot(NamedTuple):
@@ -74,25 +76,27 @@ class Snapshot(NamedTuple):
 
 
 def as_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
-    """A snapshot as a file keeps it; of its episodes, all of which must have begun, what has changed since."""
+    """A snapshot as arrays by name, for a file: its state, and the GROWING_FIELDS of its episodes, which must all have
+    begun."""
     arrays = {"images": snapshot.images}
     for i, leaf in enumerate(jax.tree.leaves(snapshot.state)):
         arrays[f"state/{i}"] = np.asarray(leaf)
     for b, episode in enumerate(snapshot.episodes):
-        arrays |= {f"episode/{b}/{name}": np.array(list(getattr(episode, name))) for name in CHANGING}
+        arrays |= {f"episode/{b}/{name}": np.array(list(getattr(episode, name))) for name in GROWING_FIELDS}
         arrays[f"episode/{b}/count"] = np.array(episode.count)
     return arrays
 
 
-def from_arrays(arrays: Mapping[str, np.ndarray], begun: Snapshot) -> Snapshot:
-    """What `as_arrays` kept, of a simulator whose same episodes have `begun` again. KeyError for arrays of others."""
-    leaves, tree = jax.tree.flatten(begun.state)
-    # Where they lay, or programs would be compiled once more; a file knows bfloat16 by its width alone.
+def from_arrays(arrays: Mapping[str, np.ndarray], fresh: Snapshot) -> Snapshot:
+    """The snapshot that `as_arrays` stored. `fresh` is one of the same simulator right after the same episodes began.
+    Raises KeyError for arrays of other episodes."""
+    leaves, tree = jax.tree.flatten(fresh.state)
+    # On the same device, or programs would be compiled once more; a file stores bfloat16 as raw 16-bit values.
     state = [jax.device_put(arrays[f"state/{i}"].view(x.dtype), x.sharding) for i, x in enumerate(leaves)]
-    episodes = copy.deepcopy(begun.episodes)
+    episodes = copy.deepcopy(fresh.episodes)
     for b, episode in enumerate(episodes):
         episode.count = int(arrays[f"episode/{b}/count"])
-        for name in CHANGING:
+        for name in GROWING_FIELDS:
             rows = getattr(episode, name)
             rows.clear()
             rows.extend(arrays[f"episode/{b}/{name}"])

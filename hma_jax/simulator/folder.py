@@ -1,4 +1,4 @@
-"""What of a simulator lies on disk: a run, and beside it its tokenizer, its robots' commands and starts of episodes.
+"""A simulator on disk: a run, its tokenizer, its robots' commands and starts of episodes.
 
     RUN/checkpoints   the model (`hma_jax.training.runs`)
     RUN/tokenizer     or RUN/../tokenizer, where a study has it
@@ -31,9 +31,8 @@ ROBOTS = "robots.json"
 TOKENIZER = "tokenizer"
 DECODE = "decode.json"
 
-USUAL = DecodeConfig(sampler=SamplerConfig("dpm++", 12))
-"""How frames are filled where decode.json does not say it. Latents with fewer evaluations of the denoiser than frames
-are judged with."""
+DEFAULT_DECODE = DecodeConfig(sampler=SamplerConfig("dpm++", 12))
+"""How frames are decoded without a decode.json. Latents take fewer evaluations of the denoiser than in evaluation."""
 
 
 def find_tokenizer(directory: Path, run: Run, given: Path | None) -> BaseTokenizer:
@@ -67,13 +66,13 @@ def find_starts(directory: Path) -> tuple[Start, ...]:
 
 
 def find_decode(directory: Path) -> DecodeConfig:
-    """Of decode.json, otherwise the usual one. Raises ConfigError for a file that is damaged."""
+    """From decode.json, otherwise DEFAULT_DECODE. Raises ConfigError for a file that is damaged."""
     path = directory / DECODE
-    return from_dict(DecodeConfig, _read(path), str(path)) if path.exists() else USUAL
+    return from_dict(DecodeConfig, _read(path), str(path)) if path.exists() else DEFAULT_DECODE
 
 
 def load_robots(path: Path) -> tuple[Robot, ...]:
-    """None where there is no such file. Raises ConfigError for one that is damaged."""
+    """Empty where there is no such file. Raises ConfigError for one that is damaged."""
     if not path.exists():
         return ()
     rows = _read(path)

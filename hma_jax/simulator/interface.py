@@ -1,4 +1,4 @@
-"""What a learned simulator and a true one have in common: whoever steps the one can step the other."""
+"""The interface that learned and true simulators share: code that steps one can step the other."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class AnySimulator(Protocol):
 
 
 def whole_numbers(what: str, values: Sequence[int]) -> list[int]:
-    """Raises ConfigError for others: 0.5 is not taken for 0."""
+    """`values` as ints. Raises ConfigError for anything else: 0.5 is not truncated to 0."""
     try:
         return [operator.index(value) for value in values]
     except TypeError as error:
@@ -63,10 +63,10 @@ def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
 
 
 Judge = Callable[[AnySimulator], tuple[np.ndarray, np.ndarray]]
-"""What the present frames are worth: (rewards float [B], bool [B]: the task is done and the episode over). One that has
-a method `begin(simulator, episodes)` is told of episodes that have just begun."""
+"""Rewards and termination at the present frames: (float [B], bool [B]: the task is done and the episode over). A judge
+with a method `begin(simulator, episodes)` has it called after `episodes` were reset."""
 
 
 def no_judge(simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:
-    """Nothing is worth anything, and nothing ends an episode but its length."""
+    """Reward 0 everywhere, and no episode terminates."""
     return np.zeros(len(simulator)), np.zeros(len(simulator), bool)

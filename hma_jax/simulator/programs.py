@@ -1,8 +1,8 @@
 """What a simulator compiles: from pixels and raw actions to pixels in one call each, of fixed shapes.
 
-Begin from images, begin again from tokens, advance, copy: each takes and gives back the state of all episodes, and
-all but the last use its memory again. The first three are compiled once for every power of two of episodes that they
-are of (`padded`), so that the others cost nothing.
+`reset_from_images`, `reset_from_tokens`, `advance` and `take` each map the state of all episodes to a new one; all but
+the last donate it. The first three work on some of the episodes, and are compiled once per power of two of how many
+(`padded`): the other episodes cost nothing.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.training.runs import Model
 
 
-class Beginning(NamedTuple):
-    """Where n of the episodes begin, or begin again; padded to the room of T - 1 frames."""
+class ResetInputs(NamedTuple):
+    """Frames and chunks from which n of the episodes start, or are rewound to; padded to T - 1 frames."""
 
-    rows: np.ndarray  # int32 [n]: which; one that stands twice begins the same twice
+    rows: np.ndarray  # int32 [n]: which episodes; one may be repeated with equal values
     frames: np.ndarray  # uint8 [n, T - 1, H, W, 3], or tokens [n, T - 1, S (, C)]
     chunks: np.ndarray  # float32 [n, T - 2, U]
     robots: np.ndarray  # int32 [n]
@@ -34,14 +34,14 @@ class Beginning(NamedTuple):
     counts: np.ndarray  # int32 [n]: frames so far
 
     @classmethod
-    def blank(cls, rows: Sequence[int], room: int, width: int, shape: tuple[int, ...], dtype: Any) -> Beginning:
-        """Of these episodes, with frames of `shape`, before they are placed."""
+    def empty(cls, rows: Sequence[int], capacity: int, width: int, shape: tuple[int, ...], dtype: Any) -> ResetInputs:
+        """For the episodes `rows`, with frames of `shape`; zeros until `set_episode`."""
         n = len(rows)
-        frames, chunks = np.zeros((n, room, *shape), dtype), np.zeros((n, room - 1, width), np.float32)
+        frames, chunks = np.zeros((n, capacity, *shape), dtype), np.zeros((n, capacity - 1, width), np.float32)
         return cls(np.array(rows, np.int32), frames, chunks, *np.zeros((3, n), np.int32))
 
-    def place(self, i: int, episode: Episode, frames: np.ndarray) -> None:
-        """The i-th of them begins as `episode` after the newest `frames` of its window."""
+    def set_episode(self, i: int, episode: Episode, frames: np.ndarray) -> None:
+        """Sets the i-th row to `episode`, whose newest frames are `frames`, at most T - 1."""
         given = len(frames)
         self.frames[i, :given] = frames
         if given > 1:
@@ -49,15 +49,15 @@ class Beginning(NamedTuple):
         self.robots[i], self.given[i], self.counts[i] = episode.index, given, episode.count
 
 
-class Weights(NamedTuple):
-    """What all programs compute with."""
+class ProgramParams(NamedTuple):
+    """Parameters that all programs take as an argument."""
 
     model: Params
     tokenizer: Params
 
 
 def padded(rows: list[int], episodes: int) -> list[int]:
-    """`rows` and the first of them again, up to a power of two or `episodes`."""
+    """`rows`, padded with copies of the first to a power of two, at most `episodes`."""
     size = min(1 << (len(rows) - 1).bit_length(), episodes)
     return rows + rows[:1] * (size - len(rows))
 
@@ -66,52 +66,54 @@ class Programs:
     """The compiled programs of a simulator of `episodes` episodes."""
 
     def __init__(self, model: Model, tokenizer: BaseTokenizer, episodes: int, decode: DecodeConfig):
-        self.weights = Weights(model.params, tokenizer.params)
-        declared, room = model.declared, model.config.frames - 1
+        self.weights = ProgramParams(model.params, tokenizer.params)
+        declared, capacity = model.declared, model.config.frames - 1
         hidden = model.run.train.masking.ignores_actions
-        decoded: Callable[[Weights, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(w.tokenizer, x)
+        decode: Callable[[ProgramParams, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(w.tokenizer, x)
 
-        def fresh(weights: Weights, tokens: jax.Array, at: Beginning) -> Episodes:
+        def fresh(weights: ProgramParams, tokens: jax.Array, at: ResetInputs) -> Episodes:
             chunks, robots = jnp.asarray(at.chunks), jnp.asarray(at.robots)
             given, counts = jnp.asarray(at.given), jnp.asarray(at.counts)
             return start_each(declared.merge(weights.model), tokens, chunks, robots, given, counts, hidden=hidden)
 
-        def again(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array]:
+        def reset_from_tokens(weights: ProgramParams, state: Episodes, at: ResetInputs) -> tuple[Episodes, jax.Array]:
             tokens = jnp.asarray(at.frames)
             newest = jnp.take_along_axis(tokens, at.given.reshape(-1, *(1,) * (tokens.ndim - 1)) - 1, axis=1)[:, 0]
-            return put(state, at.rows, fresh(weights, tokens, at)), decoded(weights, newest)
+            return put(state, at.rows, fresh(weights, tokens, at)), decode(weights, newest)
 
-        def begin(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array, jax.Array]:
+        def reset_from_images(
+            weights: ProgramParams, state: Episodes, at: ResetInputs
+        ) -> tuple[Episodes, jax.Array, jax.Array]:
             images = jnp.asarray(at.frames)
             tokens = tokenizer.encode_fn(weights.tokenizer, images.reshape(-1, *images.shape[2:]))
             tokens = tokens.reshape(*images.shape[:2], *tokens.shape[1:])
-            state, seen = again(weights, state, at._replace(frames=tokens))
+            state, seen = reset_from_tokens(weights, state, at._replace(frames=tokens))
             return state, tokens, seen
 
         def advance(
-            weights: Weights, state: Episodes, rows_n: jax.Array, chunk_nU: jax.Array, seed_n: jax.Array
+            weights: ProgramParams, state: Episodes, rows_n: jax.Array, chunk_nU: jax.Array, seed_n: jax.Array
         ) -> tuple[Episodes, jax.Array, jax.Array]:
             keys = jax.vmap(key_of)(seed_n)
             before, hma = take(state, rows_n), declared.merge(weights.model)
             new, frames = advance_each(hma, before, chunk_nU, keys, decode, hidden=hidden)
-            return put(state, rows_n, new), frames, decoded(weights, frames)
+            return put(state, rows_n, new), frames, decode(weights, frames)
 
-        self.begin = jax.jit(begin, donate_argnums=1)
-        self.again = jax.jit(again, donate_argnums=1)
+        self.reset_from_images = jax.jit(reset_from_images, donate_argnums=1)
+        self.reset_from_tokens = jax.jit(reset_from_tokens, donate_argnums=1)
         self.advance = jax.jit(advance, donate_argnums=1)
-        self.take = jax.jit(take)  # with its rows in order, a copy
+        self.take = jax.jit(take)  # of all rows in order: a copy
         self.token_shape = (tokenizer.tokens, tokenizer.channels) if tokenizer.channels else (tokenizer.tokens,)
         described = jax.ShapeDtypeStruct
-        empty = Beginning(
+        empty = ResetInputs(
             described((episodes,), jnp.int32),
-            described((episodes, room, *self.token_shape), jnp.float32 if tokenizer.channels else jnp.int32),
-            described((episodes, room - 1, model.table.action_width), jnp.float32),
+            described((episodes, capacity, *self.token_shape), jnp.float32 if tokenizer.channels else jnp.int32),
+            described((episodes, capacity - 1, model.table.action_width), jnp.float32),
             *[described((episodes,), jnp.int32)] * 3,
         )
         self._shapes = jax.eval_shape(lambda weights, at: fresh(weights, at.frames, at), self.weights, empty)
 
     def empty(self) -> Episodes:
-        """The state of episodes of which none has begun, where the weights lie: programs give it back there, and would
-        be compiled a second time for a state from elsewhere."""
-        place = jax.tree.leaves(self.weights)[0].sharding
-        return jax.device_put(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes), place)
+        """The state before any episode has begun, on the device of the weights: programs return it there, and would be
+        compiled once more for a state on another device."""
+        sharding = jax.tree.leaves(self.weights)[0].sharding
+        return jax.device_put(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes), sharding)

@@ -1,4 +1,4 @@
-"""What may be asked of a robot: its action dimensions, their ranges, and what becomes of what lies outside."""
+"""A robot's commands: its action dimensions, their ranges, and what is done with values outside."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from hma_jax.config import ConfigError, require
 from hma_jax.model.embodiments import DEAD_STD, Embodiment
 
 Outside = Literal["clip", "refuse"]
-"""What becomes of a value that lies outside what the robot ever did: it is moved to the nearest that does not,
-and said so, or an error."""
+"""What is done with a value outside a robot's recorded range: it is clipped, and reported, or it is an error."""
 
 KEYS = 4
-"""Directions that a page's keys have: right, up, D, W."""
+"""Keys of the page that move a robot: right, up, D, W."""
 
 SPREAD = 3.0
 """Standard deviations on both sides of the mean that are taken for a range where none is known."""
@@ -37,7 +36,7 @@ class Robot:
     rest: tuple[float, ...]  # an action to begin with: 0 where the range has it, otherwise the mean
     dimensions: tuple[str, ...] = ()  # what each value is called
     unit: str = ""  # of the values, for people
-    keeps: bool = False  # an action is a place to go to: keys move it; otherwise letting go of them is `rest`
+    keeps: bool = False  # actions are target positions: keys shift the last one; else releasing them gives `rest`
     # What the keys right, up, D and W do to each value, in shares of half its range; left, down, A and S do the
     # opposite.
     keys: tuple[tuple[float, ...], ...] = ()
@@ -77,7 +76,7 @@ class Robot:
 
     @classmethod
     def of(cls, entry: Embodiment) -> Robot:
-        """As far as a model's table knows it."""
+        """From its entry in a model's table."""
         if entry.low:
             low, high = entry.low, entry.high
         else:
@@ -87,7 +86,7 @@ class Robot:
         alive = [s > DEAD_STD for s in entry.std]
         low = tuple(a if on else m for a, on, m in zip(low, alive, entry.mean, strict=True))
         high = tuple(b if on else m for b, on, m in zip(high, alive, entry.mean, strict=True))
-        return cls(entry.name, entry.stride, low, high, rest_of(low, high, entry.mean), recorded=False)
+        return cls(entry.name, entry.stride, low, high, rest_action(low, high, entry.mean), recorded=False)
 
     def chunk(self, action: np.ndarray) -> np.ndarray:
         """float32 [stride, A] of one action [A], held for a whole frame, or of a chunk [stride, A].
@@ -103,8 +102,9 @@ class Robot:
         require(bool(np.isfinite(action).all()), f"{self.name}: the action is not finite: {action.tolist()}")
         return np.broadcast_to(action, shapes[1])
 
-    def confine(self, actions: np.ndarray, outside: Outside) -> tuple[np.ndarray, np.ndarray]:
-        """(`actions` [..., A] within range, bool [A]: dimensions that were not). ConfigError where that is refused."""
+    def clip_to_range(self, actions: np.ndarray, outside: Outside) -> tuple[np.ndarray, np.ndarray]:
+        """(`actions` [..., A] clipped to the range, bool [A]: dimensions that were outside). Raises ConfigError if
+        there are any and `outside` is "refuse"."""
         low, high = np.asarray(self.low, np.float32), np.asarray(self.high, np.float32)
         beyond = ((actions < low) | (actions > high)).reshape(-1, self.action_dim).any(0)
         if outside == "refuse" and beyond.any():
@@ -114,7 +114,7 @@ class Robot:
         return np.clip(actions, low, high), beyond
 
     def describe(self, beyond: np.ndarray, actions: np.ndarray) -> str:
-        """In words, what of `actions` [..., A] lies outside."""
+        """A message that says which of `actions` [..., A] are out of range, for dimensions `beyond` [A]."""
         values = actions.reshape(-1, self.action_dim)
         known = "it was ever given" if self.recorded else "its statistics allow"
         return "; ".join(
@@ -124,6 +124,6 @@ class Robot:
         )
 
 
-def rest_of(low: Sequence[float], high: Sequence[float], mean: Sequence[float]) -> tuple[float, ...]:
-    """0 where the range has it, otherwise the mean, within the range."""
+def rest_action(low: Sequence[float], high: Sequence[float], mean: Sequence[float]) -> tuple[float, ...]:
+    """The action to begin with: 0 where the range contains it, otherwise the mean, clipped to the range."""
     return tuple(0.0 if a <= 0 <= b else min(max(m, a), b) for a, b, m in zip(low, high, mean, strict=True))

@@ -1,6 +1,6 @@
-"""A trained model that is driven: episodes that begin, advance under raw actions, are kept, copied and taken back.
+"""A trained model as a simulator: episodes that are reset, step under raw actions, are saved, branched and rewound.
 
-Owns what is known of each episode on the host; arrays and their arithmetic are `programs`'.
+Owns the host's record of each episode; the state on the device, and what computes with it, are `programs`'.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, 
 from hma_jax.config.base import require_choice, require_seed
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
-from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
+from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, find_robots, find_starts, find_tokenizer
 from hma_jax.simulator.interface import chosen_episodes, each_start, whole_numbers
-from hma_jax.simulator.programs import Beginning, Programs, padded
+from hma_jax.simulator.programs import Programs, ResetInputs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 from hma_jax.tokenizers.shared import BaseTokenizer
@@ -31,7 +31,7 @@ Rate = Literal["model", "native"]
 """Whether a step is a frame of the model, or one native action: then a frame comes with every stride-th."""
 
 HISTORY = 600
-"""Frames that an episode can be taken back by, unless told otherwise."""
+"""Frames that an episode can be rewound by, by default."""
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class Simulator:
     An episode must begin (`reset`) before it advances (`step`). Frames are uint8 [B, H, W, 3], as the tokenizer
     decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
     frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
-    says. A model trained on passive video is shown no action: it goes on as if none was known. ConfigError is raised
+    says. A model trained on passive video ignores actions. ConfigError is raised
     for whatever cannot be done; nothing has changed then. After a fault of the device every episode may have to begin
     again (`counts` is 0 then).
     """
@@ -60,8 +60,8 @@ class Simulator:
         rate: Rate = "model",
         history: int = HISTORY,
     ):
-        """`robots` describe commands better than the model's table does. Actions `outside` their range are clipped
-        (`clipped` says which, and the log once) or refused."""
+        """`robots` replace descriptions derived from the model's table. Actions `outside` their range are clipped
+        (reported in `clipped`, and logged once per robot) or refused."""
         config = model.config
         require_frames(model.run, "show")
         [episodes], [history] = whole_numbers("episodes", [episodes]), whole_numbers("history", [history])
@@ -73,16 +73,16 @@ class Simulator:
         taken = config.tokens, config.diffusion.token_channels if config.diffusion else 0
         made = tokenizer.tokens, tokenizer.channels
         require(taken == made, f"the model takes (tokens, channels) {taken} per frame, the tokenizer makes {made}")
-        self.model, self.tokenizer, self.decode = model, tokenizer, decode or USUAL
+        self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
-        self.describe(robots)
+        self.update_robots(robots)
         self.starts, self.outside, self.rate = tuple(starts), outside, rate
-        self.room, self.history = config.frames - 1, history
+        self.capacity, self.history = config.frames - 1, history
         self._programs = Programs(model, tokenizer, episodes, self.decode)
         self._state = self._programs.empty()
         self._images = np.zeros((episodes, *tokenizer.image_shape, 3), np.uint8)
         self._episodes: list[Episode | None] = [None] * episodes
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
         self.clipped: list[tuple[str, ...]] = [()] * episodes
 
     @classmethod
@@ -128,8 +128,9 @@ class Simulator:
         """Whether the model was trained without actions, so that none has an effect."""
         return self.model.run.train.masking.ignores_actions
 
-    def describe(self, robots: Sequence[Robot]) -> None:
-        """Takes better descriptions of robots, for episodes that begin from now on. ConfigError if one does not fit."""
+    def update_robots(self, robots: Sequence[Robot]) -> None:
+        """Replaces descriptions of robots, for episodes that begin from now on. Raises ConfigError if one does not
+        fit."""
         for robot in robots:
             known = self.robot(robot.name)
             require(
@@ -161,38 +162,40 @@ class Simulator:
         require(len(each) == len(numbers) == len(which), asked)
         for number in numbers:
             require_seed(number, "seeds")
-        new = {b: self._episode(start, int(seed)) for b, start, seed in zip(which, each, numbers, strict=True)}
+        new = {b: self._new_episode(start, int(seed)) for b, start, seed in zip(which, each, numbers, strict=True)}
         if not which:
             return self.images
-        at = self._blank(which, (*self.tokenizer.image_shape, 3), np.uint8)
-        begun = dict(zip(which, each, strict=True))
+        at = self._reset_inputs(which, (*self.tokenizer.image_shape, 3), np.uint8)
+        start_of = dict(zip(which, each, strict=True))
         for i, b in enumerate(at.rows.tolist()):
-            at.place(i, new[b], begun[b].images[-self.room :])
-        with self._giving_the_state():
-            state, *made = self._programs.begin(self._programs.weights, self._state, at)
+            at.set_episode(i, new[b], start_of[b].images[-self.capacity :])
+        with self._donating_state():
+            state, *made = self._programs.reset_from_images(self._programs.weights, self._state, at)
             tokens, seen = map(np.asarray, made)
             self._state = state
         for i, (b, episode) in enumerate(new.items()):
             episode.frames.extend(tokens[i, : at.given[i]])
             self._episodes[b] = episode
-        return self._show(which, seen[: len(which)])
+        return self._update_images(which, seen[: len(which)])
 
-    def _episode(self, start: Start, seed: int) -> Episode:
+    def _new_episode(self, start: Start, seed: int) -> Episode:
         robot, table = self.robot(start.robot), self.model.table
         size, given = (*self.tokenizer.image_shape, 3), start.images.shape[1:]
         require(given == size, f"a start of {robot.name}: frames must be {size}, got {given}")
-        return begin_episode(robot, table.index(robot.name), start, seed, self.room, self.history, table.action_width)
+        return begin_episode(
+            robot, table.index(robot.name), start, seed, self.capacity, self.history, table.action_width
+        )
 
-    def _blank(self, which: list[int], shape: tuple[int, ...], dtype: Any) -> Beginning:
-        return Beginning.blank(padded(which, len(self)), self.room, self.model.table.action_width, shape, dtype)
+    def _reset_inputs(self, which: list[int], shape: tuple[int, ...], dtype: Any) -> ResetInputs:
+        return ResetInputs.empty(padded(which, len(self)), self.capacity, self.model.table.action_width, shape, dtype)
 
-    def _begun(self, b: int) -> Episode:
+    def _running_episode(self, b: int) -> Episode:
         episode = self._episodes[b]
         if episode is None:
             raise ConfigError(f"episode {b} has not begun; reset it first")
         return episode
 
-    def _show(self, which: Sequence[int], seen: np.ndarray) -> np.ndarray:
+    def _update_images(self, which: Sequence[int], seen: np.ndarray) -> np.ndarray:
         images = self._images.copy()  # callers keep the frames they were given
         images[list(which)] = seen
         self._images = images
@@ -212,20 +215,20 @@ class Simulator:
         for b, action in enumerate(actions):
             if action is None:
                 continue
-            robot = self._begun(b).robot
+            robot = self._running_episode(b).robot
             native = self.rate == "native"
             require(not native or np.ndim(action) == 1, f"at the native rate an action is [A], got {np.shape(action)}")
-            asked[b], beyond = robot.confine(robot.chunk(action), self.outside)
+            asked[b], beyond = robot.clip_to_range(robot.chunk(action), self.outside)
             if beyond.any():
                 clipped[b] = tuple(np.array(robot.dimensions)[beyond].tolist())
-                self._say_once(robot, beyond, np.asarray(action, np.float32))
+                self._warn_once(robot, beyond, np.asarray(action, np.float32))
         self.clipped = clipped
-        chunks = {b: chunk for b, asked_b in asked.items() if (chunk := self._whole(b, asked_b)) is not None}
+        chunks = {b: chunk for b, asked_b in asked.items() if (chunk := self._complete_chunk(b, asked_b)) is not None}
         return self._advance(chunks) if chunks else self.images
 
-    def _whole(self, b: int, chunk: np.ndarray) -> np.ndarray | None:
+    def _complete_chunk(self, b: int, chunk: np.ndarray) -> np.ndarray | None:
         """The chunk [stride, A] to execute, or None while native actions of it are missing."""
-        episode = self._begun(b)
+        episode = self._running_episode(b)
         if self.rate == "model":
             return chunk
         episode.pending.append(chunk[0])
@@ -234,9 +237,9 @@ class Simulator:
         whole, episode.pending = np.stack(episode.pending), []
         return whole
 
-    def _say_once(self, robot: Robot, beyond: np.ndarray, actions: np.ndarray) -> None:
-        if robot.name not in self._said:
-            self._said.add(robot.name)
+    def _warn_once(self, robot: Robot, beyond: np.ndarray, actions: np.ndarray) -> None:
+        if robot.name not in self._warned:
+            self._warned.add(robot.name)
             log.warning("%s: %s; clipped, here and from now on", robot.name, robot.describe(beyond, actions))
 
     def _advance(self, chunks: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -244,23 +247,23 @@ class Simulator:
         chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
         for i, b in enumerate(rows):
             chunk_nU[i, : chunks[b].size] = chunks[b].ravel()
-        seeds = np.array([self._begun(b).seed for b in rows], np.uint32)
+        seeds = np.array([self._running_episode(b).seed for b in rows], np.uint32)
         asked = np.array(rows, np.int32), chunk_nU, seeds
-        with self._giving_the_state():
+        with self._donating_state():
             state, *made = self._programs.advance(self._programs.weights, self._state, *asked)
             tokens, seen = map(np.asarray, made)
             self._state = state
         for b, frame, chunk in zip(chunks, tokens, chunk_nU, strict=False):
-            episode = self._begun(b)
+            episode = self._running_episode(b)
             episode.frames.append(frame)
             episode.chunks.append(chunk)
             episode.count += 1
-        return self._show(list(chunks), seen[: len(chunks)])
+        return self._update_images(list(chunks), seen[: len(chunks)])
 
     @contextmanager
-    def _giving_the_state(self) -> Iterator[None]:
-        """Around a program that uses the state's memory again, until what it made has arrived. If the program fails
-        after it took the memory, what the episodes were is lost: none has begun then, and all can begin again."""
+    def _donating_state(self) -> Iterator[None]:
+        """Around a program to which the state is donated, until its results have arrived. If the program fails after
+        that, the state is lost: all episodes are then as before their first reset."""
         try:
             yield
         except BaseException:  # an interrupt by the user too
@@ -270,8 +273,8 @@ class Simulator:
             raise
 
     def compile(self, together: int) -> None:
-        """What so many episodes that advance at once need, before somebody waits for it. From any thread: the episodes
-        themselves are not touched."""
+        """Compiles the program that advances so many episodes at once, ahead of its first use. From any thread: no
+        episode changes."""
         require(1 <= together <= len(self), f"1 to {len(self)} episodes advance at once, not {together}")
         rows = np.array(padded(list(range(together)), len(self)), np.int32)
         chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
@@ -282,7 +285,7 @@ class Simulator:
 
     def snapshot(self) -> Snapshot:
         """Where all episodes stand now."""
-        return Snapshot(self._copied(self._state), self._images, copy.deepcopy(tuple(self._episodes)))
+        return Snapshot(self._copy_state(self._state), self._images, copy.deepcopy(tuple(self._episodes)))
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
         """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same
@@ -291,12 +294,12 @@ class Simulator:
             len(snapshot.episodes) == len(self),
             f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}",
         )
-        self._state, self._images = self._copied(snapshot.state), snapshot.images
+        self._state, self._images = self._copy_state(snapshot.state), snapshot.images
         self._episodes = list(copy.deepcopy(snapshot.episodes))
         return self.images
 
     def branch(self, sources: Sequence[int]) -> np.ndarray:
-        """Episode b goes on as a copy of episode sources[b], with its seed: what differs then, actions have done."""
+        """Episode b becomes a copy of episode sources[b], seed included: later differences are due to actions alone."""
         copied = whole_numbers("sources", sources)
         fits = len(copied) == len(self) and all(0 <= s < len(self) for s in copied)
         require(fits, f"branches need {len(self)} episodes below {len(self)} to copy, got {copied}")
@@ -316,33 +319,33 @@ class Simulator:
         which = chosen_episodes(episodes, len(self))
         if not which:
             return self.images
-        at = self._blank(which, self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
+        at = self._reset_inputs(which, self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
         new: dict[int, Episode] = {}
         for b in which:
-            reach = self.reach(b)
-            require(frames <= reach, f"episode {b} can be taken back by {reach} frames, not by {frames}")
-            new[b] = self._begun(b).earlier(frames)
+            max_rewind = self.max_rewind(b)
+            require(frames <= max_rewind, f"episode {b} can be taken back by {max_rewind} frames, not by {frames}")
+            new[b] = self._running_episode(b).rewound(frames)
         for i, b in enumerate(at.rows.tolist()):
-            at.place(i, new[b], np.stack(list(new[b].frames)[-min(new[b].count, self.room) :]))
-        with self._giving_the_state():
-            state, made = self._programs.again(self._programs.weights, self._state, at)
+            at.set_episode(i, new[b], np.stack(list(new[b].frames)[-min(new[b].count, self.capacity) :]))
+        with self._donating_state():
+            state, made = self._programs.reset_from_tokens(self._programs.weights, self._state, at)
             seen = np.asarray(made)
             self._state = state
         for b, episode in new.items():
             self._episodes[b] = episode
-        return self._show(which, seen[: len(which)])
+        return self._update_images(which, seen[: len(which)])
 
-    def reach(self, b: int) -> int:
-        """By how many frames episode b can be taken back."""
-        return self._begun(b).reach(self.room)
+    def max_rewind(self, b: int) -> int:
+        """By how many frames episode b can be rewound."""
+        return self._running_episode(b).max_rewind(self.capacity)
 
     def last_action(self, b: int) -> np.ndarray | None:
         """The native action [A] just before the present frame of episode b; None if that is its first."""
-        episode = self._begun(b)
+        episode = self._running_episode(b)
         robot = episode.robot
         if not episode.chunks:
             return None
         return episode.chunks[-1][: robot.stride * robot.action_dim].reshape(robot.stride, -1)[-1]
 
-    def _copied(self, state: Episodes) -> Episodes:
+    def _copy_state(self, state: Episodes) -> Episodes:
         return self._programs.take(state, np.arange(len(self), dtype=np.int32))

@@ -1,4 +1,4 @@
-"""Recorded beginnings of episodes, from which a simulator may go on, and the file that keeps them."""
+"""Recorded beginnings of episodes, from which a simulator starts, and the file that holds them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that a simulator will compile, before somebody waits for it."""
+"""Compiles a simulator's programs before their first use."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from hma_jax.simulator.starts import Start
 
 
 def warm_up(simulator: Simulator, together: int | None = None) -> None:
-    """Begins and rewinds black episodes, then all is as before; and compiles for as many as advance together. All of it
-    for any number of episodes at once, or for up to `together` of them. More that advance: `warm_up_more`."""
+    """Compiles resetting, rewinding and advancing up to `together` episodes at once (default: any number), and restores
+    the simulator's state. For more that advance at once: `warm_up_more`."""
     kept = simulator.snapshot()
     robot = next(iter(simulator.robots.values()))
     black = np.zeros((1, *simulator.images.shape[1:]), np.uint8)
@@ -33,8 +33,8 @@ def warm_up_more(
     ended: Callable[[], bool] = lambda: False,
     reached: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Compiles for more than `above` episodes that advance together, up to `most` or all, unless it is `ended` before;
-    from any thread. `reached` is told of each number up to which it is done."""
+    """Compiles advancing more than `above` episodes at once, up to `most` (default: all), until `ended()`; from any
+    thread. Calls `reached` with each number that is ready."""
     for together in sizes(len(simulator)):
         if above < together <= (most or len(simulator)) and not ended():
             simulator.compile(together)
@@ -42,5 +42,5 @@ def warm_up_more(
 
 
 def sizes(episodes: int) -> list[int]:
-    """Of the programs that advance any of so many episodes."""
+    """Batch sizes of the programs that advance any number of so many episodes."""
     return sorted({len(padded(list(range(together)), episodes)) for together in range(1, episodes + 1)})

@@ -102,7 +102,7 @@ class GeneratedSource:
 
 def confined(trajectory: Trajectory, robot: Robot) -> Trajectory:
     """With the actions that the simulator will execute: none outside the robot's recorded range."""
-    chunks = robot.confine(trajectory.chunks, "clip")[0]
+    chunks = robot.clip_to_range(trajectory.chunks, "clip")[0]
     return Trajectory(trajectory.origin, trajectory.images, chunks, trajectory.instruction)
 
 

@@ -87,7 +87,7 @@ def _act(
         if session.truth is not None:
             session.truth.step([chunk])
         if session.recorded and session.recording is not None:
-            done = session.robot.confine(chunk, "clip")[0]
+            done = session.robot.clip_to_range(chunk, "clip")[0]
             session.recorded = session.recording.add(before[session.episode], done, simulator.images[session.episode])
 
 
@@ -116,10 +116,10 @@ def _begin_truth(truth: Truth, robot: Robot, start: Any) -> TrueSimulator | None
 def _rewind(simulator: Simulator, truth: Truth, session: Session, values: Message) -> None:
     del truth
     require(session.robot is not None, "begin an episode first")
-    reach = simulator.reach(session.episode)
-    frames = min(whole(values.get("frames", 1)), reach)
+    most = simulator.max_rewind(session.episode)
+    frames = min(whole(values.get("frames", 1)), most)
     if session.truth is not None:
-        frames = min(frames, session.truth.reach(0))
+        frames = min(frames, session.truth.max_rewind(0))
     simulator.rewind(frames, [session.episode])
     if session.truth is not None:
         session.truth.rewind(frames)
@@ -164,7 +164,7 @@ def frame_of(simulator: Simulator, session: Session, request: Request) -> Messag
         "image": picture(image),
         "count": simulator.counts[session.episode],
         "window": simulator.model.config.frames,
-        "reach": simulator.reach(session.episode) if session.robot else 0,
+        "reach": simulator.max_rewind(session.episode) if session.robot else 0,
         "clipped": list(simulator.clipped[session.episode]) if request.kind == "act" else [],
         "recorded": len(session.recording) if session.recording is not None else 0,
         "recording": session.recorded,

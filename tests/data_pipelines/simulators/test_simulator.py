@@ -40,7 +40,7 @@ def test_episodes_go_their_own_ways_wait_and_are_taken_back():
     while not sim.success()[0]:
         sim.step([AHEAD, BACK])
     assert sim.success().tolist() == [True, False]
-    np.testing.assert_array_equal(sim.rewind(sim.reach(0) - 1, [0])[0], seen[0])
+    np.testing.assert_array_equal(sim.rewind(sim.max_rewind(0) - 1, [0])[0], seen[0])
     assert not sim.success()[0]
     sim.step([np.full(4, 3.0), None])
     assert sim.clipped == [DRAWER.dimensions, ()]

@@ -38,11 +38,11 @@ def test_episodes_are_apart_clipped_and_taken_back(monkeypatch):
     for _ in range(2):
         true.step(np.array([1.0, 0.0]))
     np.testing.assert_array_equal(images[0], true.render())
-    assert sim.reach(0) == 1
+    assert sim.max_rewind(0) == 1
     np.testing.assert_array_equal(sim.rewind(1, [0])[0], first[0])
     monkeypatch.setattr(true_simulator, "HISTORY", 2)
     seen = [sim.step([np.array([x, 0.0]), None])[0] for x in (0.9, 0.6, 0.3)]
-    assert sim.reach(0) == 2
+    assert sim.max_rewind(0) == 2
     np.testing.assert_array_equal(sim.rewind(2, [0])[0], seen[0])
 
 
@@ -67,7 +67,7 @@ def test_what_is_refused_changes_no_episode():
     with pytest.raises(ConfigError, match="episode 1 can be taken back by 0 frames"):
         sim.rewind(1)
     np.testing.assert_array_equal(sim.images, now)
-    assert sim.reach(0) == 1
+    assert sim.max_rewind(0) == 1
 
 
 def test_up_moves_the_pusher_up_and_right_to_the_right():

@@ -16,7 +16,7 @@ from experiments.cli.main import main
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig, require
 from hma_jax.runtime.exits import Exit
 from hma_jax.simulator import Simulator
-from hma_jax.simulator.folder import DECODE, USUAL, save_decode
+from hma_jax.simulator.folder import DECODE, DEFAULT_DECODE, save_decode
 from tests.experiments.applications.serving import no_truth, until
 from tests.hma_jax.simulator.small import parts, simulator, start
 
@@ -31,7 +31,7 @@ def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(mo
         raise ConfigError("enough is known")
 
     monkeypatch.setattr(simulators, "load_simulator", load)
-    save_decode(replace(USUAL, slide="streaming"), tmp_path / DECODE)
+    save_decode(replace(DEFAULT_DECODE, slide="streaming"), tmp_path / DECODE)
     for more in ([], ["--window", "exact"]):
         assert main(["play", str(tmp_path), *more]) == 2
     assert asked == ["streaming", "exact"]

@@ -338,7 +338,7 @@ def test_the_page_says_that_a_model_without_actions_follows_none(browsing):
 def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_rewind(browsing):
     async def test(browser, address, client):
         simulator = client.server.app[SESSIONS].simulator
-        simulator.describe([replace(simulator.robots["arm"], keeps=True)])
+        simulator.update_robots([replace(simulator.robots["arm"], keeps=True)])
         page = await opened(browser, address)
         await page.click("#robots button[data-name=arm]")
         await page.evaluate("state.robot.keeps = true")

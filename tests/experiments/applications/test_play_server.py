@@ -215,7 +215,7 @@ def test_rewinding_and_the_same_actions_give_the_same_frames():
 def test_a_robot_that_went_back_is_told_where_it_was_sent_then():
     async def test(client):
         sessions, player = client.server.app[server.SESSIONS], Player(client)
-        sessions.simulator.describe([replace(sessions.simulator.robots["arm"], keeps=True)])
+        sessions.simulator.update_robots([replace(sessions.simulator.robots["arm"], keeps=True)])
         await player.enter()
         for value in (0.4, 0.5, 0.6):
             frame = await ask(player.socket, type="act", action=[value] * 7)

@@ -22,7 +22,7 @@ from experiments.running.workspace import Workspace
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
-from hma_jax.simulator.folder import USUAL, find_decode
+from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode
 from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.runs import TABLE, make_run
 
@@ -199,5 +199,5 @@ def test_the_model_of_this_repository_is_whole():
     shipped = Path(ship_module.__file__).parents[2] / DRIVEN
     simulator = Simulator.load(shipped)
     assert len(simulator.robots) == 8 == len({start.robot for start in simulator.starts})
-    assert simulator.decode == find_decode(shipped) != USUAL
+    assert simulator.decode == find_decode(shipped) != DEFAULT_DECODE
     assert sum(path.stat().st_size for path in shipped.rglob("*") if path.is_file()) < ship_module.LARGEST

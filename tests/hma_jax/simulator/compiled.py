@@ -11,7 +11,7 @@ import pytest
 
 from hma_jax.config import DecodeConfig
 from hma_jax.simulator import simulator as module
-from hma_jax.simulator.programs import Programs, Weights
+from hma_jax.simulator.programs import ProgramParams, Programs
 from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.training.runs import Model
 
@@ -25,7 +25,7 @@ def programs(model: Model, tokenizer: BaseTokenizer, episodes: int, decode: Deco
     if key not in COMPILED:
         COMPILED[key] = Programs(model, tokenizer, episodes, decode)
     shared = copy(COMPILED[key])
-    shared.weights = Weights(model.params, tokenizer.params)
+    shared.weights = ProgramParams(model.params, tokenizer.params)
     return shared
 
 

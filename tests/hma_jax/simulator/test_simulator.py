@@ -167,7 +167,7 @@ def test_what_was_taken_back_comes_again_under_the_same_actions(back: int):
     shown = sim.rewind(back)[0]
     np.testing.assert_array_equal(shown, made[11 - back] if back < 12 else first)
     np.testing.assert_array_equal(run(sim, plan[12 - back :]), made[12 - back :])
-    assert sim.reach(0) == 12
+    assert sim.max_rewind(0) == 12
     sim.rewind(12)
     np.testing.assert_array_equal(sim.images[0], first)
 
