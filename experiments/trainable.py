@@ -31,7 +31,7 @@ def devices_of(mesh: MeshConfig, share: float | None) -> float:
     """
     from hma_jax.runtime.mesh import mesh_sizes
 
-    share = share or float(mesh.least)
+    share = share or float(mesh.min_devices)
     mesh_sizes(mesh, math.ceil(share))
     return share
 

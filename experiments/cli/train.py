@@ -297,7 +297,7 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
     from experiments.trainable import check_trials
 
     mesh, own = setting.study.execution.mesh, LauncherOptions().share()
-    share = own * processes if own else float(max(processes, mesh.least))
+    share = own * processes if own else float(max(processes, mesh.min_devices))
     model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
     devices = Devices(check_trials(setting.study, [model], share))
     given, trained = bool(setting.data), setting.tokenizer is None

@@ -1,4 +1,4 @@
-"""What every configuration is checked with."""
+"""Checks that every configuration uses."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_shapes(what: str, found: Mapping[str, Any], wanted: Mapping[str, tuple[int, ...]]) -> None:
-    """Raises ConfigError, which begins with `what`, unless arrays have the shapes that are wanted; None is said to be
-    missing."""
+    """Raises ConfigError, which begins with `what`, unless the arrays in `found` have the shapes `wanted`; None has
+    none."""
     shapes = {name: getattr(array, "shape", None) for name, array in found.items()}
     wrong = [f"{name} {shape}, got {shapes[name]}" for name, shape in wanted.items() if shapes[name] != shape]
     require(not wrong, f"{what} {'; '.join(wrong)}")
 
 
 def require_seed(seed: int, where: str) -> None:
-    """Raises ConfigError, which begins with `where`, unless `seed` differs from every other one: of a number JAX takes
-    32 bits, so that masks of 2^32 would be those of 0, and numpy takes none below 0."""
+    """Raises ConfigError, which begins with `where`, unless `seed` is in [0, 2^32): JAX uses 32 bits of a seed, so that
+    2^32 would be the same as 0, and numpy takes no negative one."""
     require(0 <= seed < 2**32, f"{where} must lie in [0, 2^32), got {seed}")
 
 
@@ -40,11 +40,11 @@ def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
     require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
 
 
-def check_fields(config: Any, limits: tuple[str, ...] = ()) -> None:
-    """Raises ConfigError for a field of a dataclass that is not among the choices of its type (a Literal, one or
-    None, or a tuple of such), and for a number that is not finite. Of `limits` infinity is none at all.
+def check_fields(config: Any, infinite_allowed: tuple[str, ...] = ()) -> None:
+    """Raises ConfigError for a field of a dataclass that is not among the choices of its type (a Literal, one or None,
+    or a tuple of such), and for a number that is not finite. Fields in `infinite_allowed` may be infinite: no limit.
 
-    A list becomes the tuple that it is read for: it has no hash, by which programs are kept."""
+    A list is replaced by a tuple: configurations are hashed, as keys of compiled programs."""
     where = type(config).__name__
     for name, value in list(vars(config).items()):
         if isinstance(value, list):
@@ -54,7 +54,9 @@ def check_fields(config: Any, limits: tuple[str, ...] = ()) -> None:
         for one in value if several else (value,):
             require_choice(one, choices, f"{where}.{name}")
     for name, value in vars(config).items():
-        finite = not isinstance(value, float) or math.isfinite(value) or (name in limits and value == math.inf)
+        finite = (
+            not isinstance(value, float) or math.isfinite(value) or (name in infinite_allowed and value == math.inf)
+        )
         require(finite, f"{where}.{name} must be finite, got {value}")
 
 
@@ -71,7 +73,7 @@ def _choices(cls: type) -> tuple[tuple[str, tuple[Any, ...], bool], ...]:
 
 
 def _of_literals(hint: Any) -> tuple[Any, ...]:
-    """What a Literal, or a Literal or None, allows; nothing of other types."""
+    """The values of a Literal, or of `Literal | None`; empty for other types."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         options = [option for option in typing.get_args(hint) if option is not type(None)]
         choices = _of_literals(options[0]) if len(options) == 1 else ()

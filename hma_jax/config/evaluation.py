@@ -40,7 +40,7 @@ class SamplerConfig:
         require(self.temperature >= 0, f"sampler.temperature must not be negative, got {self.temperature}")
         require(0.0 <= self.eta <= 1.0, f"sampler.eta must lie in [0, 1], got {self.eta}")
         require(
-            self._draws or self.scale_initial_noise or self.temperature == 1,
+            self._stochastic or self.scale_initial_noise or self.temperature == 1,
             f"sampler.temperature has no effect on {self.kind} without scale_initial_noise; "
             "set scale_initial_noise or leave the temperature at 1",
         )
@@ -48,10 +48,10 @@ class SamplerConfig:
     @property
     def noisy_steps(self) -> bool:
         """Whether the steps after the first need random numbers."""
-        return self._draws and self.temperature > 0
+        return self._stochastic and self.temperature > 0
 
     @property
-    def _draws(self) -> bool:
+    def _stochastic(self) -> bool:
         return self.kind == "ddpm" or (self.kind == "dpm++" and self.eta > 0)
 
 

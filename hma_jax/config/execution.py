@@ -1,7 +1,6 @@
-"""How a program is computed: recorded with a run, but no part of what the run is.
+"""How a program is executed: recorded with a run, but no part of its identity.
 
-Two starts of one run may differ in all of this (`training.train`); what they compute differs by
-rounding at most.
+A run may be resumed with any other execution (`training.train`); results differ by rounding at most.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ Attention = Literal["auto", "plain", "cpu", "cudnn", "splash"]
 """What computes attention (`hma_jax.kernels`); `auto` takes what suits the platform and the shapes."""
 
 FORMER_FIELDS = {"model": ("compute_dtype", "remat", "attention"), "train": ("accumulate",)}
-"""Fields of configurations that earlier versions wrote there and that say how a run was computed, not what it is;
-they are not compared."""
+"""Fields of earlier versions' model and train configurations that describe execution, not identity; they are dropped
+before runs are compared."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class MeshConfig:
         require(self.min_shard_size >= 0, f"mesh.min_shard_size must not be negative, got {self.min_shard_size}")
 
     @property
-    def least(self) -> int:
-        """How many devices it takes at least: all of them where no axis is -1."""
+    def min_devices(self) -> int:
+        """The product of the axes that are not -1: the number of devices if none is -1, else the least."""
         return math.prod(size for size in (self.data, self.fsdp, self.tensor) if size != -1)
 
 

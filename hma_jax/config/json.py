@@ -87,8 +87,8 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 
 
 def _by_kind(options: list[Any], value: Any, where: str) -> Any:
-    """Of several configs the one whose `kind` is `value`'s; the first of them has none. Of several types
-    the tuple where `value` is a list."""
+    """The member of a union that `value` is decoded as: among configs the one with the same `kind` (default: the
+    first), or the tuple if `value` is a list."""
     tuples = [option for option in options if typing.get_origin(option) is tuple]
     if isinstance(value, (list, tuple)) and tuples:
         return tuples[0]
@@ -122,12 +122,12 @@ def _of_dataclass(config: Any) -> dict[str, Any]:
 
 
 def diff(old: Any, new: Any, path: str = "") -> list[str]:
-    """Readable lines 'field: old -> new' for every difference between two configs. What is in a list and has a name, as
-    robots have, is told apart by it."""
+    """Readable lines 'field: old -> new' for every difference between two configs. List entries that have a name, as
+    robots do, are matched by it."""
     a, b = to_dict(old), to_dict(new)
-    if (mine := _by_name(a)) and (other := _by_name(b)):
-        lines = diff(mine, other, path) if mine.keys() == other.keys() else []
-        return lines or ([] if a == b else [f"{path}: {list(mine)} -> {list(other)}"])
+    if (old_named := _by_name(a)) and (new_named := _by_name(b)):
+        lines = diff(old_named, new_named, path) if old_named.keys() == new_named.keys() else []
+        return lines or ([] if a == b else [f"{path}: {list(old_named)} -> {list(new_named)}"])
     if isinstance(a, dict) and isinstance(b, dict):
         lines = []
         for key in sorted(set(a) | set(b)):
@@ -137,7 +137,7 @@ def diff(old: Any, new: Any, path: str = "") -> list[str]:
 
 
 def _by_name(value: Any) -> dict[str, Any]:
-    """A list of objects that all have names of their own, by these; nothing for anything else."""
+    """A list of objects with distinct names, as a dict by name; empty for anything else."""
     if not isinstance(value, list) or not all(
         isinstance(one, dict) and isinstance(one.get("name"), str) for one in value
     ):

@@ -53,7 +53,7 @@ class DiffusionConfig:
     time_shift: float = 1.0
 
     def __post_init__(self):
-        check_fields(self, limits=("clip", "weight_cap"))
+        check_fields(self, infinite_allowed=("clip", "weight_cap"))
         for name in ("channels", "patch", "width", "depth", "repeats"):
             value = getattr(self, name)
             require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")

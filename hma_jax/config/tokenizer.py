@@ -108,7 +108,7 @@ class TokenizerTrainConfig:
     seed: int = 0  # of initial values and order of frames
 
     def __post_init__(self):
-        check_fields(self, limits=("clip_norm",))
+        check_fields(self, infinite_allowed=("clip_norm",))
         require(self.steps >= 1, f"tokenizer training: steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"tokenizer training: batch must be at least 1, got {self.batch}")
         require(

@@ -146,7 +146,7 @@ class OptimizerConfig:
     matrices: Literal["adamw", "muon"] = "adamw"
 
     def __post_init__(self):
-        check_fields(self, limits=("clip_norm",))
+        check_fields(self, infinite_allowed=("clip_norm",))
         require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")
         require(self.warmup_steps >= 0, "optimizer.warmup_steps must not be negative")
         require(self.clip_norm > 0, f"optimizer.clip_norm must be positive, got {self.clip_norm}")

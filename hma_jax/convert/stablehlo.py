@@ -29,7 +29,7 @@ from hma_jax.generation import rollout
 from hma_jax.kernels.random import GENERATOR
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.objective.masking import never_shown
+from hma_jax.objective.masking import hidden_at_inference
 from hma_jax.training.runs import Run, require_frames
 
 FORMAT, VERSION = "hma-jax-stablehlo", 1
@@ -76,7 +76,7 @@ def generate_function(
     def generate(weights, prompt, actions, embodiment, key):
         base = jax.random.wrap_key_data(key, impl=GENERATOR)
         keys = jax.vmap(lambda row: jax.random.fold_in(base, row))(jnp.arange(config.batch))
-        hma, hidden = declared.merge(nested(weights)), never_shown(table, setting, embodiment, config.frames)
+        hma, hidden = declared.merge(nested(weights)), hidden_at_inference(table, setting, embodiment, config.frames)
         return rollout(hma, prompt, actions[:, None], embodiment, keys, config.decode, hidden_BT=hidden)[:, 0]
 
     return generate

@@ -1,9 +1,8 @@
 """Whether activations keep their size as the model widens: the coordinate check of muP.
 
-Models of several widths take the same few training steps on one fixed batch. Before every step
-the sizes (root mean square) of what flows through them are noted. Under muP no size grows with
-width, and no change that training makes grows or fades (Tensor Programs V, appendix D.1). It
-takes a large learning rate: a small one hides what is wrong.
+Models of several widths take the same few training steps on one fixed batch. Before every step the sizes (root mean
+square) of activations are recorded. Under muP no size grows with width, and no change that training makes grows or
+fades (Tensor Programs V, appendix D.1). It takes a large learning rate: a small one hides what is wrong.
 """
 
 from __future__ import annotations
@@ -49,39 +48,39 @@ class Slope(NamedTuple):
 # --- Measuring -------------------------------------------------------------------------------
 
 
-class _WatchedTrunk:
-    """Stands in for a trunk: runs its blocks one by one, not in a scan, and notes what they do."""
+class _RecordingTrunk:
+    """Replaces a trunk: runs its blocks one by one, not in a scan, and records their activations."""
 
-    def __init__(self, model: HMA, note: Callable[[str, jax.Array], None]):
-        self.blocks, self.layers, self.note = model.trunk.blocks, model.config.layers, note
+    def __init__(self, model: HMA, record: Callable[[str, jax.Array], None]):
+        self.blocks, self.layers, self.record = model.trunk.blocks, model.config.layers, record
 
     def __call__(self, x: jax.Array, *rest: Any) -> tuple[jax.Array, None]:
         block_def, layers = nnx.split(self.blocks)
         logits = []
 
-        def keep(scale: float, pairs: str, qkv: jax.Array) -> None:
+        def record_logits(scale: float, pairs: str, qkv: jax.Array) -> None:
             logits.append(scale * jnp.einsum(pairs, qkv[..., 0, :, :], qkv[..., 1, :, :]))
 
         for index in range(self.layers):
             block = nnx.merge(block_def, jax.tree.map(lambda p, i=index: p[i], layers))
             for attention, pairs in ((block.space, "btphi,btshi->bthps"), (block.time, "btphi,bsphi->bphts")):
-                _watch(attention, "project", partial(keep, attention.scale, pairs))
+                _record_outputs(attention, "project", partial(record_logits, attention.scale, pairs))
             x, _ = block(x, *rest[:3], None)
-        self.note("attention logits", jnp.concatenate([y.ravel() for y in logits]))
-        self.note("residual stream", x)
+        self.record("attention logits", jnp.concatenate([y.ravel() for y in logits]))
+        self.record("residual stream", x)
         return x, None
 
 
-def _watch(module: Any, name: str, note: Callable[[Any], None]) -> None:
-    """From now on `note` is given whatever this module's `name` returns."""
+def _record_outputs(module: Any, name: str, record: Callable[[Any], None]) -> None:
+    """Wraps the method `name` of `module`: `record` is called with every result."""
     inner = getattr(module, name)
 
-    def watched(*args: Any) -> Any:
+    def recorded(*args: Any) -> Any:
         result = inner(*args)
-        note(result)
+        record(result)
         return result
 
-    setattr(module, name, watched)
+    setattr(module, name, recorded)
 
 
 def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
@@ -91,26 +90,26 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     block, "logits" or "conditions" of the frames, then "denoiser condition" and "denoiser" (fixed
     noise and times) in the continuous variant, and "actions" where there is an action head.
     """
-    seen: dict[str, jax.Array] = {}
-    note = seen.__setitem__
-    model.trunk = _WatchedTrunk(model, note)
+    activations: dict[str, jax.Array] = {}
+    record = activations.__setitem__
+    model.trunk = _RecordingTrunk(model, record)
     hidden = model.align_hidden(masked.hidden_T, masked.hidden_T.shape)
     embodiment_B = batch["embodiment"]
     out = model(masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden)
     diffusion = model.config.diffusion
     if diffusion:
-        note("conditions", out.predictions)
+        record("conditions", out.predictions)
     else:
-        note("logits", model.logits(out.predictions, batch["tokens"]))
+        record("logits", model.logits(out.predictions, batch["tokens"]))
     if diffusion:
         key = key_of(0)
         time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)
-        _watch(model.denoiser, "condition", lambda y: note("denoiser condition", y))
-        note("denoiser", model.denoiser(noise, time, out.predictions))
+        _record_outputs(model.denoiser, "condition", lambda y: record("denoiser condition", y))
+        record("denoiser", model.denoiser(noise, time, out.predictions))
     if model.action_head is not None and out.actions is not None:
         args = draw_noise(key, batch["actions"].shape, diffusion.steps)[::-1] if diffusion else ()
-        note("actions", model.action_head(*args, out.actions, embodiment_B))
-    return seen
+        record("actions", model.action_head(*args, out.actions, embodiment_B))
+    return activations
 
 
 def measure(
@@ -144,11 +143,11 @@ def measure(
             compiler_options=compiler_options,
         )
         for seed in seeds:
-            seen = jax.device_get(run(init_state(declared, table, seed)))
+            activations = jax.device_get(run(init_state(declared, table, seed)))
             rows += [
                 Size(quantity, width, seed, step, _rms(values[step]), _rms(values[step] - values[0]))
                 for step in range(train.steps + 1)
-                for quantity, values in seen.items()
+                for quantity, values in activations.items()
             ]
     return rows
 
@@ -172,11 +171,11 @@ def slopes(rows: Sequence[Size]) -> dict[str, Slope]:
     late = [row for row in rows if row.step > last / 2]
     fitted = {}
     for quantity in dict.fromkeys(row.quantity for row in late):
-        mine = [row for row in late if row.quantity == quantity]
-        x = np.log([row.width for row in mine])
+        own = [row for row in late if row.quantity == quantity]
+        x = np.log([row.width for row in own])
         x -= x.mean()
         with np.errstate(all="ignore"):
-            sizes = np.log([[row.size, row.change] for row in mine])
+            sizes = np.log([[row.size, row.change] for row in own])
             fitted[quantity] = Slope(*map(float, x @ sizes / (x @ x)))
     return fitted
 

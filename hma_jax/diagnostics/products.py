@@ -1,7 +1,7 @@
 """Which matrix products a program consists of, and how often each is computed.
 
-The rest of a program (softmax, norms, copies, the optimiser) takes time on top: what its products take, each
-measured alone, is what no arrangement of it can go below.
+The rest of a program (softmax, norms, copies, the optimiser) takes time on top: the time of its products, each measured
+alone, is a lower bound.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ Axes = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Product:
-    """One `jax.lax.dot_general`: shapes of its factors, which axes are summed over and which run along."""
+    """One `jax.lax.dot_general`: the shapes of its factors, their contracting axes and their batch axes."""
 
     left: tuple[int, ...]
     right: tuple[int, ...]
-    summed: tuple[Axes, Axes]
-    along: tuple[Axes, Axes]
+    contracting: tuple[Axes, Axes]
+    batch: tuple[Axes, Axes]
     dtype: str
 
     @property
     def flops(self) -> float:
         """Two per multiply-add."""
-        free = [n for axis, n in enumerate(self.right) if axis not in (*self.summed[1], *self.along[1])]
+        free = [n for axis, n in enumerate(self.right) if axis not in (*self.contracting[1], *self.batch[1])]
         return 2.0 * math.prod(self.left) * math.prod(free)
 
     @property
     def matrices(self) -> tuple[int, int, int, int]:
-        """(how many products side by side, rows, summed values, columns)."""
-        count = math.prod(self.left[axis] for axis in self.along[0])
-        inner = math.prod(self.left[axis] for axis in self.summed[0])
+        """(batch size, rows, contracted values, columns)."""
+        count = math.prod(self.left[axis] for axis in self.batch[0])
+        inner = math.prod(self.left[axis] for axis in self.contracting[0])
         rows = math.prod(self.left) // max(count * inner, 1)
         columns = math.prod(self.right) // max(count * inner, 1)
         return count, rows, inner, columns
 
     def __call__(self, left: jax.Array, right: jax.Array) -> jax.Array:
-        return jax.lax.dot_general(left, right, (self.summed, self.along))
+        return jax.lax.dot_general(left, right, (self.contracting, self.batch))
 
 
 def count_products(function: Callable[..., Any], *args: Any) -> Counter[Product]:
     """How often `function` of arguments like `args` computes each product.
 
-    What no result needs is not counted. Of a condition's branches the one with most operations counts, and the
-    body of a loop whose length is not known beforehand counts once.
+    Dead code is not counted. Of a `cond` the branch with most operations counts; the body of a `while` loop counts
+    once.
     """
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     needed, _ = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
@@ -82,8 +82,8 @@ def _count(jaxpr: Jaxpr) -> Counter[Product]:
 def _product(equation: JaxprEqn) -> Product:
     left, right = (variable.aval for variable in equation.invars)
     (left_summed, right_summed), (left_along, right_along) = equation.params["dimension_numbers"]
-    summed, along = (tuple(left_summed), tuple(right_summed)), (tuple(left_along), tuple(right_along))
-    return Product(left.shape, right.shape, summed, along, str(left.dtype))
+    contracting, batch = (tuple(left_summed), tuple(right_summed)), (tuple(left_along), tuple(right_along))
+    return Product(left.shape, right.shape, contracting, batch, str(left.dtype))
 
 
 def _inner(equation: JaxprEqn) -> Iterator[Jaxpr]:

@@ -30,7 +30,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.objective.losses import frame_diffusion_loss
-from hma_jax.objective.masking import never_shown
+from hma_jax.objective.masking import hidden_at_inference
 
 Kind = Literal["still", "negated", "scaled", "swapped"]
 
@@ -178,7 +178,7 @@ def make_loss(
     def loss(params: Params, batch: dict[str, jax.Array], actions: jax.Array) -> jax.Array:
         hma, tokens, real = declared.merge(params), batch["tokens"][:, : model.frames], batch.get("real")
         followed = None if real is None else real[:, 1 : model.frames]
-        hidden = never_shown(table, setting, batch["embodiment"], model.frames)
+        hidden = hidden_at_inference(table, setting, batch["embodiment"], model.frames)
         predictions = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
         if model.diffusion:
             keys = jax.vmap(key_of)(jnp.arange(len(tokens)))  # common noise under all changes

@@ -46,7 +46,7 @@ from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
 from hma_jax.model.readout import choose_likeliest
 from hma_jax.objective.losses import frame_diffusion_loss
-from hma_jax.objective.masking import never_shown
+from hma_jax.objective.masking import hidden_at_inference
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
@@ -157,7 +157,7 @@ def _frame_metrics(
     """(metrics of tokens, Predicted) of a model that was trained for frames; `window` is what of a batch fits it."""
     model = hma.config
     tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
-    hidden = never_shown(table, setting, robots, actions.shape[1])
+    hidden = hidden_at_inference(table, setting, robots, actions.shape[1])
     sequences, decoding = evaluation_inputs(batch, table, config)
     real = batch.get("real")
     shown = None if hidden is None else hidden[:, : model.frames]

@@ -57,7 +57,7 @@ def rollout(
     chunk of the last prompt frame on; what comes before is read from the first sequence and
     computed once. All R sequences use the same random numbers (a function of the example's key
     and the frame), so a difference between them is the actions' doing. `hidden_BT` marks recorded
-    chunks that the model is not shown; which it was trained without, says `objective.masking.never_shown`.
+    chunks that the model is not shown; which it was trained without, says `objective.masking.hidden_at_inference`.
     Raises ConfigError for shapes that do not fit the model or each other.
     """
     _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, hidden_BT)

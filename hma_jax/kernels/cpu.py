@@ -1,9 +1,9 @@
-"""Attention for CPUs: one frame's weights at a time, which fit the cache that all frames' together do not.
+"""Attention for CPUs: one frame's attention weights at a time, which fit in the processor's cache; those of all frames
+do not.
 
-The weights of a frame are computed again in the backward pass, from the logarithm of their sum. Heads go in a
-few groups, each a chain of its own: XLA's thread pool runs chains side by side, but not the matrices of one
-batched product. A single query per position, as in generation, is no matrix: products and sums of arrays are
-faster there.
+The backward pass recomputes a frame's weights from the log-sum-exp of its logits. Heads are split into a few groups of
+independent operations: XLA's thread pool runs those in parallel, but not the matrices of one batched product. With a
+single query per position, as in generation, element-wise products and sums are faster than matrix products.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from hma_jax.kernels.pointwise import sum_over
 from hma_jax.runtime.sharding import is_split
 
 CACHED_BYTES = 2**20
-"""Attention weights of a frame below this stay in the cache anyway."""
+"""Frames whose attention weights are smaller are left to `plain`: they stay in the cache anyway."""
 
-CHAINS = 2
-"""Groups of heads. Measured on two cores; one chain used one of them."""
+HEAD_GROUPS = 2
+"""Groups of heads that are computed in parallel. Measured on two cores, of which a single group used one."""
 
-FEW = 2
-"""Frames up to here that attend to a cache do so one by one."""
+MAX_SINGLE_FRAMES = 2
+"""With up to so many frames, each attends to the cache on its own."""
 
 
 def within(qkv: jax.Array, scale: float) -> jax.Array:
@@ -43,29 +43,29 @@ def _by_frame(qkv: jax.Array, scale: float) -> jax.Array:
 
 def _forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tuple[jax.Array, ...]]:
     frames = qkv.reshape(-1, *qkv.shape[2:])
-    y, log_sum = jax.lax.map(partial(_in_chains, partial(_attend, scale)), (frames,))
+    y, log_sum = jax.lax.map(partial(_in_head_groups, partial(_attend, scale)), (frames,))
     y, log_sum = remat.attention(y.reshape(*qkv.shape[:3], *qkv.shape[4:])), remat.attention(log_sum)
     return y, (qkv, y, log_sum)
 
 
 def _backward(scale: float, saved: tuple[jax.Array, ...], dy: jax.Array) -> tuple[jax.Array]:
     qkv, y, log_sum = saved
-    # The mean of a row of dweights under its weights: dy.y.
+    # Mean of each row of dweights weighted by its attention weights, which equals dy.y.
     delta = jnp.swapaxes(sum_over(dy.astype(jnp.float32) * y.astype(jnp.float32), -1)[..., 0], -1, -2)
     flat = (qkv, dy, delta)
     frames, dy, delta = (x.reshape(-1, *x.shape[2:]) for x in flat)
-    dqkv = jax.lax.map(partial(_in_chains, partial(_attend_backward, scale)), (frames, dy, log_sum, delta))
+    dqkv = jax.lax.map(partial(_in_head_groups, partial(_attend_backward, scale)), (frames, dy, log_sum, delta))
     return (dqkv.reshape(qkv.shape),)
 
 
 _by_frame.defvjp(_forward, _backward)
 
 
-def _in_chains(attend: Callable, frame: tuple[jax.Array, ...]):
-    """`attend` over groups of heads. Arrays [P, ..., H, I] are handed over as [H, ..., P, I], arrays [H, P] as
-    they are, and come back likewise."""
+def _in_head_groups(attend: Callable, frame: tuple[jax.Array, ...]):
+    """Applies `attend` to groups of heads. Arrays [P, ..., H, I] are passed as [H, ..., P, I] and [H, P] as they are;
+    results come back in the first layout."""
     heads = frame[0].shape[-2]
-    size = -(-heads // CHAINS)
+    size = -(-heads // HEAD_GROUPS)
     by_head = [x if x.ndim == 2 else jnp.moveaxis(x, (-2, 0), (0, -2)) for x in frame]
     groups = [attend(*(x[first : first + size] for x in by_head)) for first in range(0, heads, size)]
     joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *groups)
@@ -84,8 +84,8 @@ def _attend(scale: float, qkv: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _attend_backward(scale: float, qkv: jax.Array, dy: jax.Array, log_sum: jax.Array, delta: jax.Array) -> jax.Array:
-    """dqkv [H, 3, P, I]. Rows of the weights are keys here: then one product of three is of a transposed
-    matrix, not two."""
+    """dqkv [H, 3, P, I]. Rows of the weights are keys here, so that only one of the three products has a transposed
+    factor."""
     q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
     logits = scale * jnp.einsum("hsi,hpi->hsp", k, q, preferred_element_type=jnp.float32)
     weights = jnp.exp(logits - log_sum[:, None])
@@ -99,7 +99,7 @@ def _attend_backward(scale: float, qkv: jax.Array, dy: jax.Array, log_sum: jax.A
 
 def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
     """As `plain.over_cache`."""
-    if qkv.shape[1] > FEW:
+    if qkv.shape[1] > MAX_SINGLE_FRAMES:
         return plain.over_cache(qkv, keys, values, visible, scale)
     q, k, v = plain.split(qkv)
     each = [_one_frame(q[:, t], (keys, k), (values, v), visible[t], scale) for t in range(qkv.shape[1])]
@@ -109,7 +109,8 @@ def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.
 def _one_frame(
     q: jax.Array, keys: tuple[jax.Array, ...], values: tuple[jax.Array, ...], visible: jax.Array, scale: float
 ) -> jax.Array:
-    """q [B, P, H, I] over frames [B, T, P, H, I] in pieces that are not joined: no copy of a cache is made.
+    """q [B, P, H, I] attends to frames [B, T, P, H, I] given in several arrays, which are not concatenated: the cache
+    is not copied.
 
     Sums are in float32, as those inside a product of matrices are.
     """

@@ -1,7 +1,7 @@
 """Products with a weight, with one weight per robot, and look-ups in tables; gradients are written out.
 
-On CPU the gradient of a weight is a product whose narrower factor is turned first, in a copy of its own:
-XLA's products are slow at factors that lie the other way round. A robot's gradient is summed over its
+On CPU the narrower factor of a weight gradient is transposed into a copy first: XLA's products of transposed factors
+are slow. A robot's gradient is summed over its
 examples by a product with their one-hot assignment: no scatter, and the same sum on every run.
 """
 
@@ -48,16 +48,16 @@ contract.defvjp(_contract_forward, _contract_backward)
 def _product_over_rows(x: jax.Array, dy: jax.Array) -> jax.Array:
     """x [R, in], dy [R, out] -> [in, out], summed over rows."""
 
-    def turned(x: jax.Array, dy: jax.Array) -> jax.Array:
+    def transposed(x: jax.Array, dy: jax.Array) -> jax.Array:
         if x.shape[1] <= dy.shape[1]:
-            return _copied(x.T) @ dy
-        return _copied(_copied(dy.T) @ x).T
+            return _materialised(x.T) @ dy
+        return _materialised(_materialised(dy.T) @ x).T
 
-    return jax.lax.platform_dependent(x, dy, cpu=turned, default=lambda x, dy: jnp.tensordot(x, dy, (0, 0)))
+    return jax.lax.platform_dependent(x, dy, cpu=transposed, default=lambda x, dy: jnp.tensordot(x, dy, (0, 0)))
 
 
-def _copied(x: jax.Array) -> jax.Array:
-    """x as an array of its own: XLA may not merge what follows with what made it."""
+def _materialised(x: jax.Array) -> jax.Array:
+    """x as an array in memory: XLA may not fuse its producer with its consumers."""
     return jax.lax.optimization_barrier(x)
 
 
@@ -104,14 +104,13 @@ take_by_robot.defvjp(
 
 
 TO_EXAMPLES, FROM_EXAMPLES = "robots_to_examples", "examples_to_robots"
-"""Names that what is sent for these two bears in a compiled program."""
+"""Scopes of the two communications in compiled programs, by which tests and profiles find them."""
 
 
 def _to_examples(w: jax.Array, slice_B: jax.Array, layouts: Layouts | None) -> jax.Array:
-    """w [E, ...] -> [B, ...], on a mesh: from where w is stored to the devices that have the examples.
+    """w [E, ...] -> [B, ...]; on a mesh, from the storage layout of w to the devices that hold the examples.
 
-    Few robots are gathered whole. If a device has fewer examples than there are robots, each part of w sends
-    every example its own slice only.
+    If a device has as many examples as there are robots, w is gathered; otherwise only each example's slice is sent.
     """
     if layouts is None:
         return jnp.take(w, slice_B, axis=0)
@@ -120,7 +119,7 @@ def _to_examples(w: jax.Array, slice_B: jax.Array, layouts: Layouts | None) -> j
         if _few(len(w), slice_B):
             each = jnp.take(pinned(w, None, *compute[1:]), slice_B, axis=0)
         else:
-            each = pinned(jnp.take(w, pinned(slice_B, None), axis=0), _left(storage), *storage[1:])
+            each = pinned(jnp.take(w, pinned(slice_B, None), axis=0), _free_batch_axes(storage), *storage[1:])
         return pinned(each, BATCH, *compute[1:])
 
 
@@ -131,12 +130,12 @@ def _from_examples(each: jax.Array, slice_B: jax.Array, robots: int, layouts: La
     storage, _ = layouts
     with jax.named_scope(FROM_EXAMPLES):
         if not _few(robots, slice_B):
-            each = pinned(each, _left(storage), *storage[1:])
+            each = pinned(each, _free_batch_axes(storage), *storage[1:])
         return pinned(sum_by_robot(each, slice_B, robots), None, *storage[1:])
 
 
-def _left(storage: PartitionSpec) -> tuple[str, ...]:
-    """The mesh axes of the batch that examples' slices still have where the width is split as in storage."""
+def _free_batch_axes(storage: PartitionSpec) -> tuple[str, ...]:
+    """The batch's mesh axes that are left for the examples when the other axes are split as in storage."""
     used = {name for part in storage[1:] for name in mesh_axes(part)}
     return tuple(name for name in BATCH if name not in used)
 
@@ -193,16 +192,16 @@ def sum_by_robot(x: jax.Array, slice_B: jax.Array, robots: int) -> jax.Array:
     """x [B, ...] -> [E, ...]: the sum over each robot's examples."""
     if robots == 1:
         return jnp.sum(x, axis=0, keepdims=True)
-    mine = (jnp.arange(robots)[:, None] == slice_B).astype(x.dtype)
+    one_hot = (jnp.arange(robots)[:, None] == slice_B).astype(x.dtype)
     if is_split():  # a split dimension must stay one of its own
-        return jnp.tensordot(mine, x, 1)
-    return (mine @ x.reshape(len(x), -1)).reshape(robots, *x.shape[1:])
+        return jnp.tensordot(one_hot, x, 1)
+    return (one_hot @ x.reshape(len(x), -1)).reshape(robots, *x.shape[1:])
 
 
 # --- Tables ------------------------------------------------------------------------------------
 
-WIDE = 2048
-"""Entries of a table above which its gradient is scattered instead of multiplied."""
+MAX_ONE_HOT_ENTRIES = 2048
+"""Larger tables get their gradient by a scatter-add instead of a product with one-hot rows."""
 
 
 @jax.custom_vjp
@@ -219,7 +218,7 @@ def look_up(table: jax.Array, ids: jax.Array) -> jax.Array:
 def _look_up_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array) -> tuple[jax.Array, None]:
     table, ids = saved
     rows, ids = dy.reshape(-1, dy.shape[-1]), ids.ravel()
-    if len(table) > WIDE:
+    if len(table) > MAX_ONE_HOT_ENTRIES:
         return jnp.zeros(table.shape, jnp.float32).at[ids].add(rows.astype(jnp.float32)), None
     hot = (jnp.arange(len(table))[:, None] == ids).astype(rows.dtype)
     return jnp.matmul(hot, rows, preferred_element_type=jnp.float32), None

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 
 from hma_jax.kernels import remat
 
-NEVER = -1e30
-"""A logit that no softmax notices; finite, so that a row without anything visible has no NaN."""
+MASKED_LOGIT = -1e30
+"""The logit of masked keys; finite, so that a row without a visible key gives no NaN."""
 
 
 def softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.Array:
     """float32 softmax over the last axis, over what is `visible` (bool, which broadcasts)."""
     if visible is not None:
-        logits = jnp.where(visible, logits, NEVER)
+        logits = jnp.where(visible, logits, MASKED_LOGIT)
     return jax.nn.softmax(logits, axis=-1)
 
 
@@ -45,7 +45,7 @@ def _weights(q: jax.Array, k: jax.Array, visible: jax.Array, scale: float) -> ja
 
 
 def _kept_if_small(weights: jax.Array, qkv: jax.Array) -> jax.Array:
-    """Attention weights are worth keeping for the backward pass where they are smaller than what they came from."""
+    """Marks attention weights as worth saving for the backward pass if they are smaller than q, k and v."""
     return remat.product(weights) if weights.size <= qkv.size else weights
 
 

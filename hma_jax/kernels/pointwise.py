@@ -1,10 +1,9 @@
-"""Layer norm, GELU, vectors that meet arrays: formulas with their gradients.
+"""Layer norm, GELU, and biases and gains broadcast over rows, with their gradients.
 
-The gradients are the usual ones. They are written out so that a backward pass keeps no more than it needs,
-and so that XLA's CPU compiler is not given what it is slow at: a sum over the last axis of a product of two
-arrays, which it computes many times slower than a product with a vector of ones. What all rows share has
-a gradient that is summed over all of them, in float32 whatever the type of the rows: in bfloat16 a sum of
-thousands of terms would stop growing at a few hundred.
+The gradients are the usual ones. They are written out so that a backward pass saves no more than it needs, and to avoid
+sums over the last axis of a product of two arrays, which XLA computes many times slower on CPUs than a product with a
+vector of ones. The gradient of a vector that all rows share is summed in float32 whatever the type of the rows: in
+bfloat16 a sum of thousands of terms would stop growing at a few hundred.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ layer_norm.defvjp(_layer_norm_forward, _layer_norm_backward)
 @jax.custom_jvp
 def gelu(x: jax.Array) -> jax.Array:
     """The exact one: x times the normal distribution function of x, in float32."""
-    return (x * _normal_below(x)).astype(x.dtype)
+    return (x * _normal_cdf(x)).astype(x.dtype)
 
 
 @gelu.defjvp
@@ -62,12 +61,13 @@ def _gelu_slope(x: tuple[jax.Array], tangent: tuple[jax.Array]) -> tuple[jax.Arr
     # Behind a barrier, or XLA computes erf once for value and slope, and stores it between them: on CPU the
     # slower way.
     x32 = jax.lax.platform_dependent(x, cpu=jax.lax.optimization_barrier, default=lambda x: x).astype(jnp.float32)
-    slope = _normal_below(x32) + x32 * jnp.exp(-0.5 * jnp.square(x32)) / math.sqrt(2 * math.pi)
+    slope = _normal_cdf(x32) + x32 * jnp.exp(-0.5 * jnp.square(x32)) / math.sqrt(2 * math.pi)
     return gelu(x), t * slope.astype(t.dtype)
 
 
-def _normal_below(x: jax.Array) -> jax.Array:
-    """By erf: jax.nn.gelu's erfc, exact in the far tail too, takes more than twice as long."""
+def _normal_cdf(x: jax.Array) -> jax.Array:
+    """The standard normal CDF, by erf. The erfc of jax.nn.gelu is accurate in the far tail too, but takes over twice as
+    long."""
     return 0.5 + 0.5 * jax.lax.erf(x.astype(jnp.float32) * math.sqrt(0.5))
 
 

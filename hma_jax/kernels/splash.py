@@ -17,13 +17,13 @@ from hma_jax.runtime.sharding import is_split, partition
 BLOCK = 128
 """Tokens of a block: the lanes of a vector register."""
 
-SMALLEST = 128
-"""Frames of fewer tokens are left to `plain`: they would be padding for the most part."""
+MIN_TOKENS = 128
+"""Frames of fewer tokens are left to `plain`: they would be mostly padding."""
 
 
 def within(qkv: jax.Array, scale: float, interpret: bool = False) -> jax.Array:
     """As `plain.within`. With `interpret` the kernel is run step by step on any platform, for tests."""
-    if qkv.shape[2] < SMALLEST:
+    if qkv.shape[2] < MIN_TOKENS:
         return plain.within(qkv, scale)
 
     def on_device(qkv: jax.Array) -> jax.Array:

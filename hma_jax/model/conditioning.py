@@ -18,7 +18,7 @@ from hma_jax.kernels.dense import per_robot
 from hma_jax.kernels.pointwise import layer_norm, over_tokens, scaled, shifted
 from hma_jax.model.attention import attention_scale
 from hma_jax.model.initial import trunk_init
-from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, own
+from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, robot_vectors
 from hma_jax.model.params import bias, layouts_of, ones, param, used
 
 
@@ -126,7 +126,7 @@ class CrossAttention(nnx.Module):
     def _heads(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """[B, ..., D] -> [B, ..., H, I], a layer norm over each head."""
         x = layer_norm(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
-        return shifted(scaled(x, own(self.gain, slice_B, x)), own(self.bias, slice_B, x))
+        return shifted(scaled(x, robot_vectors(self.gain, slice_B, x)), robot_vectors(self.bias, slice_B, x))
 
 
 def _own_bonus(allowed_BTs: jax.Array) -> jax.Array:

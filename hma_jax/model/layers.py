@@ -76,18 +76,18 @@ class EmbodimentLinear(nnx.Module):
     def __call__(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
         y = self.map(x, self.kernel.astype(x.dtype), slice_B, layouts_of(self.kernel))
-        return shifted(y, own(self.bias, slice_B, x))
+        return shifted(y, robot_vectors(self.bias, slice_B, x))
 
 
 def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array, Layouts | None], jax.Array]:
-    """What multiplies each example with its robot's matrix. What a robot gets must not depend on U, which
-    other robots decide."""
+    """The product of each example with its robot's matrix. Results must not depend on U, which the widest robot
+    sets."""
     if axes[0] == "U":
         return per_robot_from_actions
     return per_robot_to_actions if axes[1] == "U" else per_robot
 
 
-def own(vectors: nnx.Param, slice_B: jax.Array, like: jax.Array) -> jax.Array:
-    """Each example's own vector [E, D] -> [B, 1, ..., D], to meet `like` [B, ..., D]."""
+def robot_vectors(vectors: nnx.Param, slice_B: jax.Array, like: jax.Array) -> jax.Array:
+    """`vectors` [E, D] -> each example's own, [B, 1, ..., D], shaped to broadcast against `like` [B, ..., D]."""
     taken = take_by_robot(vectors.get_value(), slice_B, layouts_of(vectors))
     return taken.reshape(len(taken), *(1,) * (like.ndim - 2), -1)

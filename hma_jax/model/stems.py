@@ -16,7 +16,7 @@ from hma_jax.config import ModelConfig
 from hma_jax.kernels.pointwise import layer_norm, scaled, shifted
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import hidden_init, input_fan_out
-from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear, own
+from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear, robot_vectors
 from hma_jax.model.params import bias, ones, param, uniform
 
 
@@ -47,5 +47,5 @@ class Stem(nnx.Module):
         """Raw, zero-padded actions -> features a_BTD in `dtype`."""
         x = self.table.normalise(actions_BTU, embodiment_B).astype(dtype)
         x = layer_norm(self.into(x, slice_B), BLOCK_EPS)
-        x = shifted(scaled(x, own(self.gain, slice_B, x)), own(self.bias, slice_B, x))
+        x = shifted(scaled(x, robot_vectors(self.gain, slice_B, x)), robot_vectors(self.bias, slice_B, x))
         return self.out(jax.nn.relu(x), slice_B)

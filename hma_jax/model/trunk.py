@@ -17,14 +17,14 @@ from hma_jax.model.layers import LayerNorm, Linear
 from hma_jax.model.params import layer_for_compute, stack
 from hma_jax.runtime.sharding import constrain
 
-UNROLLED = 4
-"""Trunks of up to so many layers are not scanned but written out: without slices of stacked arrays the steps of small
-models are a seventh faster on CPU, and so few layers compile as fast. At width 256 it gains nothing: four layers take
-4.45 s a step written out and 4.20 s scanned."""
+MAX_UNROLLED_LAYERS = 4
+"""Trunks of up to so many layers are unrolled: without slices of stacked arrays the steps of small models are a seventh
+faster on CPU, and so few layers compile as fast. At width 256 it gains nothing: four layers take 4.45 s a step unrolled
+and 4.20 s scanned."""
 
 
 class TemporalCache(NamedTuple):
-    """What later frames need of finished ones; every array is [N, B, T_past, ...]."""
+    """Keys and values of finished frames, for later ones to attend to; every array is [N, B, T_past, ...]."""
 
     time: Past  # of temporal attention [N, B, T_past, P, H, I]
     actions: Any  # keys, values and shown of cross-attention to actions; otherwise None
@@ -78,7 +78,7 @@ class Trunk(nnx.Module):
     def __init__(self, config: ModelConfig, embodiments: int, execution: ExecutionConfig):
         self.blocks = stack(lambda: Block(config, embodiments, execution), config.layers)
         self.remat = execution.remat
-        self.unroll = config.layers if config.layers <= UNROLLED else 1
+        self.unroll = config.layers if config.layers <= MAX_UNROLLED_LAYERS else 1
 
     def __call__(
         self,

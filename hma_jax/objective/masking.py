@@ -1,8 +1,7 @@
-"""What is hidden from the model in training: one mechanism for both variants and every setting.
+"""Masking in training: which tokens and actions are hidden from the model, for both variants and every setting.
 
-Random numbers (`draw`) are kept apart from what is done with them, so that masking can be
-checked against recorded numbers. The settings of paper section 3.1 differ only in which
-frames' tokens are masked and which actions are hidden:
+Random numbers are drawn (`draw`) before they are used, so that masking can be checked against recorded numbers. The
+settings of paper section 3.1 differ only in which frames' tokens are masked and which actions are hidden:
 
     setting   tokens          actions hidden            predicted
     forward   masked          none                      tokens
@@ -63,8 +62,8 @@ class Masked(NamedTuple):
     hidden_T: jax.Array  # bool: recorded chunks that are not shown
     action_targets_T: jax.Array  # bool: recorded chunks that the loss counts
 
-    def among(self, real_T: jax.Array) -> Masked:
-        """The same without targets in frames that are not `real`: bool [T], or [B, T] of a batch."""
+    def without_padding(self, real_T: jax.Array) -> Masked:
+        """The same without targets in frames where `real_T` is False; bool [T], or [B, T] of a batch."""
         return self._replace(
             targets_TS=self.targets_TS & real_T[..., None], action_targets_T=self.action_targets_T & real_T
         )
@@ -140,7 +139,7 @@ def mask_tokens(u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array,
 
 
 def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Array:
-    """bool [T]: the recorded chunks that one example does not show."""
+    """bool [T]: the chunks of one example that are hidden from the model."""
     if masking.setting in ("passive", "inverse"):
         return jnp.ones(frames, bool)
     if masking.setting == "full":  # as the release: a rate per example, then every step by itself
@@ -151,8 +150,10 @@ def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Arr
     return jnp.zeros(frames, bool)
 
 
-def never_shown(table: EmbodimentTable, setting: Setting, embodiment_B: jax.Array, frames: int) -> jax.Array | None:
-    """bool [B, T]: chunks that a model so trained was never shown, and is to be used without; None if it sees all."""
+def hidden_at_inference(
+    table: EmbodimentTable, setting: Setting, embodiment_B: jax.Array, frames: int
+) -> jax.Array | None:
+    """bool [B, T]: chunks to hide from a model trained for `setting`, because it was never shown any; None: none."""
     shape = (len(embodiment_B), frames)
     if setting == "passive":
         return jnp.ones(shape, bool)
@@ -209,4 +210,4 @@ def mask_batch(
         return mask_example(jax.random.fold_in(key, row), window, config, masking, actions, video)
 
     masked = jax.vmap(one)(jnp.arange(len(tokens)), tokens, has_actions, has_video)
-    return masked if real_BT is None else masked.among(real_BT)
+    return masked if real_BT is None else masked.without_padding(real_BT)

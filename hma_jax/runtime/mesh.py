@@ -29,8 +29,8 @@ def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -
 def mesh_sizes(config: MeshConfig, devices: int) -> list[int]:
     """The mesh's axes over so many devices, -1 filled in. Raises ConfigError if they do not fit."""
     sizes = [config.data, config.fsdp, config.tensor]
-    if -1 in sizes and devices % config.least == 0:
-        sizes[sizes.index(-1)] = devices // config.least
+    if -1 in sizes and devices % config.min_devices == 0:
+        sizes[sizes.index(-1)] = devices // config.min_devices
     require(
         math.prod(sizes) == devices,
         f"a mesh of data={config.data}, fsdp={config.fsdp}, tensor={config.tensor} does not "

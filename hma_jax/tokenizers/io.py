@@ -31,7 +31,7 @@ WEIGHTS = "weights.npz"
 KINDS: dict[str, type[BaseTokenizer]] = {
     cls.kind: cls for cls in (LfqTokenizer, ContinuousTokenizer, Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)
 }
-AGAIN = "train, import or copy the tokenizer again"
+ADVICE = "train, import or copy the tokenizer again"
 
 
 def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:
@@ -80,11 +80,11 @@ def load_tokenizer(
     try:
         tokenizer = kind(config, weights, **measured, piece=piece)
     except ConfigError as error:
-        raise ConfigError(f"{directory}: {error}; {AGAIN}") from error
+        raise ConfigError(f"{directory}: {error}; {ADVICE}") from error
     require(
         tokenizer.identity == description["identity"],
         f"{directory / WEIGHTS} is not the file {DESCRIPTION} describes (identity "
-        f"{tokenizer.identity}, expected {description['identity']}); {AGAIN}",
+        f"{tokenizer.identity}, expected {description['identity']}); {ADVICE}",
     )
     return tokenizer
 
@@ -112,10 +112,10 @@ def _read_description(directory: Path) -> dict[str, Any]:
             "or make one of published weights with `hma tokenizer import`"
         ) from None
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); {AGAIN}") from error
+        raise ConfigError(f"{path} cannot be read ({error}); {ADVICE}") from error
     require(
         isinstance(description, dict),
-        f"{path} cannot be read (not a JSON object); {AGAIN}",
+        f"{path} cannot be read (not a JSON object); {ADVICE}",
     )
     missing = {"kind", "config", "identity"} - set(description)
     require(not missing, f"{path}: missing field(s) {', '.join(sorted(missing))}")
@@ -126,7 +126,7 @@ def _read_description(directory: Path) -> dict[str, Any]:
     )
     for name in KINDS[kind].measured:
         value = description.get(name)
-        require(isinstance(value, float), f"{path}: {name} should be a number, got {value!r}; {AGAIN}")
+        require(isinstance(value, float), f"{path}: {name} should be a number, got {value!r}; {ADVICE}")
     return description
 
 
@@ -136,7 +136,7 @@ def _read_weights(directory: Path) -> Params:
         with np.load(path, allow_pickle=False) as file:
             flat = {tuple(name.split("/")): jnp.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
-        raise ConfigError(f"{path} is missing; {AGAIN}") from None
+        raise ConfigError(f"{path} is missing; {ADVICE}") from None
     except UNREADABLE as error:
-        raise ConfigError(f"{path} is damaged ({error}); {AGAIN}") from error
+        raise ConfigError(f"{path} is damaged ({error}); {ADVICE}") from error
     return nnx.traversals.unflatten_mapping(flat)

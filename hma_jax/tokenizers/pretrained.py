@@ -94,7 +94,7 @@ class SvdVaeTokenizer(BaseTokenizer):
         require(clips.ndim == 4, f"clips of latents are [B, T, S, C], got {list(clips.shape)}")
         checked = self._checked(clips.reshape(-1, *clips.shape[2:])).reshape(clips.shape)
         size = max(1, self.piece // clips.shape[1]) * self._mesh.size
-        return in_pieces(lambda piece: self._decode_clips(self._placed, piece), checked, size)
+        return in_pieces(lambda piece: self._decode_clips(self._device_params, piece), checked, size)
 
     @cached_property
     def _decode_clips(self) -> Callable:
@@ -103,7 +103,7 @@ class SvdVaeTokenizer(BaseTokenizer):
             images = self.decode_fn(params, clips.reshape(-1, *token), frames)
             return jnp.round(images).astype(jnp.uint8).reshape(batch, frames, *images.shape[1:])
 
-        return self._shared_out(decode)
+        return self._jit_over_devices(decode)
 
     def tokens_of(self, cells: jax.Array) -> jax.Array:
         """Unscaled latents [..., h, w, c], which the release stores channels first -> tokens [..., S, C]."""

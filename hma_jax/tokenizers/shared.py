@@ -68,8 +68,8 @@ class BaseTokenizer(abc.ABC):
         self.piece = self.default_piece(config) if piece is None else piece
         self._declared = declared
         self._mesh = make_mesh(MeshConfig(), list(devices or jax.local_devices()))
-        self._encode = self._shared_out(self.encode_fn)
-        self._decode = self._shared_out(self.decode_uint8_fn)
+        self._encode = self._jit_over_devices(self.encode_fn)
+        self._decode = self._jit_over_devices(self.decode_uint8_fn)
 
     @classmethod
     @abc.abstractmethod
@@ -148,7 +148,7 @@ class BaseTokenizer(abc.ABC):
         """
         images = np.asarray(images)
         require_images(images, self.image_shape, "the tokenizer encodes")
-        return in_pieces(lambda piece: self._encode(self._placed, piece), images, self.at_once)
+        return in_pieces(lambda piece: self._encode(self._device_params, piece), images, self.at_once)
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
         """Tokens [B, S] or [B, S, C] -> uint8 [B, H, W, 3].
@@ -156,7 +156,7 @@ class BaseTokenizer(abc.ABC):
         Raises ConfigError for another shape or type, and for values that are no tokens.
         """
         tokens = self._checked(np.asarray(tokens))
-        return in_pieces(lambda piece: self._decode(self._placed, piece), tokens, self.at_once)
+        return in_pieces(lambda piece: self._decode(self._device_params, piece), tokens, self.at_once)
 
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         """Pure: what `decode` does to tokens that are known to be some."""
@@ -197,7 +197,7 @@ class BaseTokenizer(abc.ABC):
         """Images of one call."""
         return self.piece * self._mesh.size
 
-    def _shared_out(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:
+    def _jit_over_devices(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:
         """`function` compiled; every device applies it to its own rows of the batch."""
         if self._mesh.size == 1:
             return jax.jit(function)
@@ -206,7 +206,7 @@ class BaseTokenizer(abc.ABC):
         return jax.jit(jax.shard_map(function, mesh=self._mesh, in_specs=(whole, rows), out_specs=rows))
 
     @cached_property
-    def _placed(self) -> Params:
+    def _device_params(self) -> Params:
         """The parameters where the devices need them."""
         if self._mesh.size == 1:
             return self.params

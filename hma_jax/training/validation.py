@@ -96,7 +96,7 @@ def make_sums(
         key = jax.random.fold_in(key_of(SEED), number)
         valid_B, real_BT = batch["valid"], batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
-        masked = masked.among(jnp.broadcast_to(valid_B[:, None], masked.hidden_T.shape))
+        masked = masked.without_padding(jnp.broadcast_to(valid_B[:, None], masked.hidden_T.shape))
         rows = {name: batch[name] for name in ("tokens", "actions", "embodiment", "real") if name in batch}
         rows |= {"masked": masked, "key": noise_keys(key, len(valid_B))}
 

@@ -37,7 +37,7 @@ def make_table(robots: int) -> EmbodimentTable:
 
 
 def make_model(kind: str) -> ModelConfig:
-    """More layers than are written out one after the other (`model.trunk.UNROLLED`)."""
+    """More layers than are written out one after the other (`model.trunk.MAX_UNROLLED_LAYERS`)."""
     changes = {
         "latents": {"diffusion": LATENTS},
         "recipe": {"diffusion": LATENTS, "recall": True},
