@@ -13,7 +13,7 @@ from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import IMAGE_SIZE, EmbodimentSpec
 from data_pipelines.true_simulator import TrueSimulator
-from hma_jax.simulator.robots import KEYS, Outside, Robot, rest_of
+from hma_jax.simulator.robots import KEYS, Outside, Robot, rest_action
 from hma_jax.simulator.starts import Start
 
 UNITS = {"delta": "per step", "velocity": "per second", "absolute": "position"}
@@ -43,7 +43,7 @@ def suite_robot(
     spec = SPECS[name]
     names = [f"{control.key} {part}" for control in spec.controls for part in _parts(control)]
     return Robot(
-        name, stride, tuple(low), tuple(high), rest_of(low, high, mean), tuple(names),
+        name, stride, tuple(low), tuple(high), rest_action(low, high, mean), tuple(names),
         unit=UNITS[spec.convention], keeps=spec.convention == "absolute", hz=float(spec.hz), keys=_keys(spec),
         recorded=recorded,
     )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, MaskingConfig, SamplerConfig
-from hma_jax.evaluation.evaluate import evaluate, held
+from hma_jax.evaluation.evaluate import evaluate, hold_last_frame
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.objective.losses import bidirectional_mask
 from hma_jax.training.state import init_state
@@ -178,9 +178,9 @@ def test_a_short_window_is_judged_as_the_host_would():
 
 def test_clips_hold_their_last_real_frame():
     real = np.array([True, True, True, False, False])
-    assert held(np.arange(5), real).tolist() == [0, 1, 2, 2, 2]
-    assert held(np.arange(2, 5), real).tolist() == [2, 2, 2]
-    assert held(np.arange(5), np.ones(5, bool)).tolist() == [0, 1, 2, 3, 4]
+    assert hold_last_frame(np.arange(5), real).tolist() == [0, 1, 2, 2, 2]
+    assert hold_last_frame(np.arange(2, 5), real).tolist() == [2, 2, 2]
+    assert hold_last_frame(np.arange(5), np.ones(5, bool)).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_window_without_a_frame_to_predict_is_refused():
