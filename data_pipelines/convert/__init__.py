@@ -1,4 +1,4 @@
-"""The export: any source made of units (`sources.units`) as one RLDS directory, restartably.
+"""Export of any `sources.convertible` source as one RLDS directory, resumable.
 
 Nothing here is needed to train: every command reads such sources directly.
 """

@@ -1,4 +1,4 @@
-"""An episode of any source as a record, and what a conversion says of itself."""
+"""An episode of any source as a record, and the result of a conversion."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sources.convertible import Episode, Layout, UnitError
 from data_pipelines.sources.rlds.example import encode_example
 from data_pipelines.sources.rlds.writer import step_features
-from data_pipelines.sources.units import Episode, Layout, UnitError
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Conversion:
     spec: DatasetSpec  # the registry entry that reads it
     episodes: int
     shards: int
-    left_out: dict[str, int] = field(default_factory=dict)
+    skipped: dict[str, int] = field(default_factory=dict)  # reason -> how many
 
 
 def encode(episode: Episode, layout: Layout) -> bytes:

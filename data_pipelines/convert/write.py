@@ -1,9 +1,8 @@
-"""Any source to one RLDS directory, restartable at every shard.
+"""Writes any source as one RLDS directory, resumable after every shard.
 
-`<out>/<name>/1.0.0` appears when it is complete. Until then shards lie in a hidden directory
-beside it with a journal of the finished ones; an interrupted conversion goes on behind the last
-of them, and the result has the same bytes as an undisturbed one. One process at a time converts
-to a place (see `publishing`).
+`<out>/<name>/1.0.0` appears when it is complete. Until then shards lie in a hidden directory beside it, with a
+journal of the finished ones. An interrupted conversion continues after the last of them, and the result has the
+same bytes as an uninterrupted one. One process at a time converts to a directory (see `publishing`).
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from data_pipelines.publishing.fingerprint import FINGERPRINT, read_metadata, sh
 from data_pipelines.publishing.journal import Journal
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sources.convertible import ConvertibleSource, Skipped, UnitError
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
-from data_pipelines.sources.units import LeftOut, Source, UnitError
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 from hma_jax.runtime.locks import Held
 
-CONVERTER = 1
+CONVERTER_VERSION = 1
 """Raise it when a converter writes other bytes for the same source."""
 
 SHARD_BYTES = 256 * 2**20
@@ -46,15 +45,15 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class _Shard:
-    """A line of the journal: a finished shard, up to which unit, and what was left out of it."""
+    """A line of the journal: a finished shard. The names of the fields are those in the file."""
 
-    units: int  # units done at its end
+    units: int  # of the source, read by the end of this shard
     records: int
     size: int  # bytes of payload
-    left_out: dict[str, int]
+    left_out: dict[str, int]  # reason -> how many were skipped
 
 
-def suggest_spec(source: Source, name: str) -> DatasetSpec:
+def suggest_spec(source: ConvertibleSource, name: str) -> DatasetSpec:
     """The registry entry of a converted dataset: its first camera and its action."""
     layout = source.layout
     actions = {key: size for key, size in layout.vectors.items() if key.partition("/")[0] == "action"}
@@ -69,7 +68,7 @@ def suggest_spec(source: Source, name: str) -> DatasetSpec:
 
 
 def convert(
-    source: Source,
+    source: ConvertibleSource,
     out: str | Path,
     name: str,
     *,
@@ -80,10 +79,10 @@ def convert(
 ) -> Conversion:
     """Writes every episode of `source` into `<out>/<name>/1.0.0`.
 
-    The same source and settings again: goes on where it was, or finds it done. With
-    `skip_damaged`, which may be added after damage was met, damaged units are left out and
-    counted. `origin` is what metadata.json says besides. Raises UnitError for a damaged unit
-    otherwise, DataError if no episode is left, ConfigError for a name or place that cannot be used.
+    With the same source and settings again it resumes, or returns at once if the dataset is finished. With
+    `skip_damaged`, which may be added after an error, damaged units are skipped and counted; without it they raise
+    UnitError. `origin` is added to metadata.json. Raises DataError if no episode is left, ConfigError for a name or
+    directory that cannot be used.
     """
     require(
         re.fullmatch(r"[a-z][a-z0-9_]*", name) is not None,
@@ -92,7 +91,7 @@ def convert(
     final = Path(out) / name / VERSION
     fingerprint = stable_hash(
         {
-            "converter": CONVERTER,
+            "converter": CONVERTER_VERSION,
             "name": name,
             "shard": shard_bytes,
             **source.identity(),
@@ -116,7 +115,7 @@ def convert(
 
 
 def _write_shards(
-    source: Source, partial: Path, skip_damaged: bool, shard_bytes: int, progress: Progress | None
+    source: ConvertibleSource, partial: Path, skip_damaged: bool, shard_bytes: int, progress: Progress | None
 ) -> list[_Shard]:
     journal = Journal(partial / JOURNAL)
     shards = [_Shard(**line) for line in journal.read()]
@@ -126,7 +125,7 @@ def _write_shards(
     total = len(source.units)
     while (shards[-1].units if shards else 0) < total:
         unit = shards[-1].units if shards else 0
-        left_out: Counter[str] = Counter()
+        skipped: Counter[str] = Counter()
         size = 0
 
         def records() -> Iterator[bytes]:
@@ -134,8 +133,8 @@ def _write_shards(
             while unit < total and size < shard_bytes:
                 try:
                     for item in source.read(unit):
-                        if isinstance(item, LeftOut):
-                            left_out[item.reason] += 1
+                        if isinstance(item, Skipped):
+                            skipped[item.reason] += 1
                             continue
                         record = encode(item, source.layout)
                         size += len(record)
@@ -143,25 +142,25 @@ def _write_shards(
                 except UnitError as error:
                     if not skip_damaged:
                         raise
-                    left_out[without_advice(str(error))] += 1
+                    skipped[without_advice(str(error))] += 1
                 unit += 1
                 if progress is not None:
                     progress(unit, total, source.units[unit - 1])
 
         count = write_shard(partial / _part(len(shards)), records())
-        shards.append(_Shard(unit, count, size, dict(sorted(left_out.items()))))
+        shards.append(_Shard(unit, count, size, dict(sorted(skipped.items()))))
         sync(partial / _part(len(shards) - 1))  # the line below says that it is there
         journal.append(vars(shards[-1]))
     return shards
 
 
 def _finish(
-    source: Source, partial: Path, final: Path, name: str, shards: list[_Shard], metadata: Mapping[str, Any]
+    source: ConvertibleSource, partial: Path, final: Path, name: str, shards: list[_Shard], metadata: Mapping[str, Any]
 ) -> Conversion:
     episodes = sum(s.records for s in shards)
-    left_out = dict(sorted(sum((Counter(s.left_out) for s in shards), Counter()).items()))
+    skipped = dict(sorted(sum((Counter(s.left_out) for s in shards), Counter()).items()))
     if not episodes:
-        reasons = "; ".join(f"{n} x {reason.rstrip('.')}" for reason, n in left_out.items()) or "it has no unit"
+        reasons = "; ".join(f"{n} x {reason.rstrip('.')}" for reason, n in skipped.items()) or "it has no unit"
         shutil.rmtree(partial)
         raise DataError(f"{source.description.rstrip('.')}: no episode can be made of it: {reasons}.")
     kept = [(k, s) for k, s in enumerate(shards) if s.records]
@@ -176,18 +175,18 @@ def _finish(
         lengths=[s.records for _, s in kept],
         size=sum(s.size for _, s in kept),
         description=source.description,
-        metadata={**metadata, "hz": source.hz, "left_out": left_out},
+        metadata={**metadata, "hz": source.hz, "left_out": skipped},
         module="data_pipelines.convert",
     )
-    # Without the journal all of it is made again, so it goes last. Hidden files are of writers that were killed.
+    # Without the journal all shards are made again, so it is removed last. Hidden files are of killed writers.
     for stray in [*partial.glob("part-*"), *partial.glob(".*"), partial / JOURNAL]:
         stray.unlink(missing_ok=True)
     publish(partial, final)
-    return Conversion(final, suggest_spec(source, name), episodes, len(kept), left_out)
+    return Conversion(final, suggest_spec(source, name), episodes, len(kept), skipped)
 
 
-def _finished(final: Path, fingerprint: str, source: Source, name: str) -> Conversion:
-    """What is there already, if it was made of the same source in the same way."""
+def _finished(final: Path, fingerprint: str, source: ConvertibleSource, name: str) -> Conversion:
+    """The result of an earlier run, if it converted the same source with the same settings; ConfigError otherwise."""
     metadata, lengths = read_metadata(final), shard_lengths(final)
     require(
         metadata.get(FINGERPRINT) == fingerprint and bool(lengths),

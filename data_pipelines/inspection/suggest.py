@@ -12,8 +12,8 @@ from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, Facts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
+from data_pipelines.sources.convertible import unsupported_images_text
 from data_pipelines.sources.rlds.schema import field_slice
-from data_pipelines.sources.units import told_left_out
 from data_pipelines.windows.cut import Cut
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES
 
@@ -111,7 +111,7 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
     keys, dims, about = _choose_actions(facts)
     reasons = [f"camera: {why}", f"action: {about}"]
     if others := [field.key for field in facts.fields if field.kind == NOT_READ]:
-        reasons.append(told_left_out(others))
+        reasons.append(unsupported_images_text(others))
     angles, unit = _choose_angles(facts, keys, dims)
     if angles:
         reasons.append(

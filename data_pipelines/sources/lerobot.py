@@ -4,7 +4,7 @@ Row t of an episode was recorded at t / fps seconds; its camera frame is the one
 shows at the row's timestamp (plus, in 3.0, the time at which the episode begins in its file).
 Cameras become `observation/<name>`, other numeric features vectors under `observation/` and
 `action`; texts follow `task_index`. Success is the last `next.success`, where there is one.
-Depth cameras and grey ones are left out (`left_out`, with their shapes).
+Depth and grey cameras are not read; `unsupported_images` lists them with their shapes.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import quote, safe_join
+from data_pipelines.sources.convertible import Episode, Layout, UnitError, choose
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta
 from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import LeRobotSettings
-from data_pipelines.sources.units import Episode, Layout, UnitError, choose
 from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
 PICTURES = ("video", "image")
@@ -58,7 +58,7 @@ class LeRobotSource:
         wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(available), "camera", str(self.root))
         self.cameras = {f"observation/{name}": available[name] for name in names}
-        self.left_out = {f"observation/{_short(key)}": shape for key, shape in others.items()}
+        self.unsupported_images = {f"observation/{_short(key)}": shape for key, shape in others.items()}
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self.vectors}:
             raise DataError(

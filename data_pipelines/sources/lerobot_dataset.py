@@ -65,7 +65,7 @@ class LeRobotDataset(EpisodeSource):
         self.version = self._read.meta.version
         self._cameras = {step_key(k): name for k, name in self._read.cameras.items()}
         self._vectors = {step_key(k): name for k, name in self._read.vectors.items()}
-        self.features = self._read.layout.flat_features(self._read.left_out)
+        self.features = self._read.layout.flat_features(self._read.unsupported_images)
         self._numbered = np.asarray([e.index for e in self._entries], np.int64)
         self.runs = _runs(self._numbered)
         self._lengths = np.asarray([e.length for e in self._entries], np.int64)

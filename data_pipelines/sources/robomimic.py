@@ -26,10 +26,10 @@ import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import quote
+from data_pipelines.sources.convertible import Episode, Layout, UnitError, choose, require_module
 from data_pipelines.sources.rlds.location import is_io_error, retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import RobomimicSettings
-from data_pipelines.sources.units import Episode, Layout, UnitError, choose, require_module
 from data_pipelines.sources.video import shrink
 from hma_jax.config import ConfigError
 
@@ -59,7 +59,9 @@ class RobomimicSource:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
             self.units = _demonstrations(self.path, file, settings.filter_key)
-            self.layout, self.cameras, self.left_out = self._read_layout(file["data"][self.units[0]], settings.camera)
+            self.layout, self.cameras, self.unsupported_images = self._read_layout(
+                file["data"][self.units[0]], settings.camera
+            )
         self.task = str(args.get("env_name", "robomimic"))
         self.own_hz = _control_rate(self.path, args)
         self.hz = float(settings.hz or self.own_hz or CONTROL_RATE)
@@ -144,8 +146,7 @@ class RobomimicSource:
     def _read_layout(
         self, demo: Any, wanted: tuple[str, ...]
     ) -> tuple[Layout, tuple[str, ...], dict[str, tuple[int, ...]]]:
-        """Fields, the cameras among them, and pictures that are none of these: called otherwise, or depths; with their
-        shapes."""
+        """(fields, cameras, unsupported images with their shapes: those of other names, and depth images)."""
         where = f"{self.path}: {demo.name.lstrip('/')}"
         obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # groups are none of robomimic's
         available = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
@@ -173,8 +174,8 @@ class RobomimicSource:
             vectors["observation/sim_state"] = int(states.shape[1])
         images = {f"observation/{c}": image_field(None, None) for c in cameras}
         others = sorted(key for key in obs if obs[key].ndim >= 3 and not key.endswith("_image"))
-        left_out = {f"observation/{key}": tuple(map(int, obs[key].shape[1:])) for key in others}
-        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, left_out
+        unsupported_images = {f"observation/{key}": tuple(map(int, obs[key].shape[1:])) for key in others}
+        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, unsupported_images
 
 
 @contextmanager

@@ -56,7 +56,7 @@ class RobomimicDataset(EpisodeSource):
         self._read = RobomimicSource(path, RobomimicSettings(filter_key=None if split == "train" else split))
         self.name = dataset_name(self._read)
         self._demos = list(self._read.units)
-        self.features = self._read.layout.flat_features(self._read.left_out)
+        self.features = self._read.layout.flat_features(self._read.unsupported_images)
         numbers = [int(name.removeprefix("demo_")) for name in self._demos]
         self.runs = tuple(EpisodeRun(self.location.name, number, 1) for number in numbers)
         with self._read.open() as file:

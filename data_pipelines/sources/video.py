@@ -16,10 +16,10 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.errors import UnreachableError
+from data_pipelines.sources.convertible import UnitError, require_module
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import is_io_error, retry
 from data_pipelines.sources.rlds.writer import encode_jpeg
-from data_pipelines.sources.units import UnitError, require_module
 
 ADVICE = "Fetch the file again, or leave it out with --skip-damaged (when tokenising, corrupt='skip')."
 

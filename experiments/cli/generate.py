@@ -56,7 +56,7 @@ def generate(
         registry: TOML file with entries of your own.
     """
     from data_pipelines.convert.write import convert
-    from data_pipelines.sources.units import require_module
+    from data_pipelines.sources.convertible import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
     from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories
@@ -95,7 +95,7 @@ def generate(
             source, out, called, shard_bytes=SHARD_BYTES, origin=source.origin() | {"run": str(run)},
             progress=lambda n, total, unit: update(n, total, unit + pace(n, total)),
         )  # fmt: skip
-    for reason, left in done.left_out.items():
+    for reason, left in done.skipped.items():
         say(f"left out {left:,} x: {reason}")
     with step("compare with the recordings") as update:
         found = compare(done.directory, recorded, given, clips, source.hz, update)

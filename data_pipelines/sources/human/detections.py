@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from data_pipelines.sources.units import UnitError
+from data_pipelines.sources.convertible import UnitError
 
 ADVICE = "Fetch the file again, or leave it out with --skip-damaged."
 LEFT, RIGHT = 0, 1

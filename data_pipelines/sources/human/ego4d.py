@@ -29,10 +29,10 @@ import numpy as np
 from data_pipelines.errors import DataError
 from data_pipelines.names import is_dataset_name, quote
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.convertible import Episode, Skipped, UnitError
 from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.rlds.writer import encode_jpeg
 from data_pipelines.sources.settings import Ego4dSettings
-from data_pipelines.sources.units import Episode, LeftOut, UnitError
 from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from hma_jax.config.json import to_dict
 
@@ -83,19 +83,19 @@ class Ego4dSource:
             "settings": to_dict(self.settings),
         }
 
-    def read(self, unit: int) -> Iterator[Episode | LeftOut]:
+    def read(self, unit: int) -> Iterator[Episode | Skipped]:
         uid = self.units[unit]
         with open_video(self._video(uid)) as video:
             for number, interval in enumerate(self._field(self._labels[uid], "annotated_intervals", uid)):
                 times, positions = self._annotated(uid, number, interval, video)
                 if not len(times):
-                    yield LeftOut(NONE)
+                    yield Skipped(NONE)
                 for first, last in _stretches(times, self.settings.max_gap):
                     yield from self._episodes(uid, video, times[first:last], positions[first:last])
 
     def _episodes(
         self, uid: str, video: Video, times: np.ndarray, positions: np.ndarray
-    ) -> Iterator[Episode | LeftOut]:
+    ) -> Iterator[Episode | Skipped]:
         grid = times[0] + np.arange(int((times[-1] - times[0]) * HZ + 1e-6) + 1) / HZ
         even = np.stack([np.interp(grid, times, column) for column in positions.T], axis=1)
         yield from cut_episodes(

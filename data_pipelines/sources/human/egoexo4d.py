@@ -22,10 +22,10 @@ import numpy as np
 from data_pipelines.errors import DataError
 from data_pipelines.names import is_dataset_name, quote
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.convertible import Episode, Skipped, UnitError
 from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.rlds.writer import encode_jpeg
 from data_pipelines.sources.settings import EgoExo4dSettings
-from data_pipelines.sources.units import Episode, LeftOut, UnitError
 from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from hma_jax.config.json import to_dict
 
@@ -76,13 +76,13 @@ class EgoExo4dSource:
             "settings": to_dict(self.settings),
         }
 
-    def read(self, unit: int) -> Iterator[Episode | LeftOut]:
+    def read(self, unit: int) -> Iterator[Episode | Skipped]:
         take, name = self._takes[unit], self.units[unit]
         path = self._video(take)
         with open_video(path) as video:
             numbers, positions = self._wrists(take, video)
             if not len(numbers):
-                yield LeftOut(NONE)
+                yield Skipped(NONE)
                 return
             if numbers[-1] >= video.max_frames:
                 raise UnitError(

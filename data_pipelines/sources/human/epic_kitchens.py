@@ -28,10 +28,10 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.convertible import Episode, Skipped, UnitError
 from data_pipelines.sources.human.detections import ADVICE, read_hands
 from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, displacement
 from data_pipelines.sources.settings import EpicKitchensSettings
-from data_pipelines.sources.units import Episode, LeftOut, UnitError
 from data_pipelines.sources.video import stored_jpeg
 from hma_jax.config.json import to_dict
 
@@ -75,7 +75,7 @@ class EpicKitchensSource:
             "settings": to_dict(self.settings),
         }
 
-    def read(self, unit: int) -> Iterator[Episode | LeftOut]:
+    def read(self, unit: int) -> Iterator[Episode | Skipped]:
         video = self.units[unit]
         positions = read_hands(self._pickle(video), self.settings.min_score)
         folder = self.frames / _participant(video) / "rgb_frames" / video

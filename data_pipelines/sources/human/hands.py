@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from data_pipelines.sources.convertible import Episode, Layout, Skipped
 from data_pipelines.sources.rlds.writer import image_field
-from data_pipelines.sources.units import Episode, Layout, LeftOut
 
 IMAGE, STATE, ACTION = "observation/image", "observation/state", "action"
 LAYOUT = Layout({IMAGE: image_field(None, None)}, {ACTION: 4, STATE: 4}, knows_success=False)
@@ -56,14 +56,14 @@ def cut_episodes(
     min_frames: int,
     max_steps: int,
     origin: Callable[[int], str],
-) -> Iterator[Episode | LeftOut]:
+) -> Iterator[Episode | Skipped]:
     """The episodes of [N, 4] positions of evenly spaced frames; `origin` names one by its first row."""
     found = runs(both_seen(positions))
     if not found:
-        yield LeftOut(NONE)
+        yield Skipped(NONE)
     for start, stop in found:
         if stop - start < min_frames:
-            yield LeftOut(f"fewer than {min_frames} frames in a row with both hands")
+            yield Skipped(f"fewer than {min_frames} frames in a row with both hands")
             continue
         # Equal pieces that share the frame between them: the last action of one leads to the first row
         # of the next.

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from data_pipelines.sources.convertible import Episode, Layout, Skipped
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
-from data_pipelines.sources.units import Episode, Layout, LeftOut
 from experiments.applications.generating.trajectories import Trajectories, Trajectory, describe, require_layout
 from hma_jax.config.json import to_dict
 from hma_jax.simulator.interface import AnySimulator
@@ -78,7 +78,7 @@ class GeneratedSource:
     def identity(self) -> dict[str, Any]:
         return {"format": "generated", **self.origin()}
 
-    def read(self, unit: int) -> Iterator[Episode | LeftOut]:
+    def read(self, unit: int) -> Iterator[Episode | Skipped]:
         """The episodes of a batch, in order."""
         numbers, kept = self.batches[unit], []
         for i in numbers:
@@ -86,7 +86,7 @@ class GeneratedSource:
             if len(trajectory) > self._given:
                 kept.append((i, confined(trajectory, self._robot)))
             else:
-                yield LeftOut(f"not longer than the {self._given} frames that a generated episode begins with")
+                yield Skipped(f"not longer than the {self._given} frames that a generated episode begins with")
         if not kept:
             return
         seeds = [episode_seed(self._seed, self._recorded.origin(i)) for i, _ in kept]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.rlds.example import encode_example
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import (
@@ -25,7 +26,6 @@ from data_pipelines.sources.rlds.writer import (
     vector_field,
     write_info,
 )
-from data_pipelines.sources.units import require_module
 from hma_jax.simulator.robots import Robot
 
 MOST_FRAMES = 3000

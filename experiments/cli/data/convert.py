@@ -24,7 +24,7 @@ from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
-    from data_pipelines.sources.units import Source
+    from data_pipelines.sources.convertible import ConvertibleSource
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def robomimic(
     from data_pipelines.sources.robomimic import RobomimicSource
 
     opened = RobomimicSource(source, settings)
-    _convert(opened, destination, f"robomimic_{opened.task}", opened.left_out)
+    _convert(opened, destination, f"robomimic_{opened.task}", opened.unsupported_images)
 
 
 def lerobot(
@@ -71,7 +71,7 @@ def lerobot(
     from data_pipelines.sources.lerobot import LeRobotSource
 
     opened = LeRobotSource(source, settings)
-    _convert(opened, destination, source.absolute().name, opened.left_out)
+    _convert(opened, destination, source.absolute().name, opened.unsupported_images)
 
 
 def epic_kitchens(
@@ -127,10 +127,12 @@ def egoexo4d(
     _convert(EgoExo4dSource(source, settings), destination, NAME)
 
 
-def _convert(source: Source, destination: Destination, default_name: str, no_cameras: Collection[str] = ()) -> None:
+def _convert(
+    source: ConvertibleSource, destination: Destination, default_name: str, unsupported_images: Collection[str] = ()
+) -> None:
     from data_pipelines.convert.write import convert
     from data_pipelines.errors import DataError, without_advice
-    from data_pipelines.sources.units import UnitError, told_left_out
+    from data_pipelines.sources.convertible import UnitError, unsupported_images_text
 
     name = destination.name or re.sub(r"[^a-z0-9_]+", "_", default_name.lower()).strip("_")
     with step(f"convert {len(source.units)} to {name}") as update:
@@ -147,10 +149,10 @@ def _convert(source: Source, destination: Destination, default_name: str, no_cam
             advice = "Fetch the file again, or add" if rest != str(error) else "Add"
             raise DataError(f"{rest} {advice} --skip-damaged to leave it out.") from error
     say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
-    for reason, count in done.left_out.items():
+    for reason, count in done.skipped.items():
         say(f"left out {count:,} x: {reason}")
-    if no_cameras:
-        say(told_left_out(no_cameras))
+    if unsupported_images:
+        say(unsupported_images_text(unsupported_images))
     inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
     say(
         "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "

@@ -85,7 +85,7 @@ def test_a_pause_ends_an_episode_and_unusable_frames_do_not_bridge_it(tmp_path):
 
 def test_short_stretches_are_left_out_and_counted(tmp_path):
     source = ego4d(tmp_path, action(*(annotated(n) for n in (0, 5, 10, 15, 40))))
-    assert convert(source, tmp_path, "ego4d").left_out == {"fewer than 3 frames in a row with both hands": 1}
+    assert convert(source, tmp_path, "ego4d").skipped == {"fewer than 3 frames in a row with both hands": 1}
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_clips_of_enough_labelled_frames_are_kept_and_shorter_ones_are_not(tmp_p
     source = egoexo4d(tmp_path, poses)
     assert source.units == ["cooking_1"]
     done = convert(source, tmp_path, "exoego4d")
-    assert done.left_out == {"fewer than 10 frames in a row with both hands": 1} and done.spec.hz == 30
+    assert done.skipped == {"fewer than 10 frames in a row with both hands": 1} and done.spec.hz == 30
     dataset, (episode,) = read_back(done.directory, "observation/image")
     assert [number(image) for image in episode.images] == list(range(14, 39))
     n = np.arange(14, 40)[:, None]

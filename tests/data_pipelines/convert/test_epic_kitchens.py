@@ -57,7 +57,7 @@ def test_episodes_end_where_a_hand_is_missing_and_nothing_is_joined(tmp_path):
     done = convert(source, tmp_path, "epic")
     _, episodes = read_back(done.directory, "observation/image")
     assert [[number(i) for i in e.images] for e in episodes] == [[1, 7, 13, 19, 25], [43, 49, 55, 61, 67]]
-    assert done.left_out == {"fewer than 3 frames in a row with both hands": 1}  # 85 alone
+    assert done.skipped == {"fewer than 3 frames in a row with both hands": 1}  # 85 alone
 
 
 def test_the_best_hand_of_each_side_counts_from_the_threshold_on(tmp_path):

@@ -16,9 +16,9 @@ from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.sources import robomimic, video
+from data_pipelines.sources.convertible import Episode, Layout, Skipped, UnitError, require_module
 from data_pipelines.sources.human import detections
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
-from data_pipelines.sources.units import Episode, Layout, LeftOut, UnitError, require_module
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import contents, number, picture, read_back
 
@@ -60,13 +60,13 @@ class Counting:
                 self.change(parts)
             yield Episode(**parts)
         if unit % 3 == 0:
-            yield LeftOut("nothing in it")
+            yield Skipped("nothing in it")
 
 
 def test_every_episode_is_written_once_in_order_with_its_facts(tmp_path):
     seen = []
     done = convert(Counting(), tmp_path, "toy", progress=lambda *a: seen.append(a))
-    assert (done.episodes, done.shards, done.left_out) == (7, 1, {"nothing in it": 3})
+    assert (done.episodes, done.shards, done.skipped) == (7, 1, {"nothing in it": 3})
     assert done.directory == tmp_path / "toy" / "1.0.0"
     assert done.spec.action_keys == ("action",) and done.spec.action_dims == (2,) and done.spec.hz == 5
     assert seen[-1] == (8, 8, "u7") and len(seen) == 8
@@ -130,7 +130,7 @@ def test_damage_stops_or_is_left_out_and_counted(tmp_path):
         convert(Counting(damaged=(4,)), tmp_path, "toy", shard_bytes=1)
     source = Counting(damaged=(4,), stop_at=1)  # what was done before is not read again
     done = convert(source, tmp_path, "toy", shard_bytes=1, skip_damaged=True)
-    assert done.episodes == 6 and done.left_out == {"nothing in it": 3, "u4 is damaged": 1}
+    assert done.episodes == 6 and done.skipped == {"nothing in it": 3, "u4 is damaged": 1}
 
 
 @pytest.mark.parametrize("advice", [detections.ADVICE, robomimic.ADVICE, video.ADVICE])
@@ -144,7 +144,7 @@ def test_who_leaves_damage_out_is_not_advised_to(tmp_path, monkeypatch, advice):
     monkeypatch.setattr(Counting, "read", read)
     with pytest.raises(UnitError, match="--skip-damaged"):
         convert(Counting(), tmp_path, "toy")
-    assert "u4.mp4: no readable video." in convert(Counting(), tmp_path, "toy", skip_damaged=True).left_out
+    assert "u4.mp4: no readable video." in convert(Counting(), tmp_path, "toy", skip_damaged=True).skipped
 
 
 def spoil(part, key, value):

@@ -1,7 +1,7 @@
-"""What a converter reads: a source made of units, each of some episodes, whole and in order.
+"""Sources that can be converted: read unit by unit, in order, each unit giving some whole episodes.
 
-A unit is what a source reads in one go: a demonstration, an episode, a video. Owns what the formats
-that are read so have in common.
+A unit is what a format reads at a time: a demonstration, an episode, a video. Owns what these formats have in
+common. (Units of measurement of actions are not meant.)
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from hma_jax.config import ConfigError
 
 
 class UnitError(EpisodeError):
-    """One unit of a source is unusable; `--skip-damaged`, or corrupt='skip', leaves it out."""
+    """One unit of a source is unusable; `--skip-damaged`, or corrupt='skip', skips it."""
 
 
-def told_left_out(pictures: Iterable[str]) -> str:
-    """What is said of pictures that no camera is made of."""
-    return f"left out: {', '.join(pictures)}; docs/own_data.md says what is a camera"
+def unsupported_images_text(keys: Iterable[str]) -> str:
+    """A message on image fields that cannot be read as cameras, such as depth images."""
+    return f"left out: {', '.join(keys)}; docs/own_data.md says what is a camera"
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,13 @@ class Layout:
     vectors: Mapping[str, int]
     knows_success: bool
 
-    def flat_features(self, left_out: Mapping[str, tuple[int, ...]]) -> dict[str, FlatFeature]:
-        """The same fields as an `EpisodeSource` states them; before them pictures that are `left_out`, with their
-        shapes."""
+    def flat_features(self, unsupported_images: Mapping[str, tuple[int, ...]]) -> dict[str, FlatFeature]:
+        """The same fields as an `EpisodeSource` states them, after the `unsupported_images` with their shapes."""
         return {
-            **{step_key(key): FlatFeature(image=False, size=0, shape=shape) for key, shape in left_out.items()},
+            **{
+                step_key(key): FlatFeature(image=False, size=0, shape=shape)
+                for key, shape in unsupported_images.items()
+            },
             **{step_key(key): FlatFeature(image=True, size=0) for key in self.images},
             **{step_key(key): FlatFeature(image=False, size=size) for key, size in self.vectors.items()},
         }
@@ -68,14 +70,14 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """A stretch of a unit that makes no episode, and why; reasons are counted and reported."""
+class Skipped:
+    """A part of a unit that gives no episode, and why; reasons are counted and reported."""
 
     reason: str
 
 
-class Source(Protocol):
-    """An opened source. Its settings and `units` decide every byte that is written."""
+class ConvertibleSource(Protocol):
+    """An opened source. Its settings and `units` determine every byte that is written."""
 
     layout: Layout
     hz: float
@@ -83,10 +85,10 @@ class Source(Protocol):
     units: Sequence[str]
 
     def identity(self) -> dict[str, Any]:
-        """JSON facts that tell another source or other settings apart."""
+        """JSON values that differ for another source or other settings."""
         ...
 
-    def read(self, unit: int) -> Iterator[Episode | LeftOut]:
+    def read(self, unit: int) -> Iterator[Episode | Skipped]:
         """The episodes of `units[unit]`, in order. Raises UnitError for a damaged unit."""
         ...
 
