@@ -280,7 +280,7 @@ def test_dataset_without_windows_is_dropped_and_reported(tmp_path):
 
 
 @pytest.mark.parametrize("weighed", ["used", "all"])
-def test_a_dataset_whose_drawn_trajectories_are_all_lost_is_dropped_and_reported(tmp_path, weighed):
+def test_a_dataset_whose_drawn_trajectories_were_all_skipped_is_dropped_and_reported(tmp_path, weighed):
     """It has other windows, so that it weighs something by all there are: an order of nothing would never end."""
     spec, damaged = make_spec("whole"), make_spec("damaged")
 
@@ -296,7 +296,7 @@ def test_a_dataset_whose_drawn_trajectories_are_all_lost_is_dropped_and_reported
         mixture = select_windows(store, LoaderConfig(frames=4, max_trajectories=1, seed=seed, weighed=weighed)).mixture
         assert mixture.names == ("whole",) if mixture.dropped else {"whole", "damaged"} == set(mixture.names)
         lost += mixture.dropped.items()
-    assert set(lost) == {("damaged", "the trajectories that were drawn of it are all lost: raise max_trajectories")}
+    assert set(lost) == {("damaged", "the trajectories that were drawn of it were all skipped: raise max_trajectories")}
 
 
 # --- order of datasets, weights, statistics, rate ---------------------------------------------------

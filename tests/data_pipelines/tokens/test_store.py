@@ -60,7 +60,7 @@ def test_records_of_ids_have_kept_their_layout():
 
 def test_record_of_another_length_or_version_is_refused():
     data = encode_episode(make_item())
-    for bad in (data[:-1], data + b"\0", data[:10], b"\2" + data[1:]):
+    for bad in (data[:-1], data + b"\0", data[:10], b"\0" + data[1:], b"\2" + data[1:]):
         with pytest.raises(ValueError, match="episode record|no episode"):
             decode_episode(bad)
 
