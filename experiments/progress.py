@@ -40,7 +40,7 @@ Update = Callable[[int, int, str], None]
 
 
 def say(message: str) -> None:
-    """A message in anybody's words: nothing of it is markup, and the terminal alone breaks its lines."""
+    """Prints a message as it is: without markup, and without line breaks besides the terminal's own."""
     console.print(message, markup=False, soft_wrap=True)
 
 
@@ -79,8 +79,8 @@ def step(title: str) -> Iterator[Update]:
     console.print(f"[green]done[/] {title} [dim]({_clock(time.monotonic() - began)})")
 
 
-class Pace:
-    """How long what is left will take, from how long it took since the first call."""
+class Eta:
+    """Estimates the time left from the rate since the first call."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
         self._clock = clock

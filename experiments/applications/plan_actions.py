@@ -56,7 +56,7 @@ from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
-from experiments.progress import Pace, step
+from experiments.progress import Eta, step
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
@@ -272,7 +272,7 @@ def main() -> None:
             if not path.exists():
                 write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
         trials[way] = json.loads(path.read_text())
-    planners, pace = [name for name in PLANNERS if name in wanted], Pace()
+    planners, eta = [name for name in PLANNERS if name in wanted], Eta()
     trials |= {way: [] for way in planners}
     if planners:
         with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
@@ -282,7 +282,7 @@ def main() -> None:
                     if not path.exists():
                         write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
                     trials[way].append(json.loads(path.read_text()))
-                update(k + 1, len(seeds), f"starts{pace(k + 1, len(seeds))}")
+                update(k + 1, len(seeds), f"starts{eta(k + 1, len(seeds))}")
     write_results({name: trials[name] for name in WAYS if name in trials}, out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 

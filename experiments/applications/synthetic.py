@@ -78,7 +78,7 @@ from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
-from experiments.progress import Pace, say, step
+from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.setting import use_entries
 from experiments.wrote import wrote
@@ -295,12 +295,12 @@ def main() -> None:
     trials: Trials = {}
     conditions = range(len(CONDITIONS) if passive else PASSIVE)
     first = sorted(conditions, key=lambda i: i not in (FEW, ALL, MOST, CONTROL, PASSIVE))  # what counts most
-    jobs, pace = [(i, s) for i in first for s in settings.seeds], Pace()
+    jobs, eta = [(i, s) for i in first for s in settings.seeds], Eta()
     with step(f"train and judge {len(jobs)} policies") as update:
         for n, (i, seed) in enumerate(jobs):
             path = trials_dir / f"{i}-{seed}.json"
             if not path.exists():
-                note = f"{CONDITIONS[i].name}, seed {seed}{pace(n, len(jobs))}"
+                note = f"{CONDITIONS[i].name}, seed {seed}{eta(n, len(jobs))}"
                 report = lambda done, total, said, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {said}")
                 write_file(path, json.dumps(run_trial(source, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())

@@ -1,7 +1,7 @@
 """A process that runs stages of our base models when told to: `python -m experiments.bench.stages ROWS DTYPE`.
 
 Reads a stage's name per line, runs it once and answers with the seconds it took; the first time includes
-compilation. `experiments.bench.beside` lets it take turns with another program.
+compilation. `experiments.bench.against_release` lets it take turns with another program.
 """
 
 from __future__ import annotations

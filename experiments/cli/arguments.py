@@ -1,4 +1,4 @@
-"""What several commands ask besides `StudyArguments`; it holds for one command and is not handed on to the next."""
+"""Arguments of several commands besides `StudyArguments`; they hold for one command and are not passed to the next."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RunningArguments:
 
 
 @dataclass(frozen=True)
-class Remake:
+class ReplaceArguments:
     """What was made with other settings or data is never replaced without being asked for."""
 
     replace: Annotated[Step | None, arg(metavar="STEP"), UNSET] = None
@@ -50,7 +50,7 @@ class Remake:
 
 
 @dataclass(frozen=True)
-class OneModel:
+class ModelArguments:
     """How one model is trained."""
 
     run: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: OUT/model)")] = None
@@ -66,6 +66,6 @@ class OneModel:
 
 # As commands take them: `--help` shows those of each under its name.
 StudyOptions = Annotated[OmitArgPrefixes[StudyArguments], arg(name="study")]
-ModelOptions = Annotated[OmitArgPrefixes[OneModel], arg(name="model")]
+ModelOptions = Annotated[OmitArgPrefixes[ModelArguments], arg(name="model")]
 SavingOptions = Annotated[OmitArgPrefixes[RunOptions], arg(name="saving")]
-RemakeOptions = Annotated[OmitArgPrefixes[Remake], arg(name="replacement")]
+ReplaceOptions = Annotated[OmitArgPrefixes[ReplaceArguments], arg(name="replacement")]

@@ -36,7 +36,7 @@ def check(
         windows: Of each robot.
     """
     from experiments.applications.check import check_run, choose_robots, open_study, verdict, write_effects
-    from experiments.cli.evaluate import check_fits, say_what_it_may_have_seen
+    from experiments.cli.evaluate import check_fits, note_possible_leakage
     from hma_jax.simulator.folder import find_robots
     from hma_jax.training.runs import load_model, require_frames
 
@@ -51,7 +51,7 @@ def check(
         chosen, left_out = choose_robots(run, model, prepared, robots, windows, workspace.root)
         for why in left_out.values():
             say(f"not checked: {why}")
-        say_what_it_may_have_seen(model.run, chosen, prepared.store)
+        note_possible_leakage(model.run, chosen, prepared.store)
         found = check_run(run, model, prepared, chosen, windows)
     names = {robot.name: robot.dimensions for robot in find_robots(run, model.table)}
     for robot, effects in found.items():

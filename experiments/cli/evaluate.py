@@ -109,7 +109,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
-    say_what_it_may_have_seen(trained, names, prepared.store)
+    note_possible_leakage(trained, names, prepared.store)
     made_from = describe_evaluation(trained, names, prepared, setting.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)
@@ -150,7 +150,7 @@ def table_of(summary: Summary, title: str) -> TidyTable:
 
 
 def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:
-    """Datasets that a model was meant to be trained on and that gave it no window."""
+    """Datasets among those a model was to be trained on that had no training window."""
     from data_pipelines.loading.selection import LoaderConfig, select_windows
 
     loader = trained.provenance.get("loader")
@@ -162,8 +162,8 @@ def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:
     return list(select_windows(prepared.store, config).mixture.dropped)
 
 
-def say_what_it_may_have_seen(trained: Run, names: Sequence[str], store: TokenStore) -> None:
-    """Where what is held out in `store` may be no test of a model."""
+def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore) -> None:
+    """Prints a note where a model may have been trained on episodes that are held out in `store` (data leakage)."""
     if elsewhere := trained_on_other_tokens(trained, names, store):
         console.print(
             f"note: {few(elsewhere)}: of the tokens that the model was trained on not all lie here as they were, so that it "
@@ -215,8 +215,8 @@ def check_fits(trained: Run, prepared: PreparedData) -> None:
 
 
 def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
-    """Raises ConfigError, with `advice`, for a `misfit`."""
-    if why := misfit(trained, tokenizer):
+    """Raises ConfigError, with `advice`, where the model was not trained on the tokenizer's tokens."""
+    if why := tokenizer_mismatch(trained, tokenizer):
         raise ConfigError(why + advice)
     if _converted(trained):
         console.print(
@@ -226,7 +226,7 @@ def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
         )
 
 
-def misfit(trained: Run, tokenizer: Tokenizer) -> str:
+def tokenizer_mismatch(trained: Run, tokenizer: Tokenizer) -> str:
     """Why a model was not trained on the tokens of this tokenizer; '' if it was. A model that was converted does not
     know its own: then the form of its tokens decides."""
     if not _converted(trained):

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import Pace, console, say, step
+from experiments.progress import Eta, console, say, step
 from experiments.setting import UNSET, command, require_local, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require
@@ -89,11 +89,11 @@ def generate(
     count = len(recorded) if episodes is None else min(episodes, len(recorded))
     mark = checkpoint_hash(run, simulator.model.step)
     source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)
-    called, pace = name or f"{driven.name}_generated", Pace()
+    called, eta = name or f"{driven.name}_generated", Eta()
     with step(f"generate {count} episodes of {driven.name}") as update:
         done = convert(
             source, out, called, shard_bytes=SHARD_BYTES, origin=source.origin() | {"run": str(run)},
-            progress=lambda n, total, unit: update(n, total, unit + pace(n, total)),
+            progress=lambda n, total, unit: update(n, total, unit + eta(n, total)),
         )  # fmt: skip
     for reason, left in done.skipped.items():
         say(f"left out {left:,} x: {reason}")

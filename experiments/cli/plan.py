@@ -22,39 +22,39 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Planned(StudyArguments):
+class PlanArguments(StudyArguments):
     """The model that `hma train` with the same arguments would train."""
 
     preset: Annotated[Preset | None, arg(help_behavior_hint="(default: a model of --model)")] = None
     """The study whose model, robots, batch and execution are planned."""
 
 
-USUAL = {"model": "base", "batch": 64, "robots": 1, "dtype": "bfloat16", "remat": "everything"}
-"""Of a fixed model, what is not asked for."""
+DEFAULTS = {"model": "base", "batch": 64, "robots": 1, "dtype": "bfloat16", "remat": "everything"}
+"""Defaults of a model that is chosen by --model."""
 
 
-def _usual(name: str, metavar: str | None = None) -> object:
-    return arg(metavar=metavar, help_behavior_hint=f"(default: {USUAL[name]})")
+def _default(name: str, metavar: str | None = None) -> object:
+    return arg(metavar=metavar, help_behavior_hint=f"(default: {DEFAULTS[name]})")
 
 
 @dataclass(frozen=True)
 class Shape:
     """A model of `hma bench`, in place of a study's."""
 
-    model: Annotated[Model | None, _usual("model")] = None
+    model: Annotated[Model | None, _default("model")] = None
     """base is width 256 with 32 layers, xl width 1024."""
-    batch: Annotated[int | None, _usual("batch", "N")] = None
+    batch: Annotated[int | None, _default("batch", "N")] = None
     """Windows per step, over all devices."""
-    robots: Annotated[int | None, _usual("robots", "N")] = None
+    robots: Annotated[int | None, _default("robots", "N")] = None
     """Embodiments of the model."""
-    dtype: Annotated[Dtype | None, _usual("dtype")] = None
+    dtype: Annotated[Dtype | None, _default("dtype")] = None
     """What is computed in; parameters and moments are float32."""
-    remat: Annotated[Remat | None, _usual("remat")] = None
+    remat: Annotated[Remat | None, _default("remat")] = None
     """What a block keeps for the backward pass; the rest is computed again."""
 
 
 def plan(
-    arguments: Annotated[OmitArgPrefixes[Planned], arg(name="study")],
+    arguments: Annotated[OmitArgPrefixes[PlanArguments], arg(name="study")],
     shape: OmitArgPrefixes[Shape],
     topology: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("local",),
     memory: Annotated[str | None, arg(metavar="SIZE")] = None,
@@ -123,18 +123,18 @@ def read_memory(size: str | None) -> float | None:
 
 
 def _choose_model(
-    arguments: Planned, shape: Shape
+    arguments: PlanArguments, shape: Shape
 ) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
     """The model in words, then what its training step is made of: of a study's reference trial, or of a fixed model."""
     if arguments.preset is None:
         from experiments.bench.models import make_shape
 
-        others = replace(arguments, mesh=None) == Planned()
+        others = replace(arguments, mesh=None) == PlanArguments()
         require(others, "only a study has these settings; add --preset, or choose by --model, --batch and --robots")
-        said = USUAL | {name: value for name, value in vars(shape).items() if value is not None}
-        config, table = make_shape(said["model"], said["robots"])
-        execution = ExecutionConfig(said["dtype"], said["remat"], mesh=MeshConfig(*arguments.mesh or (1, -1, 1)))
-        return said["model"], config, table, replace(TrainConfig(), batch=said["batch"]), execution
+        chosen = DEFAULTS | {name: value for name, value in vars(shape).items() if value is not None}
+        config, table = make_shape(chosen["model"], chosen["robots"])
+        execution = ExecutionConfig(chosen["dtype"], chosen["remat"], mesh=MeshConfig(*arguments.mesh or (1, -1, 1)))
+        return chosen["model"], config, table, replace(TrainConfig(), batch=chosen["batch"]), execution
     from experiments.cost import declared_table
     from experiments.sweeps.sweep import reference_trial
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from experiments.cli.arguments import Remake, RemakeOptions, RunningArguments, StudyOptions
+from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningArguments, StudyOptions
 from experiments.progress import console
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.setting import StudyArguments, make_setting
@@ -18,7 +18,7 @@ from hma_jax.config import ConfigError, require
 def study(
     arguments: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
-    remake: RemakeOptions,
+    replacement: ReplaceOptions,
 ) -> None:
     """Run a whole scaling study: data, tokenizer, its sweeps, CSV, figures and a report page.
 
@@ -26,14 +26,14 @@ def study(
 
     Run the same command again after an interruption: only what is missing is done.
     """
-    _run(("study",), arguments, running, remake)
+    _run(("study",), arguments, running, replacement)
 
 
 def sweep(
     axis: Annotated[Positional[str], arg(metavar="|".join((*AXES, "FILE.py")))],
     arguments: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
-    remake: RemakeOptions,
+    replacement: ReplaceOptions,
 ) -> None:
     """Run one axis: datasets, trajectories, width; settings, conditioning; lr; or one of your own, from its file.
 
@@ -46,9 +46,9 @@ def sweep(
         axis: What varies.
         arguments: Which study, on which data, in which directory, on which devices.
         running: How trials are run; none of it changes a result.
-        remake: What was made with other settings or data is never replaced without being asked for.
+        replacement: What was made with other settings or data is never replaced without being asked for.
     """
-    _run(("sweep", Path(axis).absolute() if is_file(axis) else axis), arguments, running, remake, (axis,))
+    _run(("sweep", Path(axis).absolute() if is_file(axis) else axis), arguments, running, replacement, (axis,))
 
 
 def report(study: Annotated[Positional[Path], arg(metavar="STUDY")]) -> None:
@@ -66,7 +66,7 @@ def _run(
     words: tuple[str | Path, ...],
     arguments: StudyArguments,
     running: RunningArguments,
-    remake: Remake,
+    replacement: ReplaceArguments,
     axes: tuple[str, ...] = (),
 ) -> None:
     """`axes`: () for those of the study."""
@@ -95,5 +95,5 @@ def _run(
         launcher_options=launcher_options,
         retry_failed=running.retry_failed,
         accept_code=running.accept_code,
-        replace=remake.replace,
+        replace=replacement.replace,
     )

@@ -10,7 +10,7 @@ from rich.markup import escape
 from tyro.conf import arg
 
 from data_pipelines.errors import MAX_LISTED
-from experiments.cli.arguments import RemakeOptions, StudyOptions
+from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
 from experiments.running.workspace import Busy, Workspace
@@ -21,7 +21,7 @@ from hma_jax.config import require
 
 def tokenize(
     arguments: StudyOptions,
-    remake: RemakeOptions,
+    replacement: ReplaceOptions,
     batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")] = None,
 ) -> None:
@@ -34,11 +34,11 @@ def tokenize(
 
     Args:
         arguments: Study, data, output directory and settings. Several processes share the directory.
-        remake: What was made with other settings or data is never replaced without being asked for.
+        replacement: What was made with other settings or data is never replaced without being asked for.
         batch: Frames encoded at a time. Changes no token.
         threads: Threads that decode frames.
     """
-    prepare_together(make_setting(arguments), batch, threads, remake.replace)
+    prepare_together(make_setting(arguments), batch, threads, replacement.replace)
 
 
 def prepare_together(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from experiments.cli.arguments import RemakeOptions, StudyOptions
+from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step
 from experiments.setting import Setting, command, make_setting, short
@@ -23,9 +23,9 @@ HELP = "The image tokenizer: trained here, made of published weights, or none."
 
 
 @tokenizer_app.command(name="train")
-def tokenizer_train(arguments: StudyOptions, remake: RemakeOptions) -> None:
+def tokenizer_train(arguments: StudyOptions, replacement: ReplaceOptions) -> None:
     """Train the study's image tokenizer on its datasets."""
-    train_tokenizer(make_setting(arguments), remake.replace)
+    train_tokenizer(make_setting(arguments), replacement.replace)
 
 
 @tokenizer_app.command(name="import")

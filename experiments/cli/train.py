@@ -9,9 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
-from experiments.cli.arguments import ModelOptions, RemakeOptions, SavingOptions, StudyOptions
-from experiments.cli.begin import known, require_another_place, require_known, setting_of, strangers
+from experiments.cli.arguments import ModelOptions, ReplaceOptions, SavingOptions, StudyOptions
 from experiments.cli.hosts import Hosts
+from experiments.cli.initial_model import (
+    known_datasets,
+    new_datasets,
+    require_known,
+    require_other_directory,
+    setting_of,
+)
 from experiments.preparing.made_from import Step
 from experiments.progress import console, say, step
 from experiments.running.attempts import JOB, RUN
@@ -32,11 +38,11 @@ if TYPE_CHECKING:
 
 def train(
     arguments: StudyOptions,
-    one: ModelOptions,
+    model: ModelOptions,
     options: SavingOptions,
-    remake: RemakeOptions,
+    replacement: ReplaceOptions,
     hosts: OmitArgPrefixes[Hosts],
-    begin: Annotated[Path | None, arg(name="from", metavar="RUN"), UNSET] = None,
+    initial: Annotated[Path | None, arg(name="from", metavar="RUN"), UNSET] = None,
     dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False,
 ) -> None:
     """Train one model: the study's reference trial, on all trajectories unless told otherwise.
@@ -45,35 +51,36 @@ def train(
 
     Args:
         arguments: Study, data, output directory and settings.
-        one: How this model is trained; no sweep reads it.
+        model: How this model is trained; no sweep reads it.
         options: How the run is saved and watched; each start may say it anew.
-        remake: What was made with other settings or data is never replaced without being asked for.
+        replacement: What was made with other settings or data is never replaced without being asked for.
         hosts: Several processes that train together, on one host or on many.
-        begin: A trained or converted model that knows the study's robots. The new run begins with its weights, or with
-            their average where it keeps one, and has its architecture and tokenizer. Its other robots stay as they are.
+        initial: A trained or converted model that knows the study's robots. The new run begins with its weights, or
+            with their average where it keeps one, and has its architecture and tokenizer. Its other robots stay as they
+            are.
         dry_run: Print parameters, FLOPs and expected time on the devices that it would use here, and stop.
     """
     if not dry_run:
         hosts.join()
-    run = one.directory() or arguments.anywhere().out / "model"
-    trained = None if begin is None else _beginning(begin, run)
-    setting = make_setting(arguments) if trained is None else setting_of(begin, trained, arguments)
+    run = model.directory() or arguments.anywhere().out / "model"
+    trained = None if initial is None else _load_initial(initial, run)
+    setting = make_setting(arguments) if trained is None else setting_of(initial, trained, arguments)
     if trained is not None:
-        require_known(begin, trained, setting)
-        require_another_place(begin, run)
+        require_known(initial, trained, setting)
+        require_other_directory(initial, run)
     if dry_run:
-        _check(setting, run, one.trajectories, options, trained)
-        _print_cost(setting, _single_trial(setting, one.trajectories), run, hosts.count())
+        _check(setting, run, model.trajectories, options, trained)
+        _print_cost(setting, _single_trial(setting, model.trajectories), run, hosts.count())
         return
-    train_model(setting, run, options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
+    train_model(setting, run, options, trajectories=model.trajectories, replace=replacement.replace, initial=trained)
 
 
 def adapt(
     source: Annotated[Positional[Path], arg(metavar="RUN")],
     arguments: StudyOptions,
-    one: ModelOptions,
+    model: ModelOptions,
     options: SavingOptions,
-    remake: RemakeOptions,
+    replacement: ReplaceOptions,
     hosts: OmitArgPrefixes[Hosts],
     everything: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
@@ -87,9 +94,9 @@ def adapt(
         source: Directory of the training run that knows the other robots.
         arguments: The study with the new datasets. Its tokenizer is the one of the trained model: give it with
             --tokenizer if it is not beside RUN.
-        one: How the new robots are trained.
+        model: How the new robots are trained.
         options: How the run is saved and watched; each start may say it anew.
-        remake: What was made with other settings or data is never replaced without being asked for.
+        replacement: What was made with other settings or data is never replaced without being asked for.
         hosts: Several processes that train together, on one host or on many.
         everything: Train the whole model, not the new robots' own parameters alone.
     """
@@ -97,11 +104,11 @@ def adapt(
     adapt_model(
         arguments,
         source,
-        one.directory(),
+        model.directory(),
         options,
         everything=everything,
-        trajectories=one.trajectories,
-        replace=remake.replace,
+        trajectories=model.trajectories,
+        replace=replacement.replace,
     )
 
 
@@ -112,19 +119,19 @@ def train_model(
     *,
     trajectories: int | None = None,
     replace: Step | None = None,
-    begin: Run | None = None,
+    initial: Run | None = None,
 ) -> None:
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
-    the run `begin` on where one is given, which knows its robots."""
-    origin = _check(setting, run, trajectories, options, begin)
+    the run `initial` on where one is given, which knows its robots."""
+    origin = _check(setting, run, trajectories, options, initial)
     _require_devices(setting)
     _prepare(setting, replace)
     start = {}
-    if begin is not None:
-        kept = [name for name in begin.table.names if name not in known(begin, setting)]
+    if initial is not None:
+        kept = [name for name in initial.table.names if name not in known_datasets(initial, setting)]
         if kept:
             console.print(f"note: kept as they are, for want of data here: {', '.join(kept)}", soft_wrap=True)
-        start = {"table": begin.table, "initial": begin.params, "origin": origin}
+        start = {"table": initial.table, "initial": initial.params, "origin": origin}
     _train(setting, _single_trial(setting, trajectories), run, options, **start)
 
 
@@ -146,7 +153,7 @@ def adapt_model(
 
     trained = load_run(source, "auto")
     setting = setting_of(source, trained, arguments)
-    study, new = setting.study, strangers(trained, setting)
+    study, new = setting.study, new_datasets(trained, setting)
     require(
         bool(new),
         f"{short(source)} already knows {few(study.dataset_names())}: there is nothing to add. To train it on: "
@@ -157,7 +164,7 @@ def adapt_model(
         "train.only: leave it out; the new robots alone are trained, or, with --everything, all",
     )
     run = run or setting.workspace.root / "model"
-    require_another_place(source, run)
+    require_other_directory(source, run)
     origin = _check(setting, run, trajectories, options, trained)
     train = dataclasses.replace(study.train, seed=study.seeds[0], only=() if everything else tuple(new))
     require_only(train, new, study.rate)
@@ -171,10 +178,10 @@ def adapt_model(
 
 
 def _check(
-    setting: Setting, run: Path, trajectories: int | None, options: RunOptions, begin: Run | None
+    setting: Setting, run: Path, trajectories: int | None, options: RunOptions, initial: Run | None
 ) -> dict[str, Any] | None:
-    """What the run begins with (`_taken`). Raises ConfigError, before any work, for options that cannot be and for a
-    run that was not trained here, or began otherwise."""
+    """The origin of the run (`_origin_of`). Raises ConfigError, before any work, for invalid options and for a run that
+    was not trained here, or began with another model."""
     from experiments.trainable import require_only
     from hma_jax.training.optimizer import check_schedule
 
@@ -185,7 +192,7 @@ def _check(
     require_only(setting.study.train, setting.study.dataset_names(), setting.study.rate)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
-    return _taken(run, begin)
+    return _origin_of(run, initial)
 
 
 def _require_no_trial(setting: Setting, run: Path) -> None:
@@ -221,11 +228,12 @@ def _newest(run: Path) -> tuple[int, dict[str, Any]]:
     return 0, {}
 
 
-def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
-    """What `run` begins with, the model `begin`, or began with: an earlier step of it, if it has trained on since. None
-    for a run of its own. Raises ConfigError for a run that began otherwise."""
+def _origin_of(run: Path, initial: Run | None) -> dict[str, Any] | None:
+    """The origin of a run: step and provenance of the model `initial` that it begins with. Of a run that exists, those
+    that it began with, which may be an earlier step of that model; None without an initial model. Raises ConfigError
+    for a run that began with another one."""
     _, described = _newest(run)
-    origin = None if begin is None else {"step": begin.step, "provenance": begin.provenance}
+    origin = None if initial is None else {"step": initial.step, "provenance": initial.provenance}
     if "table" not in described:  # it has not begun, or is none, of which the restoring speaks
         return origin
     taken, place = described["provenance"].get("origin"), "give the new run a directory of its own with --run NEW"
@@ -250,9 +258,9 @@ def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
     return taken
 
 
-def _beginning(source: Path, run: Path) -> Run:
-    """The trained model in `source`. Where that is gone, what `run` has of it, if it began with one: a run needs no
-    more than that, and its own checkpoint, to go on."""
+def _load_initial(source: Path, run: Path) -> Run:
+    """The trained model in `source`. Where that was removed and `run` began with it, what the run recorded of it, which
+    with its own checkpoint is enough to go on."""
     from hma_jax.training.runs import load_run
 
     origin = None if source.exists() else _newest(run)[1].get("provenance", {}).get("origin")

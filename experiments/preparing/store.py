@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source, open_source
-from experiments.progress import Pace, say, step
+from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.words import few
@@ -44,12 +44,12 @@ def make_store(
     workspace.store.mkdir(parents=True, exist_ok=True)
 
     def make(i: int, wait: bool) -> bool:
-        (spec, path), pace = sources[i], Pace()
+        (spec, path), eta = sources[i], Eta()
         note = f"{spec.name} ({i + 1} of {len(sources)}{', the rest of it by other processes' if wait else ''})"
         manifest = tokenize_dataset(
             spec, path, made_with, workspace.store, **settings, **how, rate=study.rate,
             overwrite=may_replace("tokens", replace), wait=wait,
-            progress=lambda done, total: update(done, total, f"{note}{pace(done, total)}"),
+            progress=lambda done, total: update(done, total, f"{note}{eta(done, total)}"),
         )  # fmt: skip
         return manifest is not None
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.bench import beside
+from experiments.bench import against_release
 from experiments.bench import generate as bench_generate
 from experiments.bench import rollout as bench_rollout
 from experiments.bench.evaluate import time_evaluation
@@ -150,18 +150,20 @@ def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
 
 def test_two_programs_take_turns_and_the_faster_one_is_said_by_how_much(tmp_path: Path, monkeypatch):
     (tmp_path / "hma" / "model").mkdir(parents=True)
-    answers = {beside.THEIRS: "3", beside.OURS: "2"}
+    answers = {against_release.RELEASE: "3", against_release.OURS: "2"}
 
-    class Told(beside.Worker):
+    class Told(against_release.Worker):
         def __init__(self, command, **environment):
-            whose = beside.THEIRS if "PYTHONPATH" in environment else beside.OURS
+            whose = against_release.RELEASE if "PYTHONPATH" in environment else against_release.OURS
             assert command[-2:] == ["3", "bfloat16"]
-            assert bool(environment["GLIBC_TUNABLES"]) == (whose == beside.OURS)  # the release as its users start it
+            assert bool(environment["GLIBC_TUNABLES"]) == (
+                whose == against_release.OURS
+            )  # the release as its users start it
             echo = f"while read stage; do echo $stage >> {tmp_path}/{whose[:4]}; echo {answers[whose]}; done"
             super().__init__(["sh", "-c", echo])
 
-    monkeypatch.setattr(beside, "Worker", Told)
-    stages, ratios = beside.time_beside(
+    monkeypatch.setattr(against_release, "Worker", Told)
+    stages, ratios = against_release.time_against_release(
         tmp_path, Path("python"), ("fill", "slide"), 2, lambda *_: None, rows=3, dtype="bfloat16"
     )
     assert ratios == {"fill, times faster": 1.5, "slide, times faster": 1.5}
@@ -171,12 +173,15 @@ def test_two_programs_take_turns_and_the_faster_one_is_said_by_how_much(tmp_path
 
 
 def test_a_program_that_dies_is_said_and_no_checkout_is_refused(tmp_path: Path):
-    with beside.Worker(["sh", "-c", "exit 3"]) as worker, pytest.raises(ConfigError, match="'fill' ended with code 3"):
+    with (
+        against_release.Worker(["sh", "-c", "exit 3"]) as worker,
+        pytest.raises(ConfigError, match="'fill' ended with code 3"),
+    ):
         worker.run("fill")
     with pytest.raises(ConfigError, match="is no checkout of the official release"):
-        beside.time_beside(tmp_path, Path("python"), ("fill",), 1, lambda *_: None)
+        against_release.time_against_release(tmp_path, Path("python"), ("fill",), 1, lambda *_: None)
     with pytest.raises(ConfigError, match="no stage swim"):
-        beside.time_beside(tmp_path, Path("python"), ("swim",), 1, lambda *_: None)
+        against_release.time_against_release(tmp_path, Path("python"), ("swim",), 1, lambda *_: None)
 
 
 def test_decodings_vary_what_the_model_leaves_open():

@@ -19,7 +19,7 @@ from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import sources
-from experiments.progress import Pace
+from experiments.progress import Eta
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting
 from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
@@ -183,8 +183,8 @@ def test_of_many_losses_some_are_named(tmp_path, capsys):
 
 def test_time_left_does_not_count_what_was_there_before():
     now = [0.0]
-    pace = Pace(lambda: now[0])
-    assert pace(90, 100) == ""
+    eta = Eta(lambda: now[0])
+    assert eta(90, 100) == ""
     now[0] = 10.0
-    assert pace(91, 100) == ", 1 min 30 s left"
-    assert pace(100, 100) == ""
+    assert eta(91, 100) == ", 1 min 30 s left"
+    assert eta(100, 100) == ""

@@ -13,7 +13,7 @@ import pytest
 
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.cli.begin import setting_of, strangers
+from experiments.cli.initial_model import new_datasets, setting_of
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.running import run_trial as trials
@@ -391,7 +391,7 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     assert f"nothing that {BASE.name} alone has would be trained" in said
     arguments, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
     setting = setting_of(beside, trained, arguments)
-    assert setting.tokenizer == tokenizer and strangers(trained, setting) == [BASE.name]
+    assert setting.tokenizer == tokenizer and new_datasets(trained, setting) == [BASE.name]
     other = replace(trained, provenance={"tokenizer": "another"})
     with pytest.raises(ConfigError, match="trained on tokens of tokenizer another, .*; add --tokenizer"):
         setting_of(beside, other, arguments)

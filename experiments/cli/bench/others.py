@@ -218,12 +218,12 @@ def release(
         dtype: What both compute in; the release by torch's automatic mixed precision.
         out: Directory for the record.
     """
-    from experiments.bench.beside import RELEASED, time_beside
+    from experiments.bench.against_release import RELEASED, time_against_release
 
     require(min(turns, batch) >= 1, "--turns and --batch must be at least 1")
     names = stages or tuple(RELEASED)
     with step(f"time {len(names)} stages beside the release") as update:
-        found, ratios = time_beside(
+        found, ratios = time_against_release(
             checkout, python, names, turns, lambda what, turn: update(turn, turns, what), rows=batch, dtype=dtype
         )
     subject = "base" if batch == 1 else f"base-batch-{batch}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tyro.extras import SubcommandApp
 
-from experiments.cli.arguments import RemakeOptions, StudyOptions
+from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.cli.data import convert, registry, sim
 from experiments.cli.data.view import view
 from experiments.setting import make_setting
@@ -18,13 +18,13 @@ CONVERT_HELP = (
 )
 
 
-def suite(arguments: StudyOptions, remake: RemakeOptions) -> None:
+def suite(arguments: StudyOptions, replacement: ReplaceOptions) -> None:
     """Write the study's simulated datasets as RLDS directories."""
     from experiments.preparing.suite import make_suite
 
     setting = make_setting(arguments)
     with setting.workspace.locked():
-        make_suite(setting.study, setting.workspace, remake.replace)
+        make_suite(setting.study, setting.workspace, replacement.replace)
     wrote(setting.workspace.suite, then=setting.command("tokenizer train"))
 
 

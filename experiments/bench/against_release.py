@@ -1,4 +1,4 @@
-"""Our stages beside the official release's: processes that take turns, so that a slow spell hits all."""
+"""Times our stages against the official release's: processes that take turns, so that a slow spell hits all."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RELEASED = {
 }
 """Our stage -> the release's that gives the same."""
 
-OURS, THEIRS = "ours: ", "release: "
+OURS, RELEASE = "ours: ", "release: "
 
 SHARED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 """Environment of a process that leaves the GPU's memory to others too."""
@@ -59,7 +59,7 @@ class Worker:
         return float(answer)
 
 
-def time_beside(
+def time_against_release(
     release: Path,
     python: Path,
     names: Sequence[str],
@@ -75,20 +75,20 @@ def time_beside(
     require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASED)}")
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
     seconds: dict[str, list[float]] = {}
-    for theirs in dict.fromkeys(RELEASED[name] for name in names):
-        ours = [name for name in names if RELEASED[name] == theirs]
-        seconds |= _take_turns(release, python, theirs, ours, turns, progress, (str(rows), dtype))
+    for release_stage in dict.fromkeys(RELEASED[name] for name in names):
+        our_stages = [name for name in names if RELEASED[name] == release_stage]
+        seconds |= _take_turns(release, python, release_stage, our_stages, turns, progress, (str(rows), dtype))
     stages = [Stage(stage, rows, summarise(taken)) for stage, taken in seconds.items()]
     median = {stage.name: stage.timing.median for stage in stages}
-    ratios = {f"{name}, times faster": median[THEIRS + RELEASED[name]] / median[OURS + name] for name in names}
+    ratios = {f"{name}, times faster": median[RELEASE + RELEASED[name]] / median[OURS + name] for name in names}
     return stages, ratios
 
 
 def _take_turns(
     release: Path,
     python: Path,
-    theirs: str,
-    ours: Sequence[str],
+    release_stage: str,
+    our_stages: Sequence[str],
     turns: int,
     progress: Callable[[str, int], None],
     arguments: Sequence[str],
@@ -101,9 +101,11 @@ def _take_turns(
     script = Path(__file__).with_name("released.py").read_text()
     as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
     with ExitStack() as stack:
-        their_command = [str(python), "-c", script, *arguments]
-        workers = {THEIRS + theirs: (theirs, stack.enter_context(Worker(their_command, **as_its_users)))}
-        for name in ours:
+        release_command = [str(python), "-c", script, *arguments]
+        workers = {
+            RELEASE + release_stage: (release_stage, stack.enter_context(Worker(release_command, **as_its_users)))
+        }
+        for name in our_stages:
             command = [sys.executable, "-m", "experiments.bench.stages", *arguments]
             worker = stack.enter_context(Worker(command, **KEPT_PAGES, **SHARED))
             workers[OURS + name] = (name, worker)

@@ -1,4 +1,5 @@
-"""What a training run takes of the trained model that it begins with: its architecture, its tokenizer, its robots."""
+"""The trained model that a training run begins with: the study that follows from its architecture, tokenizer and
+robots."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.cli.evaluate import check_tokenizer, misfit
+from experiments.cli.evaluate import check_tokenizer, tokenizer_mismatch
 from experiments.running.workspace import Workspace
 from experiments.setting import Setting, StudyArguments, make_setting, short
 from experiments.words import few
@@ -19,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def setting_of(source: Path, trained: Run, arguments: StudyArguments) -> Setting:
-    """The study that goes on from the model `trained`, which lies in `source`. Writes nothing.
+    """The study that goes on from the model `trained`, which is in the directory `source`. Writes nothing.
 
     Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
     """
     from data_pipelines.registry import get_spec
 
     arguments = arguments.anywhere()
-    arguments = dataclasses.replace(arguments, tokenizer=_tokenizer(source, trained, arguments))
+    arguments = dataclasses.replace(arguments, tokenizer=_find_tokenizer(source, trained, arguments))
     setting = make_setting(arguments, trained.model)
     lines = diff(trained.model, setting.study.model, "model")
     require(
@@ -34,24 +35,24 @@ def setting_of(source: Path, trained: Run, arguments: StudyArguments) -> Setting
         f"{short(source)} is another model than --set asks for (there -> asked for): {'; '.join(lines)}. Leave out "
         "settings of the model: they are taken from there",
     )
-    for name in known(trained, setting):
+    for name in known_datasets(trained, setting):
         get_spec(name).check_like(trained.table.entries[trained.table.index(name)], setting.study.rate)
     return setting
 
 
-def known(trained: Run, setting: Setting) -> list[str]:
+def known_datasets(trained: Run, setting: Setting) -> list[str]:
     """The datasets of a study whose robots a model knows."""
     return [name for name in setting.study.dataset_names() if name in trained.table.names]
 
 
-def strangers(trained: Run, setting: Setting) -> list[str]:
+def new_datasets(trained: Run, setting: Setting) -> list[str]:
     """The datasets of a study whose robots a model does not know."""
     return [name for name in setting.study.dataset_names() if name not in trained.table.names]
 
 
 def require_known(source: Path, trained: Run, setting: Setting) -> None:
     """Raises ConfigError unless a model knows every robot of the study."""
-    new = strangers(trained, setting)
+    new = new_datasets(trained, setting)
     require(
         not new,
         f"{short(source)} knows {few(trained.table.names)}, not {few(new)}. To add them: "
@@ -59,7 +60,7 @@ def require_known(source: Path, trained: Run, setting: Setting) -> None:
     )
 
 
-def require_another_place(source: Path, run: Path) -> None:
+def require_other_directory(source: Path, run: Path) -> None:
     """Raises ConfigError if the new run would lie where the model lies that it begins with."""
     require(
         run.resolve() != source.resolve(),
@@ -68,7 +69,7 @@ def require_another_place(source: Path, run: Path) -> None:
     )
 
 
-def _tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Path:
+def _find_tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Path:
     """The directory of the tokenizer whose tokens a model takes: the one that is asked for, or one in the study's
     directory or beside the run. Raises ConfigError where it is none of them."""
     from hma_jax.simulator.folder import TOKENIZER
@@ -83,6 +84,6 @@ def _tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Path:
     advice = f"; add --tokenizer with the directory of the one that {short(source)} was trained with"
     require(bool(places), f"{short(source)}: its tokenizer is neither beside it nor in {short(arguments.out)}{advice}")
     tokenizers = {place: load_tokenizer(place) for place in places}
-    found = next((place for place in places if not misfit(trained, tokenizers[place])), places[0])
+    found = next((place for place in places if not tokenizer_mismatch(trained, tokenizers[place])), places[0])
     check_tokenizer(trained, tokenizers[found], advice)
     return found
