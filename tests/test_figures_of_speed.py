@@ -7,7 +7,7 @@ import json
 import re
 from pathlib import Path
 
-from experiments.bench.against_release import OURS, RELEASE, RELEASED
+from experiments.bench.against_release import OUR_PREFIX, RELEASE_PREFIX, RELEASE_STAGES
 from experiments.bench.models import EXECUTION
 from experiments.bench.record import read_record
 from experiments.presets import get_preset
@@ -34,7 +34,7 @@ def test_the_speed_beside_the_release():
     median = {stage["name"]: stage["timing"]["median"] for stage in record["stages"]}
     for label, (release, here, times) in table(README, "| | release | here |").items():
         stage = STAGES[label]
-        theirs, ours = median[RELEASE + RELEASED[stage]], median[OURS + stage]
+        theirs, ours = median[RELEASE_PREFIX + RELEASE_STAGES[stage]], median[OUR_PREFIX + stage]
         assert (release, here) == (f"{theirs:.2f} s", f"{ours:.2f} s"), label
         ratio = float(re.search(r"[\d.]+", times)[0])
         digits = len(times.split(".")[1].rstrip("*").split(":")[0])
@@ -49,7 +49,8 @@ def test_the_speed_on_a_gpu_beside_the_release():
     names = ("base-float32", "base-batch-8-bfloat16")
     frames, steps = (read_record(gpu / f"release-{name}-nvidia-h100-80gb-hbm3.json") for name in names)
     fill, slide, train = (
-        record.stage(RELEASE + RELEASED[stage], rows).timing.median / record.stage(OURS + stage, rows).timing.median
+        record.stage(RELEASE_PREFIX + RELEASE_STAGES[stage], rows).timing.median
+        / record.stage(OUR_PREFIX + stage, rows).timing.median
         for record, stage, rows in ((frames, "fill", 1), (frames, "slide", 1), (steps, "step", 8))
     )
     assert (
@@ -76,7 +77,7 @@ def beside_the_release(*earlier: str) -> list[dict[str, tuple[float, float]]]:
 
 
 def times_longer(run: dict[str, tuple[float, float]], stage: str) -> float:
-    return run[RELEASE + RELEASED[stage]][0] / run[OURS + stage][0]
+    return run[RELEASE_PREFIX + RELEASE_STAGES[stage]][0] / run[OUR_PREFIX + stage][0]
 
 
 EARLIER = ("ff60a14d7648", "9d42fe38d6dc", "beb6b0eed88e")
@@ -88,15 +89,16 @@ def test_the_page_of_speed_shows_the_release_on_two_cores():
     rows = table(SPEED, "| stage | the release | here |")
     few = "continuous fill, 10 evaluations by dpm++"
     shown = {"continuous few" if label == few else label: cells for label, cells in rows.items()}
-    assert shown.keys() == RELEASED.keys()
+    assert shown.keys() == RELEASE_STAGES.keys()
     for stage, cells in shown.items():
         times = [
-            ", ".join(f"{1e3 * x:,.0f} ms" for x in newest[name]) for name in (RELEASE + RELEASED[stage], OURS + stage)
+            ", ".join(f"{1e3 * x:,.0f} ms" for x in newest[name])
+            for name in (RELEASE_PREFIX + RELEASE_STAGES[stage], OUR_PREFIX + stage)
         ]
         others = ", ".join(f"{times_longer(run, stage):.2f}" for run in before)
         assert cells == [*times, f"{times_longer(newest, stage):.2f}", others], stage
     page = " ".join(SPEED.read_text().split())
-    forward = [[run[whose + "forward"][0] for run in (newest, *before)] for whose in (RELEASE, OURS)]
+    forward = [[run[whose + "forward"][0] for run in (newest, *before)] for whose in (RELEASE_PREFIX, OUR_PREFIX)]
     for mine, words in zip(forward, ("release's forward pass took {:.2f} s", "ours {:.2f} s"), strict=True):
         assert f"{words.format(mine[0])}, before {min(mine[1:]):.2f} to {max(mine[1:]):.2f} s" in page
     plain = [read_record(BENCH.parent / "release-before" / f"{c}.json").matmul_flops_per_second / 1e9 for c in EARLIER]
@@ -122,7 +124,7 @@ def test_the_summary_of_speed_gives_the_range_of_four_runs():
         took, beside, here, there = rows[label]
         digits = 2 if stage == "step" else 1
         mine, others = times_longer(newest, stage), [times_longer(run, stage) for run in before]
-        assert took == f"{newest[OURS + stage][0]:.2f} s", label
+        assert took == f"{newest[OUR_PREFIX + stage][0]:.2f} s", label
         found = re.findall(r"\d+\.\d+", beside)
         assert found == [f"{x:.{digits}f}" for x in (mine, min(others), max(others))], label
         assert ("slower" in beside) == (mine < 1), label
@@ -187,7 +189,7 @@ def test_the_page_of_speed_shows_products_of_two_cores():
         plain.append(products.matmul_flops_per_second / 1e9)
         cells = table(SPEED, "| program | time |")[PROGRAMS[program]]
         whole, *each = products.stages
-        took, released = sum(stage.timing.median for stage in each), release[RELEASE + theirs][0]
+        took, released = sum(stage.timing.median for stage in each), release[RELEASE_PREFIX + theirs][0]
         times = whole.timing.median / took, released / took
         assert cells == [
             f"{whole.timing.median:.2f} s", f"{took:.2f} s", f"{times[0]:.2f}", f"{released:.2f} s", f"{times[1]:.1f}"

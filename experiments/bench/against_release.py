@@ -15,7 +15,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.config.execution import Dtype
 from hma_jax.runtime.host_memory import KEPT_PAGES
 
-RELEASED = {
+RELEASE_STAGES = {
     "forward": "forward",
     "fill": "frame",
     "slide": "frame",
@@ -26,7 +26,7 @@ RELEASED = {
 }
 """Our stage -> the release's that gives the same."""
 
-OURS, RELEASE = "ours: ", "release: "
+OUR_PREFIX, RELEASE_PREFIX = "ours: ", "release: "
 
 SHARED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 """Environment of a process that leaves the GPU's memory to others too."""
@@ -71,16 +71,19 @@ def time_against_release(
 ) -> tuple[list[Stage], dict[str, float]]:
     """(stages of both, how many times faster ours are), of `rows` examples at a time. `release` is a checkout, `python`
     an interpreter that has what it imports. Raises ConfigError."""
-    unknown = sorted(set(names) - set(RELEASED))
-    require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASED)}")
+    unknown = sorted(set(names) - set(RELEASE_STAGES))
+    require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASE_STAGES)}")
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
     seconds: dict[str, list[float]] = {}
-    for release_stage in dict.fromkeys(RELEASED[name] for name in names):
-        our_stages = [name for name in names if RELEASED[name] == release_stage]
+    for release_stage in dict.fromkeys(RELEASE_STAGES[name] for name in names):
+        our_stages = [name for name in names if RELEASE_STAGES[name] == release_stage]
         seconds |= _take_turns(release, python, release_stage, our_stages, turns, progress, (str(rows), dtype))
     stages = [Stage(stage, rows, summarise(taken)) for stage, taken in seconds.items()]
     median = {stage.name: stage.timing.median for stage in stages}
-    ratios = {f"{name}, times faster": median[RELEASE + RELEASED[name]] / median[OURS + name] for name in names}
+    ratios = {
+        f"{name}, times faster": median[RELEASE_PREFIX + RELEASE_STAGES[name]] / median[OUR_PREFIX + name]
+        for name in names
+    }
     return stages, ratios
 
 
@@ -103,12 +106,15 @@ def _take_turns(
     with ExitStack() as stack:
         release_command = [str(python), "-c", script, *arguments]
         workers = {
-            RELEASE + release_stage: (release_stage, stack.enter_context(Worker(release_command, **as_its_users)))
+            RELEASE_PREFIX + release_stage: (
+                release_stage,
+                stack.enter_context(Worker(release_command, **as_its_users)),
+            )
         }
         for name in our_stages:
             command = [sys.executable, "-m", "experiments.bench.stages", *arguments]
             worker = stack.enter_context(Worker(command, **KEPT_PAGES, **SHARED))
-            workers[OURS + name] = (name, worker)
+            workers[OUR_PREFIX + name] = (name, worker)
         seconds: dict[str, list[float]] = {stage: [] for stage in workers}
         for turn in range(-1, turns):  # the first one compiles and warms up
             for label, (stage, worker) in workers.items():

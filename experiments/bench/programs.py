@@ -18,12 +18,12 @@ from hma_jax.training.step import make_train_step
 CARRIED = {"step": 0, "fill": 1}
 """The argument that a program returns, changed, as its first result."""
 
-RELEASED = ("ddpm", 100)
+RELEASE_SAMPLER = ("ddpm", 100)
 """How the release samples latents."""
 
 
 def program(
-    subject: Subject, name: str, sampler: tuple[str, int] = RELEASED, rows: int = 1
+    subject: Subject, name: str, sampler: tuple[str, int] = RELEASE_SAMPLER, rows: int = 1
 ) -> tuple[Callable[..., Any], *tuple[Any, ...]]:
     """(a function to be jitted, its arguments) for step, forward, fill or slide. The last two make a frame with
     two passes over it, `fill` as the last of a window."""
@@ -53,7 +53,9 @@ def program(
     return {"forward": forward, "slide": slide}[name], weights
 
 
-def repeatable(subject: Subject, name: str, sampler: tuple[str, int] = RELEASED, rows: int = 1) -> Callable[[], Any]:
+def repeatable(
+    subject: Subject, name: str, sampler: tuple[str, int] = RELEASE_SAMPLER, rows: int = 1
+) -> Callable[[], Any]:
     """The program compiled, going on from where its last call ended."""
     function, *args = program(subject, name, sampler, rows)
     carried = CARRIED.get(name)

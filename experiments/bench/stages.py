@@ -15,10 +15,10 @@ from functools import cache
 from typing import Any
 
 from experiments.bench.models import EXECUTION, make_subject
-from experiments.bench.programs import RELEASED, repeatable
+from experiments.bench.programs import RELEASE_SAMPLER, repeatable
 from hma_jax.config.execution import Dtype
 
-FEW = ("dpm++", 10)
+FEW_STEPS = ("dpm++", 10)
 
 
 def stages(rows: int, dtype: Dtype) -> dict[str, Callable[[], Any]]:
@@ -27,13 +27,13 @@ def stages(rows: int, dtype: Dtype) -> dict[str, Callable[[], Any]]:
 
 
 PROGRAMS = {
-    "forward": ("base", "forward", RELEASED),
-    "fill": ("base", "fill", RELEASED),
-    "slide": ("base", "slide", RELEASED),
-    "step": ("base", "step", RELEASED),
-    "continuous fill": ("base-continuous", "fill", RELEASED),
-    "continuous slide": ("base-continuous", "slide", RELEASED),
-    "continuous few": ("base-continuous", "fill", FEW),
+    "forward": ("base", "forward", RELEASE_SAMPLER),
+    "fill": ("base", "fill", RELEASE_SAMPLER),
+    "slide": ("base", "slide", RELEASE_SAMPLER),
+    "step": ("base", "step", RELEASE_SAMPLER),
+    "continuous fill": ("base-continuous", "fill", RELEASE_SAMPLER),
+    "continuous slide": ("base-continuous", "slide", RELEASE_SAMPLER),
+    "continuous few": ("base-continuous", "fill", FEW_STEPS),
 }
 """Model, program, and how latents are sampled, of every stage."""
 

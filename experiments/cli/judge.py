@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -12,6 +13,10 @@ from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, command, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from experiments.applications.judging.judge import Judgement
+    from experiments.applications.judging.real import Count
 
 
 def judge(
@@ -79,43 +84,31 @@ def judge(
         labels: Saved by the blind page: only says how often that person agrees with what lies in --out, whatever else
             is given.
     """
-    from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
+    if labels is not None:
+        _show_agreement_with_labels(labels, out)
+        return
     from experiments.applications.judging.config import JudgeConfig
     from experiments.applications.judging.head import HeadConfig
     from experiments.applications.judging.judge import judge_recorded, judge_run
     from experiments.applications.judging.ladder import LadderConfig
-    from experiments.applications.judging.outcomes import read_outcomes, write_outcomes
-    from experiments.applications.judging.page import draw_scatter, write_page
     from experiments.applications.judging.real import read_real
-    from experiments.applications.judging.summary import summarise, write_summary
     from experiments.applications.policies.tasks import AnyTask, RecordedTask, find_task
 
-    if labels is not None:
-        agreed = compare_labels(read_labels(labels, out), read_outcomes(out / "outcomes.csv"))
-        table = tidy_table(f"{labels}: agreement with a person", "judge", "share alike", "clips")
-        for name, found in agreed.items():
-            table.add_row(name, f"{found.mean:.2f} ({found.low:.2f} to {found.high:.2f})", str(found.n))
-        console.print(table)
-        say(f"the judges of {out}; nothing was judged anew, and no other option was looked at")
-        return
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
-    of_expert = {"--demonstrations": demonstrations, "--steps": steps, "--cloned": cloned, "--diffusion": diffusion}
-    usual = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
-    of_recordings = {"--real": real, "--registry": registry, "--split": split, "--reward": reward}
+    expert = {"--demonstrations": demonstrations, "--steps": steps, "--cloned": cloned, "--diffusion": diffusion}
+    _require_options_of(recordings, task, expert, {
+        "--real": real, "--registry": registry, "--split": split, "--reward": reward
+    })  # fmt: skip
+    defaults = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
     if recordings is None:
-        for flag, value in of_recordings.items():
-            require(value is None, f"{flag} is of robots without a true simulator: give --recordings, or leave it out")
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
-        require(task == "own", f"--task {task} is of robots with a true simulator, not of --recordings")
-        vain = [flag for flag, n in of_expert.items() if n not in (None, 0)]
-        require(not vain, f"recordings have no expert to clone: leave {', '.join(vain)} out")
-        usual[2:] = 0, 0
+        defaults[2:] = 0, 0  # recordings have no expert to clone
         split = split or "train"
         judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold, reward)
-    of_expert = {flag: n if m is None else m for n, (flag, m) in zip(usual, of_expert.items(), strict=True)}
-    demonstrations, steps, cloned, diffusion = of_expert.values()
+    expert = {flag: n if given is None else given for n, (flag, given) in zip(defaults, expert.items(), strict=True)}
+    demonstrations, steps, cloned, diffusion = expert.values()
     config = JudgeConfig(
         judged_task,
         starts,
@@ -132,26 +125,62 @@ def judge(
     else:
         use_entries(registry)
         judged = judge_recorded(run, out, config, recordings, step, policies, split, tuple(counts or ()))
-    summary = summarise(judged, counts)
-    write_outcomes(judged.outcomes, out / "outcomes.csv")
-    write_summary(summary, out / "agreement.json")
-    draw_scatter(summary, out / "scatter.png")
     given: dict[str, Any] = {
         "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
         "--recordings": recordings, "--split": split, "--reward": reward, "--registry": registry, "--real": real,
         "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
-        "--hold": judged.config.task.hold, **(of_expert if recordings is None else {}),
+        "--hold": judged.config.task.hold, **(expert if recordings is None else {}),
         "--head-episodes": head_episodes, "--head-steps": head_steps, "--seed": seed, "--out": out,
     }  # fmt: skip
-    said = [x for flag, value in given.items() if value is not None for x in (flag, value)]
-    page = write_page(judged, summary, out, command("judge", run, *said))
+    words = [x for flag, value in given.items() if value is not None for x in (flag, value)]
+    _write_results(judged, counts, out, command("judge", run, *words))
+
+
+def _show_agreement_with_labels(labels: Path, out: Path) -> None:
+    """Prints how often a person's labels agree with the judges of the results in `out`."""
+    from experiments.applications.judging.blind import compare_labels, read_labels
+    from experiments.applications.judging.outcomes import read_outcomes
+
+    agreed = compare_labels(read_labels(labels, out), read_outcomes(out / "outcomes.csv"))
+    table = tidy_table(f"{labels}: agreement with a person", "judge", "share alike", "clips")
+    for name, share in agreed.items():
+        table.add_row(name, f"{share.mean:.2f} ({share.low:.2f} to {share.high:.2f})", str(share.n))
+    console.print(table)
+    say(f"the judges of {out}; nothing was judged anew, and no other option was looked at")
+
+
+def _require_options_of(
+    recordings: str | None, task: str, of_expert: dict[str, Any], of_recordings: dict[str, Any]
+) -> None:
+    """Raises ConfigError for options of recordings without these, and for options of an expert with recordings."""
+    if recordings is None:
+        for flag, value in of_recordings.items():
+            require(value is None, f"{flag} is of robots without a true simulator: give --recordings, or leave it out")
+        return
+    require(task == "own", f"--task {task} is of robots with a true simulator, not of --recordings")
+    unused = [flag for flag, n in of_expert.items() if n not in (None, 0)]
+    require(not unused, f"recordings have no expert to clone: leave {', '.join(unused)} out")
+
+
+def _write_results(judged: Judgement, counts: Mapping[str, Count] | None, out: Path, again: str) -> None:
+    """Tables, figure and pages of a judgement; `counts` of the real robot; `again`: the command that repeats it."""
+    from experiments.applications.judging.blind import write_blind
+    from experiments.applications.judging.outcomes import write_outcomes
+    from experiments.applications.judging.page import draw_scatter, write_page
+    from experiments.applications.judging.summary import summarise, write_summary
+
+    summary = summarise(judged, counts)
+    write_outcomes(judged.outcomes, out / "outcomes.csv")
+    write_summary(summary, out / "agreement.json")
+    draw_scatter(summary, out / "scatter.png")
+    page = write_page(judged, summary, out, again)
     blind = write_blind(judged, out)
-    _say(summary)
+    _print_summary(summary)
     then = f"label the clips of {blind}, and the same command with --labels labels.json"
     wrote(out / "outcomes.csv", out / "agreement.json", page, blind, then=then)
 
 
-def _say(summary: dict) -> None:
+def _print_summary(summary: dict) -> None:
     from experiments.applications.judging.page import (
         NOTHING,
         describe_clipping,
@@ -166,22 +195,22 @@ def _say(summary: dict) -> None:
     for name, rates in summary["policies"].items():
         table.add_row(name, *(shown(rates[column]) for column in columns))
     console.print(table)
-    found = summary["agreement"]
+    agreement = summary["agreement"]
     say(f"The success head. {describe_head(summary)}")
-    for said in (
+    for text in (
         describe_recorded_head(summary["head"]),
         describe_control(summary),
         describe_clipping(summary),
-        "" if found else NOTHING,
+        "" if agreement else NOTHING,
     ):
-        if said:
-            say(said)
-    if not found:
+        if text:
+            say(text)
+    if not agreement:
         return
-    measures = list(next(iter(found.values()))["starts"])
+    measures = list(next(iter(agreement.values()))["starts"])
     table = tidy_table(
         f"agreement with {summary['compared with']}, intervals over other policies and starts", "compared", *measures
     )
-    for name, agreed in found.items():
+    for name, agreed in agreement.items():
         table.add_row(name, *(shown(agreed["policies and starts"][m]) for m in measures))
     console.print(table)

@@ -150,14 +150,14 @@ def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
 
 def test_two_programs_take_turns_and_the_faster_one_is_said_by_how_much(tmp_path: Path, monkeypatch):
     (tmp_path / "hma" / "model").mkdir(parents=True)
-    answers = {against_release.RELEASE: "3", against_release.OURS: "2"}
+    answers = {against_release.RELEASE_PREFIX: "3", against_release.OUR_PREFIX: "2"}
 
     class Told(against_release.Worker):
         def __init__(self, command, **environment):
-            whose = against_release.RELEASE if "PYTHONPATH" in environment else against_release.OURS
+            whose = against_release.RELEASE_PREFIX if "PYTHONPATH" in environment else against_release.OUR_PREFIX
             assert command[-2:] == ["3", "bfloat16"]
             assert bool(environment["GLIBC_TUNABLES"]) == (
-                whose == against_release.OURS
+                whose == against_release.OUR_PREFIX
             )  # the release as its users start it
             echo = f"while read stage; do echo $stage >> {tmp_path}/{whose[:4]}; echo {answers[whose]}; done"
             super().__init__(["sh", "-c", echo])

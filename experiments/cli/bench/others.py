@@ -218,10 +218,10 @@ def release(
         dtype: What both compute in; the release by torch's automatic mixed precision.
         out: Directory for the record.
     """
-    from experiments.bench.against_release import RELEASED, time_against_release
+    from experiments.bench.against_release import RELEASE_STAGES, time_against_release
 
     require(min(turns, batch) >= 1, "--turns and --batch must be at least 1")
-    names = stages or tuple(RELEASED)
+    names = stages or tuple(RELEASE_STAGES)
     with step(f"time {len(names)} stages beside the release") as update:
         found, ratios = time_against_release(
             checkout, python, names, turns, lambda what, turn: update(turn, turns, what), rows=batch, dtype=dtype
