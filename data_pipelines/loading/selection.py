@@ -7,7 +7,7 @@ from typing import Literal
 
 from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sampling.mixture import Mixture, make_mixture
-from data_pipelines.sampling.order import ORDER
+from data_pipelines.sampling.order import ORDER_VERSION
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.windows import WindowSet, require_windows, train_windows
 from hma_jax.config import require
@@ -33,7 +33,7 @@ class LoaderConfig:
     shuffle_actions: bool = False  # control: actions of another episode
     rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
     weighed: Weighed = "used"
-    order: int = ORDER  # of this program; said, so that no run goes on in another order
+    order: int = ORDER_VERSION  # part of the config, so that no run is continued in another order
 
     def __post_init__(self):
         require(self.frames >= 1, f"loader.frames must be at least 1, got {self.frames}")

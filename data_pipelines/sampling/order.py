@@ -1,8 +1,8 @@
 """Seeded order as a pure function of position: hashes, seeds and an endless shuffle.
 
-Owns every pseudo-random choice of the data path but the mixture's (`draws`). No generator is advanced
-anywhere and nothing is kept, so any position can be asked for at any time, in any process, at the same
-cost, and gives the same answer. Numbers may be arrays, which broadcast: a batch is one call.
+Owns every pseudo-random choice of the data path except the mixture's (`draws`). There is no generator and no state,
+so any position can be computed at any time, in any process, at the same cost and with the same result. Arguments
+may be arrays, which broadcast: a batch takes one call.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import hashlib
 import numpy as np
 
 ENDLESS = 1 << 40
-"""Length that an endless source states: more draws than any run makes, yet small enough for
-the sums that grain does with lengths."""
+"""The length that an endless data source reports to grain: more draws than any run makes, yet small enough for the
+sums that grain computes with lengths."""
 
 ROUNDS = 16
-"""Of the cipher, half of them for each half of the bits: with eight, not all permutations of five things are
-nearly as likely yet; large sizes need fewer."""
+"""Rounds of the Feistel cipher, half of them for each half of the bits. With eight, permutations of five items are not
+yet nearly equally likely; large sizes need fewer rounds."""
 
-ORDER = 2
-"""Of the algorithms here and in `draws`: a run made in one order does not continue in another. 1 was grain's
-mixture, a fixed cycle."""
+ORDER_VERSION = 2
+"""Version of the algorithms here and in `draws`. A run that began with one version does not continue with another.
+Version 1 was grain's mixture, a fixed cycle."""
 
 
 def stream_seed(*parts: str | int) -> int:

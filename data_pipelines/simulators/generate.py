@@ -33,8 +33,8 @@ from data_pipelines.sources.rlds.writer import VERSION
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.locks import Held
 
-GENERATOR = 1
-"""Raise it when simulation, behaviour, drawing or encoding change: older datasets are then told apart
+GENERATOR_VERSION = 1
+"""Raise it when simulation, behaviour, rendering or encoding change: datasets of older versions are then recognised
 (`made_by_other_versions`)."""
 
 JOB_EPISODES = 10
@@ -46,7 +46,7 @@ Progress = Callable[[str, int, int], None]
 
 def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
     """Hash of everything the bytes of this dataset depend on."""
-    text = repr((GENERATOR, spec, episodes, size, seed, package_versions(spec), gl_backend()))
+    text = repr((GENERATOR_VERSION, spec, episodes, size, seed, package_versions(spec), gl_backend()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -239,7 +239,7 @@ class _Run:
             self.staging(spec.name),
             episodes=self.episodes,
             size=self.size,
-            metadata={FINGERPRINT: self.fingerprints[spec.name], "generator": GENERATOR, "seed": self.seed},
+            metadata={FINGERPRINT: self.fingerprints[spec.name], "generator": GENERATOR_VERSION, "seed": self.seed},
         )
 
     def count(self, name: str, episodes: int) -> None:

@@ -24,8 +24,8 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import write_dataset
 from hma_jax.config import ConfigError, require
 
-GENERATOR = 8
-"""Raise it when simulation, rendering or encoding change: older datasets are then remade."""
+GENERATOR_VERSION = 8
+"""Raise it when simulation, rendering or encoding change: datasets of older versions are then made again."""
 
 MIN_EPISODES = 8
 """Training episodes of the smallest datasets, at any scale, unless `fewest` says otherwise."""
@@ -61,7 +61,7 @@ def fingerprint(
     spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION, fewest: int = MIN_EPISODES
 ) -> str:
     """Hash of everything the bytes of this dataset depend on."""
-    text = repr((GENERATOR, spec, episode_count(spec, scale, fewest), validation, seed))
+    text = repr((GENERATOR_VERSION, spec, episode_count(spec, scale, fewest), validation, seed))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -162,6 +162,6 @@ def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewes
             lock.scratch,
             episodes={"train": episode_count(spec, scale, fewest), "val": validation},
             seed=seed,
-            metadata={FINGERPRINT: expected, "generator": GENERATOR, "seed": seed, "family": spec.family},
+            metadata={FINGERPRINT: expected, "generator": GENERATOR_VERSION, "seed": seed, "family": spec.family},
         )
         publish(lock.scratch, final)

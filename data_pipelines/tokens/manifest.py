@@ -1,8 +1,8 @@
 """The manifest of one tokenised dataset: what it was made from, how, and what it holds.
 
-Owns the facts and their files: `manifest.json`, and `episodes.columns` for what there is an entry of
-per episode, which is read when it is used. It holds no path and no time, so tokenising the same data in
-the same way gives the same manifest, and its hash identifies the data of a run.
+Owns its two files: `manifest.json`, and `episodes.columns` with the columns that have an entry per episode, which
+are read on use. A manifest holds no path and no time, so tokenising the same data in the same way gives the same
+manifest, and its hash identifies the data of a run.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from hma_jax.model.embodiments import Embodiment
 FILE = "manifest.json"
 SPLITS = ("train", "val")
 COLUMNS_FILE = "episodes.columns"
-LISTS = ("episodes", "steps")
-"""Columns with an entry per episode: up to millions, so no code looks at them one by one."""
+EPISODE_COLUMNS = ("episodes", "steps")
+"""Columns of `SplitFacts` with an entry per episode: up to millions, so no code loops over them."""
 
-LATER = (
+ADDED_FIELDS = (
     ("spec", "rate", None),
     ("spec", "angles", []),
     ("spec", "angle_form", "as_recorded"),
@@ -45,14 +45,16 @@ LATER = (
     ("spec", "val_split", ""),
     ("settings", "max_val_fraction", 0.5),
 )
-"""Fields that stores of earlier versions lack, and what holds for those: their hash stays what it was."""
+"""Fields that were added to the format, with the value that holds for older stores. A field that has this value is left
+out of the file and of the hash, so that older stores keep their hash."""
 
-RECIPE = 1
-"""Raise it when a change to the code alters what `tokenize_job` stores of the same source: tokens of an earlier
-number are then refused where new ones are asked for."""
+RECIPE_VERSION = 1
+"""Raise it when a change to the code alters what `tokenize_job` stores of the same source: tokens of an older version
+are then refused where new ones are asked for."""
 
-FORMAT, READ = 3, (2, 3)
-"""Of the store's layout, and those that are read. 1 had one file per split, 2 the columns as JSON."""
+FORMAT_VERSION, READABLE_FORMATS = 3, (2, 3)
+"""The version of the store's layout, and those that can be read. Version 1 had one file per split, 2 the columns as
+JSON."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class JobSettings:
     max_val: int = MAX_VAL
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
-    # Of a dataset, whatever min_val says. Stores of earlier versions do not say it, and had this (`LATER`).
+    # Limits min_val too. The default is that of older stores (`ADDED_FIELDS`), not of new ones (`MAX_VAL_FRACTION`).
     max_val_fraction: float = 0.5
 
     def __post_init__(self):
@@ -104,7 +106,7 @@ class SplitFacts:
     parts: tuple[int, ...] = ()  # episodes in each part; there is no file for 0
 
     def __post_init__(self):
-        for name in LISTS:
+        for name in EPISODE_COLUMNS:
             values = getattr(self, name)
             if len(values) and not isinstance(values, Column):
                 object.__setattr__(self, name, Column(values))
@@ -142,8 +144,8 @@ class Manifest:
     action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
     skipped: tuple[SkippedEpisodes, ...] = ()  # what was left out
     runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
-    recipe: int = 1  # RECIPE of the code that made it; 1 for stores that do not say
-    format: int = FORMAT
+    recipe: int = 1  # RECIPE_VERSION of the code that made it; 1 where the file does not say
+    format: int = FORMAT_VERSION
 
     def stride_at(self, rate: float | None = FRAME_RATE) -> int:
         """Native frames per model frame at `rate` Hz (None: native). ConfigError if such frames are not stored."""
@@ -171,9 +173,9 @@ class Manifest:
         require(name in SPLITS, f"split must be 'train' or 'val', got {name!r}")
         return self.train if name == "train" else self.val
 
-    def _without_lists(self) -> Manifest:
-        """Small, however many episodes there are."""
-        empty = dict.fromkeys(LISTS, ())
+    def _without_episodes(self) -> Manifest:
+        """This manifest without the columns that have an entry per episode."""
+        empty = dict.fromkeys(EPISODE_COLUMNS, ())
         return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
     def embodiment(
@@ -233,24 +235,24 @@ class Manifest:
         return stable_hash([self._facts(), list(self._digests().values())])
 
     def _facts(self) -> dict[str, Any]:
-        """All but the columns, as plain JSON. What earlier versions did not write is left out where it says
-        nothing: the hash of a store made by them stays what it was."""
-        values = to_dict(self._without_lists())
+        """All but the episode columns, as plain JSON. Fields that older versions did not write are left out where they
+        have their default: the hash of older stores stays the same."""
+        values = to_dict(self._without_episodes())
         for name in ("runs", "action_quantiles"):
             if not values[name]:
                 del values[name]
         if values["recipe"] == 1:
             del values["recipe"]
-        for group, field, as_before in LATER:
-            if values[group][field] == as_before:
+        for group, field, default in ADDED_FIELDS:
+            if values[group][field] == default:
                 del values[group][field]
         return values
 
     def _columns(self) -> dict[str, Column]:
-        return {f"{s}.{name}": getattr(self.split(s), name) or Column() for s in SPLITS for name in LISTS}
+        return {f"{s}.{name}": getattr(self.split(s), name) or Column() for s in SPLITS for name in EPISODE_COLUMNS}
 
     def _digests(self) -> dict[str, str]:
-        """SHA-256 of each column, in the width that its format has."""
+        """SHA-256 of each column; format 2 hashed 64-bit integers."""
         columns = self._columns()
         if self.format == 2:
             columns = {name: Column(np.asarray(values), "<i8") for name, values in columns.items()}
@@ -263,7 +265,7 @@ class Manifest:
         os.replace(scratch / COLUMNS_FILE, directory / COLUMNS_FILE)
         values = self._facts() | {"columns": self._digests()}
         for split in SPLITS:
-            values[split] = {k: v for k, v in values[split].items() if k not in LISTS}
+            values[split] = {k: v for k, v in values[split].items() if k not in EPISODE_COLUMNS}
         lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]
         with open(scratch / FILE, "w") as out:
             out.write("{\n" + ",\n".join(lines) + "\n}\n")

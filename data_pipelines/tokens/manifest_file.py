@@ -1,4 +1,4 @@
-"""Reading a manifest from its files: of today's format, or of the one before."""
+"""Reading a manifest from its files, of the current format or the previous one."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ import numpy as np
 from data_pipelines.columns import Column, Columns
 from data_pipelines.errors import DataError
 from data_pipelines.names import truncate
-from data_pipelines.tokens.manifest import COLUMNS_FILE, LISTS, READ, SPLITS, Manifest
+from data_pipelines.tokens.manifest import COLUMNS_FILE, EPISODE_COLUMNS, READABLE_FORMATS, SPLITS, Manifest
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict
 
 
 def load_manifest(path: Path) -> Manifest:
-    """Reads a manifest of this format or the one before, whose columns lie in its JSON.
+    """Reads a manifest of the current format, or of the previous one, whose columns are in its JSON.
 
     Raises DataError if it is missing, damaged or of another format.
     """
     advice = "Remove the dataset from the store and tokenise it again."
     try:
         values = json.loads(path.read_text())
-        if values.get("format") not in READ:
+        if values.get("format") not in READABLE_FORMATS:
             raise DataError(
-                f"{path}: manifest format {values.get('format')!r}; this reads {' and '.join(map(str, READ))}. {advice}"
+                f"{path}: manifest format {values.get('format')!r}; this reads {' and '.join(map(str, READABLE_FORMATS))}. {advice}"
             )
         take = _from_json if values["format"] == 2 else _from_file
-        lists = take(path, values)
+        columns_by_split = take(path, values)
         manifest = from_dict(Manifest, values)
         manifest.check()
-        return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
+        return replace(manifest, **{s: replace(manifest.split(s), **columns_by_split[s]) for s in SPLITS})
     except OSError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
     except (ValueError, AttributeError, TypeError, KeyError, OverflowError, RecursionError) as error:
@@ -43,28 +43,28 @@ def load_manifest(path: Path) -> Manifest:
         raise DataError(f"{path}: the manifest is damaged ({truncate(error)}). {advice}") from error
 
 
-Lists = dict[str, dict[str, Sequence[int]]]
-"""Columns by split and name."""
+EpisodeColumns = dict[str, dict[str, Sequence[int]]]
+"""Columns with an entry per episode, by split and name."""
 
 
-def _from_json(path: Path, values: dict[str, Any]) -> Lists:
+def _from_json(path: Path, values: dict[str, Any]) -> EpisodeColumns:
     """Takes the columns out of a manifest of format 2."""
     del path
-    return {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in LISTS} for s in SPLITS}
+    return {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in EPISODE_COLUMNS} for s in SPLITS}
 
 
-def _from_file(path: Path, values: dict[str, Any]) -> Lists:
+def _from_file(path: Path, values: dict[str, Any]) -> EpisodeColumns:
     """The columns beside a manifest, which says what they are."""
     stated = values.pop("columns")
     columns = Columns(path.with_name(COLUMNS_FILE))
-    lists = {s: {name: Column.of(columns, f"{s}.{name}") for name in LISTS} for s in SPLITS}
-    for split, by_name in lists.items():
+    columns_by_split = {s: {name: Column.of(columns, f"{s}.{name}") for name in EPISODE_COLUMNS} for s in SPLITS}
+    for split, by_name in columns_by_split.items():
         for name, column in by_name.items():
             if stated[f"{split}.{name}"] != column.digest():
                 raise ValueError(f"{columns.path.name} is not the one it was written with")
             if len(column) != sum(values[split]["parts"]):
                 raise ValueError(f"{split}.{name} has {len(column)} entries, not one per episode")
-    return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in lists.items()}
+    return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in columns_by_split.items()}
 
 
 def _integers(values: list, name: str) -> Sequence[int]:

@@ -29,7 +29,7 @@ from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts,
 from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
-    RECIPE,
+    RECIPE_VERSION,
     JobSettings,
     Manifest,
     SkippedEpisodes,
@@ -137,7 +137,7 @@ def plan_dataset(
         train=SplitFacts(),
         val=SplitFacts(),
         runs=source.runs,
-        recipe=RECIPE,
+        recipe=RECIPE_VERSION,
     )
 
 

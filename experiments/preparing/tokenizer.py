@@ -64,7 +64,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
     of where a dataset's frames are.
     """
-    from data_pipelines.sampling.order import ORDER
+    from data_pipelines.sampling.order import ORDER_VERSION
 
     settings = study.store
     data = {
@@ -80,7 +80,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
         "tokenizer_train": to_dict(study.tokenizer_train),
         "store": {name: getattr(settings, name) for name in HELD_OUT},
         "tau": study.tau,
-        "order": ORDER,
+        "order": ORDER_VERSION,
         "datasets": list(data),
         "data": data,
     }

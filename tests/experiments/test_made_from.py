@@ -269,10 +269,12 @@ def test_tokenizer_and_windows_copied_to_another_place_are_those_of_the_study(hm
 
 def test_tokens_that_earlier_code_would_make_otherwise_are_refused_and_stay(hma, out, monkeypatch):
     before = contents(out)
-    monkeypatch.setattr(tokenize_job, "RECIPE", tokenize_job.RECIPE + 1)
+    monkeypatch.setattr(tokenize_job, "RECIPE_VERSION", tokenize_job.RECIPE_VERSION + 1)
     code, said = hma("tokenize")
-    assert code == 2 and f"recipe: {tokenize_job.RECIPE - 1} -> {tokenize_job.RECIPE} ({ARM.name}" in " ".join(
-        said.split()
+    assert (
+        code == 2
+        and f"recipe: {tokenize_job.RECIPE_VERSION - 1} -> {tokenize_job.RECIPE_VERSION} ({ARM.name}"
+        in " ".join(said.split())
     )
     assert "--replace tokens" in said and contents(out) == before
     assert hma("tokenize", "--replace", "tokens")[0] == 0 and hma("tokenize")[0] == 0
@@ -334,7 +336,7 @@ def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp
 def test_a_suite_of_an_earlier_simulator_stays_in_use_and_says_so(suite, tmp_path, capsys, monkeypatch):
     out = shutil.copytree(suite, tmp_path / "out")
     before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]
-    monkeypatch.setattr(suite_generator, "GENERATOR", suite_generator.GENERATOR + 1)
+    monkeypatch.setattr(suite_generator, "GENERATOR_VERSION", suite_generator.GENERATOR_VERSION + 1)
     assert main(command) == 0
     assert "made by an earlier version of the simulator" in " ".join(capsys.readouterr().out.split())
     assert contents(out) == before

@@ -195,7 +195,7 @@ def test_a_dataset_of_other_settings_or_of_others_is_not_replaced(tmp_path, fake
 def test_a_dataset_of_another_generator_is_made_again(tmp_path, fake, monkeypatch):
     run(tmp_path)
     fake.made.clear()
-    monkeypatch.setattr(generate, "GENERATOR", generate.GENERATOR + 1)
+    monkeypatch.setattr(generate, "GENERATOR_VERSION", generate.GENERATOR_VERSION + 1)
     run(tmp_path)
     assert len(fake.made) == 12
 

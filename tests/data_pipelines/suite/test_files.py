@@ -210,7 +210,7 @@ def test_only_what_is_missing_stale_or_damaged_is_made(tmp_path, monkeypatch):
     assert run() == [NAMES[0]]
     assert contents(tmp_path) == before
     assert run(seed=3) == sorted(NAMES[:2])
-    monkeypatch.setattr(generate, "GENERATOR", generate.GENERATOR + 1)
+    monkeypatch.setattr(generate, "GENERATOR_VERSION", generate.GENERATOR_VERSION + 1)
     assert run(seed=3) == sorted(NAMES[:2])
 
 
