@@ -164,14 +164,14 @@ def empty(demonstration) -> None:
         demonstration[name] = nothing
 
 
-def test_held_out_episodes_that_are_all_lost_are_told_as_such(tmp_path):
+def test_held_out_episodes_that_were_all_skipped_are_told_as_such(tmp_path):
     """As where a small part of a large dataset was fetched: the present ones are not too few, but held in."""
     directory = write_rlds(tmp_path, SPEC, [6] * 60, shards=60)
     held = np.flatnonzero(held_out(SPEC.name, RldsDataset(directory).ids))
     for number in held:
         next(directory.glob(f"*-{number:05d}-of-00060")).unlink()
     with pytest.raises(
-        DataError, match="the 3 of its 60 that are held out are all lost; val_fraction=0.05, min_val=2 and"
+        DataError, match="the 3 of its 60 that are held out were all skipped; val_fraction=0.05, min_val=2 and"
     ):
         make_frame_loader([(SPEC, directory)], 8, 4, 0, split="val", corrupt="skip")
 

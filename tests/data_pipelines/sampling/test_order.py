@@ -63,7 +63,7 @@ def test_a_draw_costs_the_same_whatever_the_number_and_size_of_datasets():
 
 
 def test_order_does_not_change_between_releases():
-    """Changing these numbers changes the data of every run: `ORDER_VERSION` changes with them, so that none is resumed."""
+    """Changing these numbers changes the data of every run, so `ORDER_VERSION` changes with them."""
     assert stream_seed(0, "order", "arm") == 2219857017995254801
     assert hash64(np.arange(2), 5).tolist() == [13168350753275463132, 7134611160154358618]
     assert endless_shuffle(np.arange(10), 10, 0).tolist() == [0, 2, 4, 6, 1, 7, 9, 3, 8, 5]
