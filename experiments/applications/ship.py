@@ -196,7 +196,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="directory that is replaced")
-    parser.add_argument("--unmask-steps", type=int, default=DEFAULT_DECODE.unmask_steps, help="looks at a frame")
+    parser.add_argument("--unmask-steps", type=int, default=DEFAULT_DECODE.unmask_steps, help="passes over a frame")
     parser.add_argument("--temperature", type=float, default=DEFAULT_DECODE.temperature, help="of drawing tokens")
     args = parser.parse_args()
     decode = replace(DEFAULT_DECODE, unmask_steps=args.unmask_steps, temperature=args.temperature)

@@ -93,7 +93,9 @@ class EvalConfig:
     # Continuous tokens: the mean of each diffusion step, not a draw.
     decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
     random_actions: int = 5  # draws for delta PSNR
-    other_actions: int = 15  # of other episodes, that the true ones are told from; 0: neither action-nats nor retrieval
+    other_actions: int = (
+        15  # sequences of other episodes, compared with the true one; 0: neither action-nats nor retrieval
+    )
     batch: int = 32  # windows at a time
     perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
     lpips: bool = False  # also by LPIPS over AlexNet, whose weights are the extra `lpips`; images of 31 pixels or more

@@ -101,8 +101,8 @@ class ModelConfig:
     # to it then arrives through temporal attention) or the one that led to it (`causal`).
     action_alignment: Literal["released", "causal"] = "released"
     action_heads: bool = True  # what predicts actions; forward dynamics does without
-    # What stands at a masked token: one learned vector and, where `recall`, what was there in the frame before, so that
-    # the first block already sees what is to move. DIFFERS: the release has the vector alone.
+    # Masked tokens are embedded as one learned vector and, with `recall`, the embedding of the same token a frame
+    # earlier as well. DIFFERS: the release has the vector alone.
     recall: bool = False
     # A token's factors are drawn one after the other, each given those before it. DIFFERS: the release draws them as if
     # independent, so that where two tokens are likely it may show a third, made of a piece of each.

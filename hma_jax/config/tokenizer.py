@@ -1,4 +1,4 @@
-"""The tokenizers: the one that is trained here and how, two pretrained ones, and pixels."""
+"""The tokenizer that is trained here, and its training."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class MaskingConfig:
     # Continuous variant: mask whole patches. DIFFERS: the release masks single cells, so that
     # patches are partly masked in training and never at inference; `cell` is as released.
     mask_unit: Literal["patch", "cell"] = "patch"
-    # Masked frames are predicted from the true frames before them, as when frames are generated. DIFFERS: the release
+    # Masked frames are predicted from the true frames before them, as in generation. DIFFERS: the release
     # masks all frames of a window in one pass, so that each is predicted from masked ones. A step passes over every
     # frame twice; docs/models.md shows when that pays.
     teacher_forcing: bool = False
@@ -129,8 +129,8 @@ class MaskingConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    # At the muP base width. DIFFERS: the release multiplies what it is told by batch / 64, between 1 and 8; here the
-    # rate is what is said, so that runs of several batch sizes say what differs.
+    # At the muP base width. DIFFERS: the release multiplies the configured rate by batch / 64, between 1 and 8; here
+    # it is used as configured.
     learning_rate: float = 1e-4
     schedule: Literal["constant", "cosine", "wsd"] = "constant"  # of the learning rate, after the warmup
     warmup_steps: int = 500  # over which the learning rate rises from 0

@@ -1,1 +1,1 @@
-"""Checks of a model rather than of code: the coordinate check of muP."""
+"""Diagnostics of models: the coordinate check of muP, and the matrix products that a program computes."""

@@ -67,12 +67,12 @@ def evaluate(
 ) -> Evaluation:
     """Applies the protocol to `batches`, equal in shape.
 
-    A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
-    and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is
-    what the model was trained for. `progress` is called with the number of windows done so far. With several processes
+    A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's) and valid
+    (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the
+    model was trained for. `progress` is called with the number of windows done so far. With several processes
     (`runtime.processes`) all call this with the same batches, and each gets the whole result. A model that was trained
     for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for a model
-    whose predictions are not finite, or as `lpips.load_lpips`.
+    whose predictions are not finite, or as `make_predictor` and `lpips.load_lpips`.
     """
     mesh = make_mesh(execution.mesh)
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)

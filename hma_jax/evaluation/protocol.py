@@ -92,7 +92,8 @@ def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) 
 
 
 def action_statistics(batch: Batch, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
-    """(mean, std) of each window's actions, [B, U] each, the same for every model."""
+    """(mean, std) of each window's actions, [B, U] each: those in the batch, which are the same for every model, or
+    else the table's."""
     if "action_mean" in batch:
         return batch["action_mean"], batch["action_std"]
     return table_statistics(batch["embodiment"], table)
@@ -233,8 +234,9 @@ def _after_recorded(
 def _likelihood(
     model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array, real_BT: jax.Array | None
 ) -> dict[str, jax.Array]:
-    """Per window [B]: what `out` says of the true tokens. DIFFERS: accuracy is that of the likeliest ids of the wholly
-    masked frame; the release's is that of the ids after all unmasking steps (reference section 6.3)."""
+    """Per window [B]: how well the predictions `out` fit the true tokens. DIFFERS: accuracy is that of the likeliest
+    ids of the wholly masked frame; the release's is that of the ids after all unmasking steps (reference section
+    6.3)."""
     if model.config.diffusion:
         return {"diffusion_loss": mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)}
     guess = compose(model.frame_head.decode_factors(out, choose_likeliest)[0], model.config.factor_vocab)

@@ -1,9 +1,8 @@
-"""Whole rollouts in one compiled call, and the oracle they must equal.
+"""Whole rollouts in one compiled call, and a naive implementation that they must equal.
 
-`rollout` costs one pass over the prompt; while the window fills, M + 1 one-frame passes per new
-frame; when it slides, one window pass and M - 1 one-frame passes, where the release runs the
-whole window M times per frame. `rollout_naive` does it the release's way. How a frame is filled
-is `decoding`'s business; everything here serves both variants.
+`rollout` costs one pass over the prompt; while the window fills, M + 1 one-frame passes per new frame; when it slides,
+one window pass and M - 1 one-frame passes, where the release runs the whole window M times per frame. `rollout_naive`
+does it the release's way. How a frame is decoded is in `decoding`; everything here serves both variants.
 """
 
 from __future__ import annotations
@@ -56,8 +55,8 @@ def rollout(
     longer prompt the last T - 1 frames are seen. The sequences of one example may differ from the
     chunk of the last prompt frame on; what comes before is read from the first sequence and
     computed once. All R sequences use the same random numbers (a function of the example's key
-    and the frame), so a difference between them is the actions' doing. `hidden_BT` marks recorded
-    chunks that the model is not shown; which it was trained without, says `objective.masking.hidden_at_inference`.
+    and the frame), so that they differ by their actions alone. `hidden_BT` marks chunks
+    that the model is not shown: those that it was trained without (`objective.masking.hidden_at_inference`).
     Raises ConfigError for shapes that do not fit the model or each other.
     """
     _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, hidden_BT)

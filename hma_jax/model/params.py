@@ -29,12 +29,12 @@ Params = Any
 """A nested dict of arrays, the structure of `Declared.specs`."""
 
 Role = Literal["hidden", "input", "output", "vector"]
-"""What width does to a parameter (muP): `hidden` has two axes that grow with width, `input`
-and `output` one (from and to a fixed size), `vector` is a bias, a gain or an embedding."""
+"""A parameter's role in muP: `hidden` has two axes that grow with width, `input` and `output` one (from and to a fixed
+size), `vector` is a bias, a gain or an embedding."""
 
 Use = Literal["always", "actions_shown", "actions_hidden", "actions_predicted", "frames_predicted"]
-"""Which examples a parameter has to do with. In a step without one it stands still, as an absent
-robot's do: no update, no decay, no count."""
+"""Which examples a parameter is trained by. A step without one leaves it as it is, like the parameters of an absent
+robot: no update, no decay, no count."""
 
 MatrixAxes = tuple[tuple[int, ...], tuple[int, ...]]
 """The axes, counted from the last, that a `hidden` parameter maps from and to. Along others there are more such
@@ -49,7 +49,7 @@ EMBODIMENT_AXIS = "E"
 
 @dataclass(frozen=True)
 class ParamSpec:
-    """What a declaration says of one array."""
+    """The declaration of one array."""
 
     shape: tuple[int, ...]
     axes: tuple[str | None, ...]
@@ -57,7 +57,7 @@ class ParamSpec:
     decay: bool
     init: Initializer
     use: Use = "always"
-    precise: bool = False  # used in float32, whatever type the model computes in
+    precise: bool = False  # used in float32, whatever the model's compute type
     matrix: MatrixAxes = ((-2,), (-1,))
 
     @property
@@ -179,10 +179,10 @@ class Declared:
         return jax.tree.map(describe, self.specs, *given, is_leaf=is_spec)
 
     def merge(self, params: Params) -> nnx.Module:
-        """The module around `params`; call it inside the traced function.
+        """The module with `params` in it; call it inside the traced function.
 
-        On a mesh, what a module has once goes to its layout for computing here; what every layer has goes
-        there inside the loop over layers (`layer_for_compute`), and what every robot has with the examples.
+        On a mesh, parameters without a layer or embodiment axis go to their compute layout here; those of layers do so
+        inside the loop over layers (`layer_for_compute`), and those of robots with the examples (`kernels.dense`).
         """
         specs = nnx.traversals.flatten_mapping(self.specs)
         flat = {
@@ -220,8 +220,8 @@ def is_spec(leaf: Any) -> bool:
 
 
 def layer_for_compute(layer: nnx.State, dtype: jnp.dtype) -> nnx.State:
-    """One layer's slices of stacked parameters as they are computed with on the current mesh: matrices are sent
-    in `dtype`, which they would be cast to anyway. Without a mesh, `layer`."""
+    """One layer's slices of stacked parameters, in their compute layout on the current mesh. Matrices are communicated
+    in `dtype`, which they would be cast to anyway. Without a mesh, `layer` itself."""
     if not is_split():
         return layer
 
@@ -263,7 +263,7 @@ def require_params(declared: Declared, params: Params, what: str) -> None:
 
 
 def path_name(path: tuple[Any, ...]) -> str:
-    """'trunk/blocks/spatial/qkv' from a jax key path."""
+    """'trunk/blocks/space/qkv' from a jax key path."""
     return "/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path)
 
 

@@ -25,7 +25,7 @@ from hma_jax.objective.process import Process, multistep
 Network = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-# --- What the network says -------------------------------------------------------------------
+# --- The network's outputs -------------------------------------------------------------------
 
 
 def _at(table: np.ndarray, t: jax.Array) -> jax.Array:

@@ -1,9 +1,9 @@
-"""A past in which things are missing or out of place, for training: what a rollout lost is to be brought back.
+"""Augments the past in training by displaced rectangles, so that a model learns to restore what a rollout lost.
 
-In a rollout an object that once came out as ground is gone from the past of all later frames. Recorded pasts never lack
-one, so that a model learns to go on without it. Here a rectangle of the past shows, for some frames on end, what stands
-elsewhere in the same frame: ground in place of an object, or an object where none is. The true frames that follow are
-still the targets.
+In a rollout, an object that was once drawn as background is missing from the past of all later frames. Recorded pasts
+never lack an object, so that a model never learns to bring one back. Here a rectangle of the past shows, for some
+consecutive frames, the content of another place in the same frame: background in place of an object, or an object where
+there is none. The true frames that follow are still the targets.
 """
 
 from __future__ import annotations

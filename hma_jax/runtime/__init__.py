@@ -1,1 +1,1 @@
-"""The machine a program runs on: devices, meshes, memory."""
+"""The machine and its operating system: devices, meshes, sharding, processes, locks, files, memory, exit codes."""

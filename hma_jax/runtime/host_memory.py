@@ -1,4 +1,4 @@
-"""How a process holds host memory: in huge pages, and it keeps what it frees for its next call.
+"""How a process holds host memory: in huge pages, and without returning freed memory to the kernel.
 
 XLA's CPU backend takes its temporary buffers anew for every call. glibc gives blocks of that
 size back to the kernel and asks for them again, and the page faults are then a third of a

@@ -197,7 +197,7 @@ def _may_be_due_to_others(error: BaseException | None) -> bool:
 
 
 def is_writer() -> bool:
-    """Whether this process writes what the program as a whole says: logs, results, lines on the screen."""
+    """Whether this is process 0, the only one that writes logs, results and terminal output."""
     return jax.process_index() == 0
 
 

@@ -1,8 +1,9 @@
 """A trained model as a simulator: pixels and a robot's raw actions in, pixels out.
 
-`simulator` is the class that programs use, `programs` what it compiles, `robots` what may be asked of a robot,
-`starts` recorded beginnings of episodes, `folder` where all of it lies on disk, `interface` what true simulators share
-with it, `environment` Gymnasium's view of both. Decoding and the window are `hma_jax.generation`'s.
+`simulator` has the class that programs use, `programs` what it compiles, `episode` the host's record of an episode,
+`robots` the commands of a robot, `starts` recorded beginnings of episodes, `folder` all of it on disk, `warm_up` what
+is compiled ahead, `interface` what true simulators share with it, `environment` Gymnasium environments of both.
+Decoding and the window are `hma_jax.generation`'s.
 """
 
 from hma_jax.simulator.episode import Snapshot

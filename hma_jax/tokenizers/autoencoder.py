@@ -1,7 +1,6 @@
 """What the trainable tokenizers share: the small network of `network`.
 
-What a token is, is up to the kinds: `lfq` makes ids, `continuous` latents. Training is
-`train`'s business, files are `io`'s.
+Subclasses decide what a token is: `lfq` makes ids, `continuous` latents. Training is in `train`, files are in `io`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ def declare_tokenizer(config: TokenizerConfig) -> Declared:
 
 
 class AutoencoderTokenizer(BaseTokenizer):
-    """Latents of the encoder and tokens are each other's functions, which the kinds say."""
+    """Encodes and decodes with `network.Autoencoder`; subclasses convert between its latents and tokens."""
 
     config_class = TokenizerConfig
 

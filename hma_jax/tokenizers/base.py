@@ -1,4 +1,4 @@
-"""What every tokenizer offers, and how images are fed through one in equal pieces.
+"""The interface of all tokenizers, and how images are passed through one in batches of one size.
 
 Code outside this package depends on `Tokenizer` alone: any model that turns frames into ids or
 latent vectors and back can stand behind it.
@@ -99,10 +99,10 @@ class Tokenizer(Protocol):
 
 
 def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int = PIECE) -> np.ndarray:
-    """`function` over consecutive pieces of exactly `size` rows; the last one is padded.
+    """Applies `function` to consecutive pieces of exactly `size` rows; the last one is padded.
 
-    One static shape means one compilation, and rounding that does not vary with the number
-    of rows: a latent near zero must not change its bit with the batch it came in.
+    One static shape means one compilation, and rounding that does not depend on the number of rows: a latent near zero
+    must not change its sign with the batch it came in.
     """
     require(len(rows) > 0, "an empty batch cannot be encoded or decoded")
     results = []
@@ -111,5 +111,5 @@ def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int
         missing = size - len(piece)
         if missing:
             piece = np.concatenate([piece, np.zeros((missing, *piece.shape[1:]), piece.dtype)])
-        results.append(function(piece))  # dispatched; the device works while the next is cut
+        results.append(function(piece))  # dispatched asynchronously: the device works while the next is sliced
     return np.concatenate([np.asarray(r) for r in results])[: len(rows)]

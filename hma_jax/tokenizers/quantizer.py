@@ -49,7 +49,7 @@ def entropies(z: jax.Array, factors: int, temperature: float) -> tuple[jax.Array
 
     A code c of a factor is assigned softly, p(c | z) ~ exp(-|z - c|^2 / temperature). Because
     codes are all sign patterns, p is a product over the channels. `uncertainty` is the
-    mean entropy of p(. | z): low when every latent is decided. `diversity` is the entropy of
+    mean entropy of p(. | z): low when every latent is close to its code. `diversity` is the entropy of
     p(.) averaged over all positions of the batch, jointly over the codes of a factor: high
     when all codes are used equally. The bonus is uncertainty - diversity, to be minimised.
     """

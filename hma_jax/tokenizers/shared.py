@@ -1,6 +1,6 @@
-"""What every tokenizer here shares: checked weights, identity, equal pieces over the devices.
+"""What every tokenizer here shares: checked weights, identity, batches of one size on each device.
 
-What a token is, and the way there and back, is up to the kinds.
+Subclasses decide what a token is, and encode and decode.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def require_images(images: np.ndarray, shape: tuple[int, int], what: str) -> Non
 
 
 class BaseTokenizer(abc.ABC):
-    """Implements `base.Tokenizer` but for the meaning of a token.
+    """Implements `base.Tokenizer`, except for `encode_fn` and `decode_fn`.
 
     `piece` images at a time go through the network on each device. With more devices a call takes
     more pieces, and each device still sees `piece` images: tokens do not depend on how many there are.
@@ -44,7 +44,7 @@ class BaseTokenizer(abc.ABC):
     kind: ClassVar[str]
     config_class: ClassVar[type]
     ignored: ClassVar[tuple[str, ...]] = ()
-    """Settings that mean nothing for this kind: they are no part of the identity."""
+    """Settings without effect on this kind, left out of its identity."""
     measured: ClassVar[tuple[str, ...]] = ()
     """Numbers beside the weights that the tokens depend on: attributes, and arguments by name."""
 
@@ -198,7 +198,7 @@ class BaseTokenizer(abc.ABC):
         return self.piece * self._mesh.size
 
     def _jit_over_devices(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:
-        """`function` compiled; every device applies it to its own rows of the batch."""
+        """`function`, jitted; every device applies it to its own rows of the batch."""
         if self._mesh.size == 1:
             return jax.jit(function)
         whole, rows = PartitionSpec(), PartitionSpec(BATCH)

@@ -88,7 +88,7 @@ class Encoder(nnx.Module):
 
 
 class TimeMixer(nnx.Module):
-    """Weighs what space and time say: sigmoid(mix_factor) is the share of time."""
+    """A weighted sum of spatial and temporal features: sigmoid(mix_factor) is the share of time."""
 
     def __init__(self):
         self.mix_factor = param((1,), (None,), zeros, role="vector", decay=False)

@@ -124,7 +124,7 @@ def tokenizer_loss(
 
 
 def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """(weighted sum, terms) that keep the codes of latents [B, S, bits] decided and all in use."""
+    """(weighted sum, terms): losses that keep latents [B, S, bits] close to their codes, and all codes in use."""
     uncertainty, diversity = entropies(z, config.factors, config.entropy_temperature)
     commit = commitment(z)
     total = config.entropy_weight * (uncertainty - diversity) + config.commitment_weight * commit

@@ -1,4 +1,4 @@
-"""A list of a checkpoint's files with their hashes, by which damage is noticed when they are read.
+"""A list of a checkpoint's files with their hashes, by which damage is detected when they are read.
 
 The list lies in the checkpoint's own directory, so that it is moved and deleted with it.
 """
@@ -77,7 +77,7 @@ def _compare(path: Path, size: int, digest: str) -> None:
 def _files(checkpoint: Path) -> Iterator[tuple[str, Path]]:
     for path in sorted(checkpoint.rglob("*")):
         name = path.relative_to(checkpoint).as_posix()
-        if path.is_file() and name not in (NAME, f".{NAME}.tmp"):
+        if path.is_file() and name != NAME:
             yield name, path
 
 
