@@ -102,7 +102,7 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
         own = table.among(robots)
         if not agree(first, own):
             require_same_windows(first, table)
-        matched[steps] = own.matched_to(first)
+        matched[steps] = own.aligned_to(first)
     half = halves(first)
     if not half.any():
         raise NotComparable("steps are chosen on other episodes than those judged, and there is one; judge more")

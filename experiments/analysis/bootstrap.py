@@ -95,7 +95,7 @@ def make_panel(points: Sequence[dict[int, WindowTable]], metric: str, robots: Se
             shared = require_same_windows(first, table)
             if len(shared) < len(chosen):
                 raise NotComparable(f"not judged in every trial: {', '.join(sorted(set(chosen) - set(shared)))}")
-            own = own.matched_to(first)
+            own = own.aligned_to(first)
         require(metric in own.metrics, f"a trial has no {metric}; it has {', '.join(own.metrics)}")
         return own.metrics[metric]
 

@@ -62,7 +62,7 @@ def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Co
     matched = {}
     for seed, table in seeds.items():
         require_same_windows(first, table)
-        matched[seed] = table.matched_to(first)
+        matched[seed] = table.aligned_to(first)
     for robot in first.datasets:
         own = {seed: table.of(robot) for seed, table in matched.items()}
         share = truth[robot].share if robot in truth else float("nan")

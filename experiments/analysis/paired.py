@@ -39,7 +39,7 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
     for robot in shared:
         try:
             of_a = a.of(robot)
-            of_b = b.of(robot).matched_to(of_a)
+            of_b = b.of(robot).aligned_to(of_a)
         except ConfigError as error:
             raise NotComparable(f"{robot}: {error}") from error
         _require_equal(of_a, of_a.frames, of_b.frames, "real frames", 0)
@@ -50,7 +50,7 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
 
 def agree(a: WindowTable, b: WindowTable) -> bool:
     """Whether both saw the same windows in the same order: quicker found out than which one differs."""
-    if not a.stands_as(b) or not np.array_equal(a.frames, b.frames):
+    if not a.has_windows_of(b) or not np.array_equal(a.frames, b.frames):
         return False
     both = TRUTH in a.metrics and TRUTH in b.metrics
     return not both or bool((np.abs(a.metrics[TRUTH] - b.metrics[TRUTH]) <= SAME).all())

@@ -80,7 +80,7 @@ def _ahead(rows: Sequence[Row], sweep: Sweep, name: str, tables: Sequence[Window
     own = [t for t in own if len(t) and {"psnr", "psnr_copy"} <= t.metrics.keys()]
     if own:
         first = own[0]
-        differences = [t.matched_to(first).metrics["psnr"] - t.matched_to(first).metrics["psnr_copy"] for t in own]
+        differences = [t.aligned_to(first).metrics["psnr"] - t.aligned_to(first).metrics["psnr_copy"] for t in own]
         stat = mean_and_sem(sum(differences) / len(differences), first.episode)
         return stat.mean, stat.sem
     psnr, copy = (_at_reference(rows, sweep, metric, name) for metric in ("psnr", "psnr_copy"))

@@ -83,7 +83,7 @@ def evaluate(
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
         for batch in batches:
-            groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, batch_ways(mesh))
+            groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, devices_per_batch(mesh))
             _check_lengths(batch, config)
             arrays = (*REQUIRED_ARRAYS, *(name for name in OPTIONAL_ARRAYS if name in batch))
             on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
@@ -98,17 +98,7 @@ def evaluate(
         for row in np.flatnonzero(batch["valid"]).tolist() if predicted is not None else ():
             own = samples.setdefault(batch["dataset"][row], [])
             if len(own) < samples_per_dataset:
-                # Read whole: rows picked on the devices would wait for the next batch.
-                real = batch["real"][row] if "real" in batch else np.ones(len(batch["images"][row]), bool)
-                clips = (batch["images"][row], np.asarray(predicted.tokens)[row])
-                random = None if predicted.random is None else hold_last_frame(np.asarray(predicted.random)[row], real)
-                other = (None, None)
-                if predicted.other is not None and batch["other_seen"][row]:
-                    other = (
-                        hold_last_frame(np.asarray(predicted.other)[row], real),
-                        hold_last_frame(batch["other_images"][row], real),
-                    )
-                own.append(Sample(*(hold_last_frame(clip, real) for clip in clips), random, *other))
+                own.append(_sample(batch, predicted, row))
         if progress is not None:
             progress(sum(map(len, tables)))
     windows = join(tables)
@@ -150,7 +140,7 @@ def make_evaluator(
         return metrics | compared, predicted
 
     def evaluate_batch(params: Params, metric_params: MetricParams, batch: dict[str, jax.Array]):
-        groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, batch_ways(mesh))
+        groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, devices_per_batch(mesh))
         return in_groups(lambda rows: evaluate_group(params, metric_params, rows), batch, groups)
 
     return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
@@ -169,14 +159,34 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
     )
 
 
+def _sample(batch: dict[str, Any], predicted: Predicted, row: int) -> Sample:
+    """One window of a batch on the host, its padding frames replaced by its last real one."""
+    real = batch["real"][row] if "real" in batch else np.ones(len(batch["images"][row]), bool)
+
+    def held(clips: Any) -> np.ndarray:
+        # Fetched whole: a row that is picked on the devices would wait for the next batch.
+        return hold_last_frame(np.asarray(clips)[row], real)
+
+    return Sample(
+        images=held(batch["images"]),
+        tokens=held(predicted.tokens),
+        random=None if predicted.random is None else held(predicted.random),
+        **(
+            {"other": held(predicted.other), "other_images": held(batch["other_images"])}
+            if predicted.other is not None and batch["other_seen"][row]
+            else {}
+        ),
+    )
+
+
 def hold_last_frame(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
     """The last n frames of a window of len(real) frames, [n, ...], with padding replaced by the last real frame."""
     first = len(real) - len(clip)
     return clip[np.minimum(np.arange(len(clip)), int(real.sum()) - 1 - first)]
 
 
-def batch_ways(mesh: Mesh) -> int:
-    """Devices that share a batch."""
+def devices_per_batch(mesh: Mesh) -> int:
+    """How many devices a batch is split over."""
     return int(np.prod([mesh.shape[axis] for axis in BATCH]))
 
 
@@ -212,7 +222,7 @@ def _on_each_device(function: Callable[..., Any], mesh: Mesh) -> Callable[..., A
 
     The compiler would not split loops over pieces of a batch by itself.
     """
-    if batch_ways(mesh) == 1:
+    if devices_per_batch(mesh) == 1:
         return function
     whole, rows = PartitionSpec(), PartitionSpec(BATCH)
     return jax.shard_map(function, mesh=mesh, in_specs=(whole, rows, rows), out_specs=rows)

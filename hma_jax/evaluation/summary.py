@@ -79,7 +79,7 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
     found = {}
     for name in shared:
         own_a = a.of(name)
-        own_b = b.of(name).matched_to(own_a)
+        own_b = b.of(name).aligned_to(own_a)
         estimates_a, estimates_b = (_estimates(x, perplexity_group) for x in (own_a, own_b))
         clusters = clusters_of(own_a.episode)
         found[name] = {

@@ -85,15 +85,15 @@ class WindowTable:
         metrics = {name: column[index] for name, column in self.metrics.items()}
         return WindowTable(self.dataset[index], self.episode[index], self.start[index], self.frames[index], metrics)
 
-    def stands_as(self, other: WindowTable) -> bool:
-        """Whether it has the windows of `other`, each once and in the same order."""
+    def has_windows_of(self, other: WindowTable) -> bool:
+        """Whether it has exactly the windows of `other`, in the same order, and none twice."""
         named = ("dataset", "episode", "start")
         return all(np.array_equal(getattr(self, n), getattr(other, n)) for n in named) and self.distinct
 
-    def matched_to(self, other: WindowTable) -> WindowTable:
+    def aligned_to(self, other: WindowTable) -> WindowTable:
         """The same windows in the order of `other`. Raises ConfigError, naming the first window that differs, if
         `other` has others, or one of them twice."""
-        if self.stands_as(other):  # as trials of one study do
+        if self.has_windows_of(other):  # as trials of one study do
             return self
         own, wanted = self.names, other.names
         at = {name: i for i, name in enumerate(own)}

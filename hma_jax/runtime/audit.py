@@ -12,7 +12,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.runtime.sharding import mesh_axes, partition, stored
+from hma_jax.runtime.sharding import mesh_axes, partition, storage_partition
 
 
 class Spec(Protocol):
@@ -63,7 +63,7 @@ def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list
     splitting = "fsdp" if mesh.shape["fsdp"] > 1 else "tensor"
     decisions = []
     for name, spec in declared.leaves().items():
-        storage = stored(spec.axes, spec.shape, mesh, config.min_shard_size)
+        storage = storage_partition(spec.axes, spec.shape, mesh, config.min_shard_size)
         ways = math.prod(mesh.shape[axis] for axis in _mesh_axes(storage))
         whole = splitting not in _mesh_axes(storage)
         reason = ""

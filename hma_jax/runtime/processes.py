@@ -163,7 +163,7 @@ def _start_watchdog(lost_after: float) -> None:
         port_text, token = broadcast_from_writer("watchdog", "").split()
         port = int(port_text)
         exchange = partial(watchdog.send_heartbeat, host.strip("[]"), port, token)
-    watchdog.watch(watchdog.Heartbeats(me, hosts, f"{host}:{port}", lost_after), exchange)
+    watchdog.start(watchdog.Heartbeats(me, hosts, f"{host}:{port}", lost_after), exchange)
 
 
 def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
@@ -174,11 +174,11 @@ def end(error: BaseException | None = None, code: int = 0, show: bool = False) -
     if jax.distributed.is_initialized() and jax.process_count() > 1:
         if error is None:
             barrier("end")
-            watchdog.finish()
+            watchdog.stop()
             return
         if show:
             traceback.print_exception(error)
-        watchdog.finish(
+        watchdog.stop(
             " ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=_may_be_due_to_others(error)
         )
         sys.stdout.flush()

@@ -1,9 +1,9 @@
-"""Two tables from logical axes to mesh axes: how arrays are stored, and how they are computed with.
+"""Two tables from logical axes to mesh axes: layouts of stored arrays, and layouts for computing.
 
-Parameters, their moments and gradients lie as `STORAGE` says, activations as `COMPUTE` does. A parameter goes
-from the one layout to the other where it is used (`for_compute`), a layer's inside the loop over layers, and
-its gradient comes back (`hma_jax.kernels.dense` for what every robot has of its own). Model code names
-logical axes at most; the mesh is made in `mesh`, decisions are printed and audited in `audit`.
+`STORAGE` is for parameters, their moments and gradients, `COMPUTE` for activations and for parameters in use. A
+parameter is moved from one layout to the other where it is used (`for_compute`; for those of layers, inside the loop
+over layers), and its gradient is moved back. `hma_jax.kernels.dense` does so for per-robot parameters. Model code names
+logical axes only; the mesh is made in `mesh`, decisions are printed and audited in `audit`.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ def find_layouts(axes: Axes, shape: tuple[int, ...], smallest: int) -> Layouts |
     if not is_split():
         return None
     mesh = jax.sharding.get_abstract_mesh()
-    return stored(axes, shape, mesh, smallest), partition(axes, shape, mesh)
+    return storage_partition(axes, shape, mesh, smallest), partition(axes, shape, mesh)
 
 
-def stored(axes: Axes, shape: tuple[int, ...], mesh: Any, smallest: int) -> PartitionSpec:
+def storage_partition(axes: Axes, shape: tuple[int, ...], mesh: Any, smallest: int) -> PartitionSpec:
     """The layout of a parameter and its moments; with fewer than `smallest` elements it is on every device."""
     if math.prod(shape) < smallest:
         return PartitionSpec(*[None] * len(shape))
@@ -94,7 +94,7 @@ def constrain(x: jax.Array, axes: Axes) -> jax.Array:
 
 
 def pinned(x: jax.Array, *split: str | tuple[str, ...] | None) -> jax.Array:
-    """x laid out so on the current mesh; along dimensions that do not divide it is whole."""
+    """x constrained to this layout on the current mesh; dimensions that do not divide stay unsplit."""
     mesh = jax.sharding.get_abstract_mesh()
     ways = [math.prod(mesh.shape[name] for name in mesh_axes(part)) for part in split]
     fitting = [part if size % n == 0 else None for part, size, n in zip(split, x.shape, ways, strict=True)]
@@ -121,13 +121,13 @@ def batch_ways() -> int:
 
 
 GATHER, SCATTER = "gather_parameters", "scatter_gradients"
-"""Names that what is sent for `for_compute` bears in a compiled program."""
+"""Scopes of the communication of `for_compute` in compiled programs."""
 
 
 def for_compute(w: jax.Array, layouts: Layouts, dtype: Any = None) -> jax.Array:
-    """w as it is computed with, from how it is stored; its gradient goes the other way.
+    """w moved from its storage layout to its compute layout; its gradient is moved back.
 
-    It is sent in `dtype` (default: its own), which is then its type; the gradient of w has the type of w.
+    w is cast to `dtype` (default: its own) before it is sent; the gradient has the original type.
     """
     return _for_compute(w, layouts, w.dtype if dtype is None else dtype, w.dtype)
 

@@ -184,14 +184,14 @@ class Watchdog:
                 self._on_failure(failure)
 
 
-def watch(heartbeats: Heartbeats, exchange: Callable[[int, Heartbeat], dict[int, Heartbeat]]) -> None:
+def start(heartbeats: Heartbeats, exchange: Callable[[int, Heartbeat], dict[int, Heartbeat]]) -> None:
     """From now on this process ends with Exit.LOST when another one is lost."""
     global _watchdog
     _delay_aborts()
     _watchdog = Watchdog(heartbeats, exchange, _exit_lost)
 
 
-def finish(error: str | None = None, *, perhaps_lost: bool = False) -> None:
+def stop(error: str | None = None, *, perhaps_lost: bool = False) -> None:
     """At the end of this process: tells the others that it is done, or why it failed.
 
     `perhaps_lost`: the error may be due to the loss of another process; the watchdog then gets the time to find which.

@@ -206,7 +206,7 @@ class Checkpoints:
         if skip_damaged:
             with writer_first("damaged checkpoints"):
                 if is_writer():
-                    self._set_damaged_aside()
+                    self._move_damaged_away()
         step = self.agree_on_latest()
         if step is None:
             raise CheckpointError(f"no checkpoint under {self.directory}")
@@ -229,7 +229,7 @@ class Checkpoints:
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
         return step, type(shapes)(**load_items(checkpoint, wanted))
 
-    def _set_damaged_aside(self) -> None:
+    def _move_damaged_away(self) -> None:
         damaged = []
         for step in reversed(list_steps(self.directory)):
             damage = find_damage(self.directory / str(step))

@@ -27,13 +27,13 @@ FLUSH_SECONDS = 30.0
 """After so long at most, files show what was written."""
 
 
-def open_log(run_dir: Path, start: int, steps: int, **how: Any) -> RunLog | Listener:
+def open_log(run_dir: Path, start: int, steps: int, **how: Any) -> RunLog | SilentLog:
     """The log of this process: only one of a program writes. Raises as `RunLog`."""
-    return RunLog(run_dir, start, steps, **how) if is_writer() else Listener(steps, how["progress"])
+    return RunLog(run_dir, start, steps, **how) if is_writer() else SilentLog(steps, how["progress"])
 
 
-class Listener:
-    """A log that writes nothing, of a process that is not the writer."""
+class SilentLog:
+    """The log of a process that is not the writer: keeps the losses, reports progress, writes nothing."""
 
     run_dir = None
 
@@ -47,7 +47,7 @@ class Listener:
             self.progress(step, self.steps, dict(values))
 
     def nothing(self, *_: Any) -> None:
-        """In place of what only the writer does."""
+        """In place of everything that only the writer does."""
 
     start_clock = discount = write_start = write_validation = flush = close = nothing
 

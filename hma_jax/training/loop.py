@@ -36,7 +36,7 @@ from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.divergence import Records, require_finite
-from hma_jax.training.log import Listener, Progress, RunLog, open_log
+from hma_jax.training.log import Progress, RunLog, SilentLog, open_log
 from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 from hma_jax.training.state import FINITE
 
@@ -215,7 +215,7 @@ def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
         raise ConfigError(f"the batches end after step {done} of {steps}; give one for every step") from None
 
 
-def _report(log: RunLog | Listener, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
+def _report(log: RunLog | SilentLog, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
     """Writes a step's metrics. Raises DivergedError, and writes nothing, if they are not finite."""
     # With as many digits as single precision has: half the bytes of a log, and nothing is lost.
     values = {name: float(str(np.float32(value))) for name, value in jax.device_get(metrics).items()}

@@ -30,7 +30,7 @@ class Presence(NamedTuple):
 
     def of(self, spec: ParamSpec) -> jax.Array:
         """Whether the step concerns a parameter: bool, and for robots' own parameters each robot's slice."""
-        return _own(spec, self.shared, self.robots)
+        return _entry_of(spec, self.shared, self.robots)
 
 
 class AdamState(NamedTuple):
@@ -154,7 +154,7 @@ def apply_update(
 
     def update(p, g, m, v, spec: ParamSpec, multiplier: float):
         # The count may be 0 before a first example; its (unused) correction must stay finite.
-        steps = jnp.maximum(_own(spec, count, count_E), 1).astype(jnp.float32)
+        steps = jnp.maximum(_entry_of(spec, count, count_E), 1).astype(jnp.float32)
         if config.matrices == "muon" and spec.role == "hidden":
             mu = MUON_MOMENTUM
             new_m, new_v = mu * m + (1 - mu) * g, v
@@ -190,7 +190,7 @@ def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active) ->
     return AdamState(first, second, new.count, count_E)
 
 
-def keep_own(grads: Params, specs: Params, trained_E: jax.Array) -> Params:
+def only_per_robot(grads: Params, specs: Params, trained_E: jax.Array) -> Params:
     """Gradients of the `trained_E` robots' own parameters; zero for everything else."""
 
     def keep(g: jax.Array, spec: ParamSpec) -> jax.Array:
@@ -199,7 +199,7 @@ def keep_own(grads: Params, specs: Params, trained_E: jax.Array) -> Params:
     return jax.tree.map(keep, grads, specs)
 
 
-def _own(spec: ParamSpec, shared: dict[Use, jax.Array], robots_E: dict[Use, jax.Array]) -> jax.Array:
+def _entry_of(spec: ParamSpec, shared: dict[Use, jax.Array], robots_E: dict[Use, jax.Array]) -> jax.Array:
     """A parameter's entry of two tables by use: of what all robots share, and of each robot's own."""
     return shared[spec.use] if spec.embodiment_axis is None else spec.along_robots(robots_E[spec.use])
 

@@ -23,9 +23,9 @@ from hma_jax.training.optimizer import (
     Presence,
     apply_update,
     clip_by_global_norm,
-    keep_own,
     learning_rate_multiplier,
     make_schedule,
+    only_per_robot,
     put_adam,
     take_adam,
 )
@@ -105,7 +105,7 @@ def make_train_step(
         rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.slice_B}
         grads, total = accumulated(own, rows, counts)
         if config.only:
-            grads = keep_own(grads, specs, jnp.asarray(trained_E)[active.robots_G])
+            grads = only_per_robot(grads, specs, jnp.asarray(trained_E)[active.robots_G])
         grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
         rate = schedule(state.step)
         leak = masking.action_leak
