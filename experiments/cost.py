@@ -103,14 +103,14 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
             flops += steps * denoiser_flops(model, frames, own_steps=False, channels=table.action_width)
     if not predicts_frames(setting):
         return flops
-    beside = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, true or masked
-    likelihood = 2 * beside
+    window_pass = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, true or masked
+    likelihood = 2 * window_pass
     if model.diffusion:
         likelihood += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
     flops += (1 + config.other_actions) * likelihood
     if config.context == "recorded":
-        flops += 2 * beside * (config.other_actions > 0)  # the likelihood once more, for decoding
-        flops += (decode.unmask_steps - 1) * beside + (frames - 1) * sampler_flops(model, decode)
+        flops += 2 * window_pass * (config.other_actions > 0)  # the likelihood once more, for decoding
+        flops += (decode.unmask_steps - 1) * window_pass + (frames - 1) * sampler_flops(model, decode)
         flops += draws * rollout_flops(model, table, decode, frames, frames - 1)
     else:
         sequences = 1 + draws + (config.other_actions > 0)
@@ -140,9 +140,9 @@ def plan_trials(
         if id in done.finished or id in done.left:
             plans[id] = TrialPlan(trial, cost, 0.0, 0.0)
             continue
-        whole = cost.flops if evaluated else cost.train_flops
-        begun = max(done.steps.get(id, 0), *(step for _, step in shared[id].before), 0) / trial.train.steps
-        flops = whole - min(begun, 1.0) * cost.train_flops
+        all_flops = cost.flops if evaluated else cost.train_flops
+        trained_share = max(done.steps.get(id, 0), *(step for _, step in shared[id].before), 0) / trial.train.steps
+        flops = all_flops - min(trained_share, 1.0) * cost.train_flops
         plans[id] = TrialPlan(trial, cost, flops, flops / (devices * study.flops_per_second) + study.trial_seconds)
     return plans
 

@@ -88,11 +88,11 @@ def _trials(
     ended = {id: events[id] for id in ids if id not in finished and events.get(id) in (FAILED, DIVERGED)}
     left = {} if retry_failed else ended
     # A trial that diverged is run anew (`runner`).
-    begun = [id for id in ids if id not in finished and id not in left and events.get(id) != DIVERGED]
-    steps = {id: newest_step(workspace.trials / id / RUN) for id in begun}
+    to_run = [id for id in ids if id not in finished and id not in left and events.get(id) != DIVERGED]
+    steps = {id: newest_step(workspace.trials / id / RUN) for id in to_run}
     if former:
         shared = share_runs(ids, former)
-        for id in begun:
+        for id in to_run:
             before = [one for one in shared[id].before if one[0] in former]
             steps[id] = steps[id] or latest_common(workspace.trials, before)[1]
     return {"finished": finished, "left": left, "steps": {id: n for id, n in steps.items() if n}}

@@ -48,9 +48,9 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
 
 def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:
     """Raises ConfigError if `place` holds results of another evaluation than `wanted`."""
-    there = read_stamp(place, STAMP)
-    if there is not None:
-        known = there.inputs | {"eval": _protocol(there.inputs.get("eval", {}))}
+    existing = read_stamp(place, STAMP)
+    if existing is not None:
+        known = existing.inputs | {"eval": _protocol(existing.inputs.get("eval", {}))}
         lines = differences(known, wanted.inputs)
     else:
         lines = _differences_of_windows(place, wanted)
@@ -74,12 +74,12 @@ def _differences_of_windows(place: Path, wanted: MadeFrom) -> list[str]:
     from hma_jax.evaluation.windows import FILE, WindowTable
 
     try:
-        there = WindowTable.load(place / FILE)
+        existing = WindowTable.load(place / FILE)
     except ConfigError:  # none, or no use
         return []
-    lines = dataset_differences(sorted(there.datasets), wanted.inputs["datasets"])
+    lines = dataset_differences(sorted(existing.datasets), wanted.inputs["datasets"])
     for name, facts in wanted.inputs["data"].items():
-        count = len(there.of(name))
+        count = len(existing.of(name))
         if count not in (0, facts["windows"]):
             lines.append(f"windows of {name}: {count} -> {facts['windows']}")
     return lines

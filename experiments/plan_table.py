@@ -89,15 +89,15 @@ def plan_table(
 
 def _describe_done(done: Done, trials: int) -> str:
     """What is not counted, since it is there."""
-    before = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
-    parts = [name for name, there in before.items() if there]
+    existing = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
+    parts = [name for name, exists in existing.items() if exists]
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
     parts += [f"{counted(sum(done.steps.values()), 'step')} of training"] if done.steps else []
-    said = f"There already, and not counted: {', '.join(parts)}. " if parts else ""
+    text = f"There already, and not counted: {', '.join(parts)}. " if parts else ""
     if done.left:
         how = " or ".join(sorted(set(done.left.values())))
-        said += f"{len(done.left)} of {trials} trials {how}: not run again, and not counted, without --retry-failed. "
-    return said
+        text += f"{len(done.left)} of {trials} trials {how}: not run again, and not counted, without --retry-failed. "
+    return text
 
 
 def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool) -> str:

@@ -122,9 +122,9 @@ def tokenizer_flops(study: Study) -> tuple[float, float]:
 def describe(cost: PreparingCost, duration: Callable[[float], str]) -> str:
     """In words; `duration` writes seconds."""
     parts = {"simulating": cost.simulating, "the tokenizer": cost.tokenizer, "tokens": cost.tokens}
-    said = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds)
+    text = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds)
     if not cost.unknown:
-        return said
+        return text
     known = cost.datasets - len(cost.unknown)
     without = f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, whose frames the registry does not say"
-    return f"{without}; {duration(cost.seconds)} with the other {known} alone ({said})" if known else without
+    return f"{without}; {duration(cost.seconds)} with the other {known} alone ({text})" if known else without

@@ -65,14 +65,14 @@ def step(title: str) -> Iterator[Update]:
         console.print(f"{title} ...")
     with _bars() as bars:
         task = bars.add_task(title, total=None, note="")
-        said = began
+        last_line = began
 
         def update(done: int, total: int, note: str = "") -> None:
-            nonlocal said
+            nonlocal last_line
             raise_pending_stop()
             bars.update(task, completed=done, total=total, note=note)
-            if not console.is_terminal and time.monotonic() - said >= SAY_EVERY:
-                said = time.monotonic()
+            if not console.is_terminal and time.monotonic() - last_line >= SAY_EVERY:
+                last_line = time.monotonic()
                 console.print(f"{title}: {done}/{total} {escape(note)}", soft_wrap=True)
 
         yield update

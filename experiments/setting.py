@@ -85,17 +85,17 @@ class StudyArguments:
 
     def words(self) -> list[str]:
         """The arguments that give this."""
-        said = []
+        words = []
         for field in fields(self):
             value = getattr(self, field.name)
             if value == field.default and field.name != "preset":
                 continue
             flag = f"--{field.name}"
             if field.name == "set":
-                said += [word for one in value for word in (flag, one)]
+                words += [word for one in value for word in (flag, one)]
             else:
-                said += [flag, *map(_word, value if isinstance(value, tuple) else (value,))]
-        return said
+                words += [flag, *map(_word, value if isinstance(value, tuple) else (value,))]
+        return words
 
 
 @dataclass(frozen=True)

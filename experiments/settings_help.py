@@ -56,11 +56,11 @@ def comments(config: type) -> dict[str, str]:
         if not isinstance(node, ast.AnnAssign):
             continue
         end = lines[node.end_lineno - 1].encode()[node.end_col_offset :].decode()
-        said, above = [end.partition("#")[2].strip()], node.lineno - 2
-        while not said[0] and lines[above].lstrip().startswith("#"):
-            said.insert(1, lines[above].lstrip(" #"))
+        parts, above = [end.partition("#")[2].strip()], node.lineno - 2
+        while not parts[0] and lines[above].lstrip().startswith("#"):
+            parts.insert(1, lines[above].lstrip(" #"))
             above -= 1
-        found[node.target.id] = re.split(r"\.(?= [A-Z]|$)", " ".join(said).strip())[0]
+        found[node.target.id] = re.split(r"\.(?= [A-Z]|$)", " ".join(parts).strip())[0]
     return found
 
 

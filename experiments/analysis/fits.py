@@ -204,8 +204,8 @@ def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
     chance = float(scipy.stats.f.sf(ratio, left, free))
     if chance >= UNLIKELY:
         return ()
-    said = f"points lie off the curve by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"
-    return (f"{said}: over the whole range the loss is not of this form",)
+    doubt = f"points lie off the curve by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"
+    return (f"{doubt}: over the whole range the loss is not of this form",)
 
 
 def _first_position(measured: Measurements, found: tuple[Coefficient, ...], weight: np.ndarray) -> tuple[str, ...]:

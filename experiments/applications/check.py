@@ -49,18 +49,18 @@ def choose_robots(
     """
     store, manifest = prepared.store, prepared.manifest
     frozen = [d.dataset for d in manifest.datasets]
-    there = [r.name for r in find_robots(run, model.table) if r.name in frozen]
-    names = list(robots) or there
-    unknown = [name for name in names if name not in there]
+    available = [r.name for r in find_robots(run, model.table) if r.name in frozen]
+    selected = list(robots) or available
+    unknown = [name for name in selected if name not in available]
     require(
-        bool(names) and not unknown,
-        f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}",
+        bool(selected) and not unknown,
+        f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(available)}",
     )
-    why = {name: short for name in names if (short := shortage(store, manifest, name, windows, out))}
-    left = [name for name in names if name not in why]
-    others = f". Nor are there enough of {few(names[1:])}" if len(names) > 1 else ""
-    require(bool(left), f"{why.get(names[0])}{others}")
-    return left, why
+    shortages = {name: short for name in selected if (short := shortage(store, manifest, name, windows, out))}
+    remaining = [name for name in selected if name not in shortages]
+    others = f". Nor are there enough of {few(selected[1:])}" if len(selected) > 1 else ""
+    require(bool(remaining), f"{shortages.get(selected[0])}{others}")
+    return remaining, shortages
 
 
 def check_run(
@@ -82,8 +82,8 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
     judged, of_all = (len({episode for episode, _ in some}) for some in (spread(frozen, windows), frozen))
     if judged >= MIN_EPISODES:
         return None
-    there = store.manifest(robot)
-    held_out, settings = len(there.val.steps), there.settings
+    token_manifest = store.manifest(robot)
+    held_out, settings = len(token_manifest.val.steps), token_manifest.settings
     if of_all >= MIN_EPISODES:
         why = (
             f"--windows {windows} takes {judged} of the {of_all} episodes that the {len(frozen)} windows there are of; "
@@ -95,10 +95,10 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
             "eval.windows_per_dataset took no more, or the others are too short. Freeze more with `hma tokenize ... "
             f"{command_words('--out', out)} --set eval.windows_per_dataset=64 --replace windows`"
         )
-    elif there.spec.val_split:
-        why = f"Its own split {there.spec.val_split} has {held_out}: leave val_split out of its entry"
+    elif token_manifest.spec.val_split:
+        why = f"Its own split {token_manifest.spec.val_split} has {held_out}: leave val_split out of its entry"
     else:
-        episodes = held_out + len(there.train.steps)
+        episodes = held_out + len(token_manifest.train.steps)
         why = (
             f"{held_out} of {episodes} are held out, by store.min_val={settings.min_val}, "
             f"store.val_fraction={settings.val_fraction:g} and at most "

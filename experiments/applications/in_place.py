@@ -132,8 +132,8 @@ def main() -> None:
     require(bool(rows), "no robot is left to look at; watch others, or a model with a shorter window")
     write_rows(args.out / TABLE, rows)
     for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
-        mine = [row for row in rows if str(row["what"]).startswith(prefix)]
-        shares = {view: in_place(mine, view) for view in VIEWS}
+        own_rows = [row for row in rows if str(row["what"]).startswith(prefix)]
+        shares = {view: in_place(own_rows, view) for view in VIEWS}
         words = [f"{view} {share:.3f} ± {half:.3f}" for view, (share, half, _) in shares.items()]
         console.print(f"{kind} that moved, in place ({shares['true'][2]} robots): {', '.join(words)}", soft_wrap=True)
     wrote(args.out / TABLE)

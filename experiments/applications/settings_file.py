@@ -68,9 +68,14 @@ def described(run: Path, simulator: Simulator, settings: Mapping[str, Any]) -> d
     """The content of the file. Runs are identified by name and a hash of their weights, robots by name and a hash of
     their descriptions."""
     robots = {name: short_hash(json.dumps(to_dict(robot)).encode()) for name, robot in sorted(simulator.robots.items())}
-    besides = {"decode": to_dict(simulator.decode), "robots": robots}
-    said = {"run": run.resolve().name, "weights": hash_of(simulator.model.params), SIMULATOR: besides, **settings}
-    return json.loads(json.dumps(said))
+    besides_weights = {"decode": to_dict(simulator.decode), "robots": robots}
+    description = {
+        "run": run.resolve().name,
+        "weights": hash_of(simulator.model.params),
+        SIMULATOR: besides_weights,
+        **settings,
+    }
+    return json.loads(json.dumps(description))
 
 
 def short_hash(content: bytes) -> str:

@@ -157,8 +157,12 @@ def keep_places(simulator: Simulator, run: Path | str) -> None:
     if (Path(run) / ROBOTS).exists() or not study.store.is_dir():
         return
     store = TokenStore(study.store)
-    told = [robot for robot in simulator.robots.values() if robot.name not in SPECS and robot.name in store.names]
-    simulator.update_robots([replace(robot, keeps=True) for robot in told if _goes_to_places(store, robot.name)])
+    recorded_robots = [
+        robot for robot in simulator.robots.values() if robot.name not in SPECS and robot.name in store.names
+    ]
+    simulator.update_robots(
+        [replace(robot, keeps=True) for robot in recorded_robots if _goes_to_places(store, robot.name)]
+    )
 
 
 def _goes_to_places(store: TokenStore, name: str) -> bool:

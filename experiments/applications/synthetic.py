@@ -301,7 +301,7 @@ def main() -> None:
             path = trials_dir / f"{i}-{seed}.json"
             if not path.exists():
                 note = f"{CONDITIONS[i].name}, seed {seed}{eta(n, len(jobs))}"
-                report = lambda done, total, said, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {said}")
+                report = lambda done, total, loss, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {loss}")
                 write_file(path, json.dumps(run_trial(source, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)

@@ -132,12 +132,12 @@ def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
             colours = COLOURS["perplexity"], COLOURS["delta_psnr"], DEFAULT  # for as many kinds as SAMPLER_STEPS has
             looks = colours[: len(kinds)], (5, -12, 12)[: len(kinds)]
             for kind, colour, lift in zip(kinds, *looks, strict=True):
-                ours = [r for r in rows if r.decoding.split()[0] == kind]
-                time, value, sem = ([getattr(r, f) for r in ours] for f in (cost, metric, f"{metric}_sem"))
+                points = [r for r in rows if r.decoding.split()[0] == kind]
+                time, value, sem = ([getattr(r, f) for r in points] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(
                     time, value, sem, color=colour, marker="o", markersize=4, linewidth=1.2, capsize=2, label=kind
                 )
-                for row in ours:
+                for row in points:
                     steps = row.decoding.split()[-1]
                     at = (getattr(row, cost), getattr(row, metric))
                     panel.annotate(steps, at, xytext=(4, lift), textcoords="offset points", fontsize=7.5)

@@ -35,9 +35,9 @@ class RunningArguments:
 
     def words(self) -> list[str]:
         """The arguments that say where and how many at a time."""
-        said = [] if self.workers is None else ["--workers", str(self.workers)]
-        said += ["--launcher", self.launcher] if self.launcher != "local" else []
-        return said + [word for one in self.launcher_set for word in ("--launcher-set", one)]
+        words = [] if self.workers is None else ["--workers", str(self.workers)]
+        words += ["--launcher", self.launcher] if self.launcher != "local" else []
+        return words + [word for one in self.launcher_set for word in ("--launcher-set", one)]
 
 
 @dataclass(frozen=True)

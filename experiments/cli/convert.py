@@ -191,7 +191,7 @@ def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> Decode
     from hma_jax.simulator.folder import DECODE, find_decode
 
     found = find_decode(run) if (run / DECODE).exists() else PLAIN
-    frame, latents = ({name: x for name, x in said.items() if x is not None} for said in (frame, latents))
+    frame, latents = ({name: x for name, x in options.items() if x is not None} for options in (frame, latents))
     return replace(found, **frame, sampler=replace(found.sampler, **latents))
 
 

@@ -189,8 +189,8 @@ def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStor
 
 def require_prepared(setting: Setting) -> None:
     """Raises ConfigError, with the command that makes it, unless everything is there that evaluation reads."""
-    there = setting.workspace
-    missing = [str(p) for p in (there.store, there.tokenizer, there.manifest) if not p.exists()]
+    workspace = setting.workspace
+    missing = [str(p) for p in (workspace.store, workspace.tokenizer, workspace.manifest) if not p.exists()]
     require(not missing, f"{', '.join(missing)}: not made yet; run `{setting.command('tokenize')}`")
 
 

@@ -64,9 +64,9 @@ def _show(root: Path) -> None:
         table.add_row(*map(escape, (fitted.curve.name, ", ".join(fitted.curve.axes), *_words(fitted))))
     if numbers.isoflop is not None:
         a = numbers.isoflop.exponent
-        said = f"N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" if a else ""
+        exponent = f"N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" if a else ""
         doubts = [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
-        table.add_row("isoflop", "training FLOPs", said, "", numbers.isoflop.refused or "; ".join(doubts))
+        table.add_row("isoflop", "training FLOPs", exponent, "", numbers.isoflop.refused or "; ".join(doubts))
     console.print(table)
 
 
@@ -110,10 +110,10 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
     ledger = Ledger(workspace.ledger)
     ran = ledger.states()
     for id, state in read_states(sorted(ids), workspace.trials, ledger).items():
-        there = state.event != MISSING
-        what = f"exists already ({state.event})" if there else f"has run, says {workspace.ledger.name}"
+        exists = state.event != MISSING
+        what = f"exists already ({state.event})" if exists else f"has run, says {workspace.ledger.name}"
         require(
-            not there and id not in ran,
+            not exists and id not in ran,
             f"--predict {target}: trial {id} {what}; a prediction is made before its trial runs",
         )
     results, windows = read_results(workspace, unique_trials(sweeps, record.provenance))

@@ -92,7 +92,7 @@ def _freeze(setting: Setting) -> None:
     from experiments.preparing.tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
-    study, workspace, said = setting.study, setting.workspace, False
+    study, workspace, announced = setting.study, setting.workspace, False
     for pause in backoff():
         try:
             with workspace.locked():
@@ -103,10 +103,10 @@ def _freeze(setting: Setting) -> None:
         except Busy as busy:
             if windows_are_frozen(study, workspace):
                 return
-            if not said:
+            if not announced:
                 waiting = f"all tokens are there; waiting for the windows, or the end, of {busy.who}"
                 console.print(waiting, soft_wrap=True)
-                said = True
+                announced = True
         time.sleep(pause)
 
 

@@ -345,11 +345,11 @@ def say_data(trial: Trial, prepared: PreparedData) -> None:
 
     chosen = select_windows(prepared.store, loader_of(trial))
     used = [chosen.sets[name] for name in chosen.mixture.names]
-    there = sum(len(prepared.store.manifest(name).train.episodes) for name in trial.datasets)
+    episodes = sum(len(prepared.store.manifest(name).train.episodes) for name in trial.datasets)
     limit = "" if trial.max_trajectories is None else f" (at most {trial.max_trajectories:,} of each robot)"
     console.print(
         f"training on {len(used)} of {counted(len(trial.datasets), 'robot')}: {sum(len(s.episodes) for s in used):,} of "
-        f"{there:,} trajectories{limit}, {sum(map(len, used)):,} windows of {trial.model.frames} frames",
+        f"{episodes:,} trajectories{limit}, {sum(map(len, used)):,} windows of {trial.model.frames} frames",
         soft_wrap=True,
     )
     for name, reason in chosen.mixture.dropped.items():

@@ -36,8 +36,8 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
     prompt = study.eval.prompt_frames
     if workspace.counterfactual.exists():
         try:
-            there = CounterfactualFrames.load(workspace.counterfactual)
-            if (there.manifest, there.prompt) == (manifest.hash(), prompt):
+            existing = CounterfactualFrames.load(workspace.counterfactual)
+            if (existing.manifest, existing.prompt) == (manifest.hash(), prompt):
                 return
         except DataError:  # it follows from what is here: made again
             pass
@@ -77,8 +77,13 @@ def _of_robot(
         own.append(item.actions)
         changed.append(item.actions)
         for other in others.choose(name, episode, start, 1):
-            instead, there = store.episode(name, other.split, other.episode).actions, other.start * cut.frame_step
-            changed[-1] = np.concatenate([item.actions[: first + until], instead[there + until : there + end]])
+            other_actions, other_start = (
+                store.episode(name, other.split, other.episode).actions,
+                other.start * cut.frame_step,
+            )
+            changed[-1] = np.concatenate(
+                [item.actions[: first + until], other_actions[other_start + until : other_start + end]]
+            )
         times[row] = first + np.minimum(np.arange(cut.frames), frames - 1) * cut.stride
         real.append(frames)
         seeds.append(_seed_of(store, spec, item.episode, study.suite.seed))

@@ -66,21 +66,21 @@ class MadeFrom:
 def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
     """What the thing in `directory` was made from; None if it is not written down there, or damaged."""
     try:
-        there = from_dict(MadeFrom, json.loads((directory / name).read_text()))
-        require(all(isinstance(part, dict) for part in vars(there).values()), "not JSON values by name")
+        existing = from_dict(MadeFrom, json.loads((directory / name).read_text()))
+        require(all(isinstance(part, dict) for part in vars(existing).values()), "not JSON values by name")
     except (OSError, ValueError):  # ConfigError is a ValueError
         return None
-    moved = {name: there.recorded[name] for name in FORMERLY_RECORDED if name in there.recorded}
-    recorded = {name: value for name, value in there.recorded.items() if name not in moved}
-    return replace(there, inputs=moved | there.inputs, recorded=recorded)
+    moved = {name: existing.recorded[name] for name in FORMERLY_RECORDED if name in existing.recorded}
+    recorded = {name: value for name, value in existing.recorded.items() if name not in moved}
+    return replace(existing, inputs=moved | existing.inputs, recorded=recorded)
 
 
-def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     """Lines 'setting: old -> new' for inputs that differ. What an earlier version did not write down of a dataset is
     not compared."""
-    if there.get(ORIGIN) != wanted.get(ORIGIN):
-        return [f"{ORIGIN}: {there.get(ORIGIN)} -> {wanted.get(ORIGIN)}"]
-    old, new = dict(there), dict(wanted)
+    if existing.get(ORIGIN) != wanted.get(ORIGIN):
+        return [f"{ORIGIN}: {existing.get(ORIGIN)} -> {wanted.get(ORIGIN)}"]
+    old, new = dict(existing), dict(wanted)
     names = old.pop("datasets", []), new.pop("datasets", [])
     lines = dataset_differences(*names)
     data = old.pop("data", {}), new.pop("data", {})
@@ -90,14 +90,14 @@ def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
     return diff(old, new) + lines
 
 
-def dataset_differences(there: Sequence[str], wanted: Sequence[str]) -> list[str]:
+def dataset_differences(existing: Sequence[str], wanted: Sequence[str]) -> list[str]:
     """One line at most, which names what came and what went."""
-    if list(there) == list(wanted):
+    if list(existing) == list(wanted):
         return []
-    gone = [n for n in there if n not in wanted]
-    new = [n for n in wanted if n not in there]
+    gone = [n for n in existing if n not in wanted]
+    new = [n for n in wanted if n not in existing]
     parts = [f"without {few(gone)}"] * bool(gone) + [f"with {few(new)}"] * bool(new)
-    return [f"datasets: {len(there)} -> {len(wanted)}, {' and '.join(parts) or 'in another order'}"]
+    return [f"datasets: {len(existing)} -> {len(wanted)}, {' and '.join(parts) or 'in another order'}"]
 
 
 def may_replace(step: Step, replace: Step | None) -> bool:
@@ -124,9 +124,9 @@ def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | 
     )
 
 
-def say_recorded(what: str, place: Path, there: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def say_recorded(what: str, place: Path, existing: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Tells that something stays in use although other sources would make it now; of what both say."""
-    lines = [line for name in there.keys() & now.keys() for line in diff(there[name], now[name], name)]
+    lines = [line for name in existing.keys() & now.keys() for line in diff(existing[name], now[name], name)]
     if lines:
         say(
             f"note: {what} in {place} was made with other {'; '.join(lines)}. It stays in use; remove it to have "

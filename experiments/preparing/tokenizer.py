@@ -134,15 +134,15 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     """Whether the tokenizer that is to be trained is there. ConfigError if another one is, unless allowed."""
     if not place.exists():
         return False
-    there = read_stamp(place)
-    if there is None:
+    existing = read_stamp(place)
+    if existing is None:
         lines = ["it is not written down there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
     else:
-        lines = differences(there.inputs, made_from.inputs)
+        lines = differences(existing.inputs, made_from.inputs)
     require_same("tokenizer", place, lines, replace, f"use it as it is with --tokenizer {place}")
     if lines:
         return False
-    say_recorded("the tokenizer", place, there.recorded, made_from.recorded)
+    say_recorded("the tokenizer", place, existing.recorded, made_from.recorded)
     console.print("[green]done[/] train the tokenizer [dim](before)[/]")
     return True
 
@@ -158,8 +158,8 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
     tokenizer = load_tokenizer(source, expect=study.tokenizer)
     place, made_from = workspace.tokenizer, MadeFrom({ORIGIN: f"{GIVEN} {tokenizer.identity}"})
     if place.exists():
-        there = read_stamp(place)
-        if there == made_from:
+        existing = read_stamp(place)
+        if existing == made_from:
             return
         try:
             identity = load_tokenizer(place).identity
@@ -168,7 +168,7 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
         else:
             if identity == tokenizer.identity:  # trained here, or the very directory that is given
                 return
-            origin = there.inputs[ORIGIN] if there else "not written down"
+            origin = existing.inputs[ORIGIN] if existing else "not written down"
             lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
         require_same("tokenizer", place, lines, replace)
     _say_held_out_elsewhere(read_stamp(source), study)
@@ -182,9 +182,11 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
 def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None:
     """Of a tokenizer that was trained on datasets of the study with fewer episodes held out: those are among these."""
     inputs = trained_from.inputs if trained_from is not None else {}
-    there, here = inputs.get("store", {}), to_dict(study.store)
+    trained_with, study_settings = inputs.get("store", {}), to_dict(study.store)
     more = [
-        f"store.{name}: {there[name]} -> {here[name]}" for name in HELD_OUT if here[name] > there.get(name, math.inf)
+        f"store.{name}: {trained_with[name]} -> {study_settings[name]}"
+        for name in HELD_OUT
+        if study_settings[name] > trained_with.get(name, math.inf)
     ]
     names = [name for name in study.all_names() if name in inputs.get("data", {})]
     if names and more:

@@ -25,9 +25,9 @@ HELD_OUT = 0.25
 
 def require_same_windows(study: Study, workspace: Workspace, replace: Step | None) -> None:
     """Raises ConfigError, before anything is made, if what is known by then differs from the frozen windows."""
-    there = _frozen(workspace, replace)
-    if there is not None:
-        lines = _setting_differences(there, study.model.frames, study.rate, study.eval.seed, study.all_names())
+    existing = _frozen(workspace, replace)
+    if existing is not None:
+        lines = _setting_differences(existing, study.model.frames, study.rate, study.eval.seed, study.all_names())
         require_same("windows", workspace.manifest, lines, replace)
 
 
@@ -45,10 +45,10 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
         store, names, frames, study.eval.windows_per_dataset, study.eval.seed,
         prompt=study.eval.prompt_frames, rate=study.rate,
     )  # fmt: skip
-    there = _frozen(workspace, replace)
-    if there is None or there.hash() != manifest.hash():
-        if there is not None:
-            require_same("windows", workspace.manifest, _differences(there, manifest), replace)
+    existing = _frozen(workspace, replace)
+    if existing is None or existing.hash() != manifest.hash():
+        if existing is not None:
+            require_same("windows", workspace.manifest, _differences(existing, manifest), replace)
         manifest.save(workspace.manifest)
     summary = summarise(store, names, frames, study.rate)
     write_file(workspace.data_summary, json.dumps(summary, indent=1))
@@ -72,8 +72,8 @@ def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
     """Whether the windows that are there are those of the tokens that are there."""
     from data_pipelines.tokens.store import TokenStore
 
-    there = _frozen(workspace, None)
-    return there is not None and there.store == TokenStore(workspace.store).hash(study.all_names())
+    existing = _frozen(workspace, None)
+    return existing is not None and existing.store == TokenStore(workspace.store).hash(study.all_names())
 
 
 def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) -> None:
@@ -110,25 +110,25 @@ def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
 
 
 def _setting_differences(
-    there: EvalManifest, frames: int, rate: float | None, seed: int, names: Sequence[str]
+    existing: EvalManifest, frames: int, rate: float | None, seed: int, names: Sequence[str]
 ) -> list[str]:
-    lines = [f"model.frames: {there.frames} -> {frames}"] if there.frames != frames else []
-    lines += [f"rate: {there.rate} -> {rate}"] if there.rate != rate else []
-    lines += [f"eval.seed: {there.seed} -> {seed}"] if there.seed != seed else []
-    return lines + dataset_differences([d.dataset for d in there.datasets], sorted(names))
+    lines = [f"model.frames: {existing.frames} -> {frames}"] if existing.frames != frames else []
+    lines += [f"rate: {existing.rate} -> {rate}"] if existing.rate != rate else []
+    lines += [f"eval.seed: {existing.seed} -> {seed}"] if existing.seed != seed else []
+    return lines + dataset_differences([d.dataset for d in existing.datasets], sorted(names))
 
 
-def _differences(there: EvalManifest, wanted: EvalManifest) -> list[str]:
+def _differences(existing: EvalManifest, wanted: EvalManifest) -> list[str]:
     """In the words of --set."""
     names = [d.dataset for d in wanted.datasets]
-    lines = _setting_differences(there, wanted.frames, wanted.rate, wanted.seed, names)
-    if there.store != wanted.store and not lines:
-        lines.append(f"tokens: {there.store} -> {wanted.store}")
-    old, new = (max(len(d.windows) for d in m.datasets) for m in (there, wanted))
+    lines = _setting_differences(existing, wanted.frames, wanted.rate, wanted.seed, names)
+    if existing.store != wanted.store and not lines:
+        lines.append(f"tokens: {existing.store} -> {wanted.store}")
+    old, new = (max(len(d.windows) for d in m.datasets) for m in (existing, wanted))
     if old != new:
         lines.append(f"eval.windows_per_dataset: {old} -> {new} in the dataset with the most")
     return lines or [
-        f"windows: {there.hash()} -> {wanted.hash()}, as of another eval.prompt_frames or an earlier version, which had "
+        f"windows: {existing.hash()} -> {wanted.hash()}, as of another eval.prompt_frames or an earlier version, which had "
         "none of short episodes"
     ]
 

@@ -181,10 +181,10 @@ def _episode(d: Viewed, example: ExampleEpisode) -> str:
     if example.success is not None:
         words.append("success" if example.success else "failure")
     text = " ".join(example.instruction.split())
-    said = f"<p>“{html.escape(text[:160])}{'…' if len(text) > 160 else ''}”</p>" if text else ""
+    instruction = f"<p>“{html.escape(text[:160])}{'…' if len(text) > 160 else ''}”</p>" if text else ""
     drawn = "".join(_curves(field, example) for field in chosen_actions(d.facts, d.entry))
     pictures = "".join(clips[:1]) + f"<div class=clips>{''.join(clips[1:])}</div>"
-    return f"<div class=episode>{pictures}<p>{' · '.join(words)}</p>{said}{drawn}</div>"
+    return f"<div class=episode>{pictures}<p>{' · '.join(words)}</p>{instruction}{drawn}</div>"
 
 
 def _curves(field: ActionFacts, example: ExampleEpisode) -> str:

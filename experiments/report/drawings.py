@@ -89,8 +89,8 @@ def lengths(steps: Sequence[int], needed: int | None) -> str:
         x = WIDTH * (needed - first) / (last - first)
         side = "end" if x > WIDTH / 2 else "start"
         parts.append(f"<line class=mark x1={x:.1f} x2={x:.1f} y1=0 y2={base} />")
-        beside = x + (-4 if side == "end" else 4)
-        parts.append(f"<text class=mark x={beside:.1f} y=9 text-anchor={side}>one window: {needed}</text>")
+        label_x = x + (-4 if side == "end" else 4)
+        parts.append(f"<text class=mark x={label_x:.1f} y=9 text-anchor={side}>one window: {needed}</text>")
     return _svg(base + 18, parts, "lengths")
 
 

@@ -50,12 +50,12 @@ def read_findings(path: Path, axes: Sequence[str]) -> Findings:
     for part in parts:
         title, _, text = part.partition("\n")
         anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")  # as where Markdown is read as a page
-        said = f'<div class=findings id="{anchor}">{_as_html(text)}</div>'
+        content = f'<div class=findings id="{anchor}">{_as_html(text)}</div>'
         named = [axis for axis in axes if f"`{axis}`" in title]
         if named:
-            of_axes[named[-1]] = of_axes.get(named[-1], "") + said
+            of_axes[named[-1]] = of_axes.get(named[-1], "") + content
         else:
-            rest.append(section(title.replace("`", ""), said))
+            rest.append(section(title.replace("`", ""), content))
     return Findings(of_axes, "".join(rest))
 
 

@@ -37,25 +37,25 @@ class FitRow:
 def fit_rows(fits: Sequence[CurveFit], isoflop: IsoFlop | None) -> list[FitRow]:
     rows = []
     for fitted in fits:
-        fit, said = fitted.fit, (fitted.curve.name, " x ".join(fitted.curve.axes), len(fitted.fit.trials))
-        rows += _rows(said, () if fit.refused else fit.coefficients, fit.refused, fit.doubts)
+        fit, label = fitted.fit, (fitted.curve.name, " x ".join(fitted.curve.axes), len(fitted.fit.trials))
+        rows += _rows(label, () if fit.refused else fit.coefficients, fit.refused, fit.doubts)
     if isoflop is not None:
         coefficients = (isoflop.exponent,) if isoflop.exponent else ()
         best = [b for b in isoflop.budgets if b.best]
         doubts = tuple(f"{b.flops:.4g} FLOPs: {b.remarks}" for b in best if b.doubts)
         rows += _rows(("isoflop", "training FLOPs", len(best)), coefficients, isoflop.refused, doubts)
         for b in isoflop.budgets:
-            said = (f"isoflop {b.flops:.4g}", "trunk parameters", len(b.sizes))
-            rows += _rows(said, (b.best,) if b.best else (), b.refused, b.doubts)
+            label = (f"isoflop {b.flops:.4g}", "trunk parameters", len(b.sizes))
+            rows += _rows(label, (b.best,) if b.best else (), b.refused, b.doubts)
     return rows
 
 
 def _rows(
-    said: tuple[str, str, int], coefficients: Iterable[Coefficient], refused: str, doubts: Sequence[str]
+    label: tuple[str, str, int], coefficients: Iterable[Coefficient], refused: str, doubts: Sequence[str]
 ) -> list[FitRow]:
     last = (refused, "; ".join(doubts))
     numbers = [(c.name, *(f"{v:.{DIGITS}g}" for v in (c.value, c.low, c.high))) for c in coefficients]
-    return [FitRow(*said, *n, *last) for n in numbers or [("", "", "", "")]]
+    return [FitRow(*label, *n, *last) for n in numbers or [("", "", "", "")]]
 
 
 def describe_fits(fits: Sequence[CurveFit], isoflop: IsoFlop | None, outcomes: Sequence[Outcome], drawn: str) -> str:
@@ -98,10 +98,10 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
     lines = []
     for o in outcomes:
         p = o.prediction
-        came = "not run yet" if o.observed is None else f"{o.observed:.4f}"
-        said = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
+        observed = "not run yet" if o.observed is None else f"{o.observed:.4f}"
+        predicted = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
         lines.append([
-            html.escape(p.curve), html.escape(p.position), said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
+            html.escape(p.curve), html.escape(p.position), predicted, observed, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
             html.escape("; ".join(o.marks)),
         ])  # fmt: skip
     head = ["curve", "at", "predicted", "came", "", "seeds", "remarks"]
@@ -116,10 +116,10 @@ def _isoflop(isoflop: IsoFlop | None) -> str:
         best = _with_interval(b.best) if b.best else "–"
         lines.append([f"{b.flops:.3g}", str(len(b.sizes)), best, html.escape(b.remarks)])
     a = isoflop.exponent
-    said = (
+    sentence = (
         f"The best size grows as C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>."
         if a
         else f"No power law: {html.escape(isoflop.refused)}."
     )
     head = ["training FLOPs", "sizes", "best trunk parameters", "remarks"]
-    return f"<h3>The best size for a budget</h3><p>{said}</p>{table(head, lines, text=4)}"
+    return f"<h3>The best size for a budget</h3><p>{sentence}</p>{table(head, lines, text=4)}"

@@ -66,10 +66,10 @@ def write_report(
     shown = _choose_shown(sweeps, record.study)
     first = trial_id(_defaults(shown.by)[0], provenance) if shown else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
-    there = first in finished
-    dated = first if there else next(iter(finished), None)
+    has_reference = first in finished
+    dated = first if has_reference else next(iter(finished), None)
     result = numbers.results[dated] if dated else None
-    robots = robots_of(rows, shown.by, provenance, numbers.windows) if there else []
+    robots = robots_of(rows, shown.by, provenance, numbers.windows) if has_reference else []
     name, aside = (shown.name, shown.aside) if shown else (REFERENCE, "")
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
@@ -82,10 +82,10 @@ def write_report(
         *_curves(workspace, sweeps, rows, optima, along, outcomes, findings),
         _fits(workspace, numbers),
         findings.rest,
-        _clips(workspace.trials / first / "samples.npz", record, robots, aside) if there else "",
+        _clips(workspace.trials / first / "samples.npz", record, robots, aside) if has_reference else "",
         section(f"Robots{', the most controllable first' * are_sorted(robots)}{aside}", describe_robots(
             rows, shown.by, robots, workspace.data_summary
-        )) if there else "",
+        )) if has_reference else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
     ]  # fmt: skip
@@ -139,13 +139,13 @@ def _headline(
     study = record.study
     metrics = drawn_metrics(rows, [s.name for s in sweeps])
     cards = []
-    said = {
+    card_notes = {
         "perplexity": ("perplexity", f"vocabulary size is {study.model.vocab_size:,}"),
         "diffusion_loss": ("diffusion loss", "before the first step"),
         "action_error": ("error of actions", "in variances of actions, before the first step"),
     }
-    for metric in (m for m in metrics if shown and m in said):
-        name, of_untrained = said[metric]
+    for metric in (m for m in metrics if shown and m in card_notes):
+        name, of_untrained = card_notes[metric]
         found = _at_default(rows, shown.by, metric)
         over = "s.e. over episodes and seeds" if found and len(found.seeds) > 1 else "s.e. over episodes of one seed"
         cards.append(card(f"{name}, {shown.name}", found, over))

@@ -60,8 +60,8 @@ def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
     """Those of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity), or the
     usual ones while none has finished. Errors of actions are drawn where no frames are predicted."""
     measured = {r.metric for r in rows if r.sweep in sweeps}
-    there = [m for m in LABELS if m in measured]
-    return [m for m in there if m != "action_error"] or there or USUAL
+    available = [m for m in LABELS if m in measured]
+    return [m for m in available if m != "action_error"] or available or USUAL
 
 
 def save(figure: plt.Figure, path: Path) -> None:

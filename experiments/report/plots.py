@@ -103,8 +103,8 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     if metric in ON_LOG:
         plain_log(panel, panel.yaxis)
         for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve
-            said = f"{p.mean:.0f}" if metric == "perplexity" else f"{p.mean:.3g}"
-            panel.set_title(f"untrained: {said}", loc="left", fontsize=8.5, color=MUTED)
+            value = f"{p.mean:.0f}" if metric == "perplexity" else f"{p.mean:.3g}"
+            panel.set_title(f"untrained: {value}", loc="left", fontsize=8.5, color=MUTED)
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     show_tally(panel, rows, sweep.name)

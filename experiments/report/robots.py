@@ -152,20 +152,20 @@ def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames
         for m, (more, of, deaf) in counted.items()
     ]
     order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
-    said = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
-    said += f"Beyond two standard errors lie the {', the '.join(parts)} robots. " if parts else ""
+    text = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
+    text += f"Beyond two standard errors lie the {', the '.join(parts)} robots. " if parts else ""
     if shares:
-        said += "<em>Decided by actions</em>: the share of the change of its pixels that actions explain in truth. "
+        text += "<em>Decided by actions</em>: the share of the change of its pixels that actions explain in truth. "
     if "retrieval" in follows:
-        said += "<em>Retrieval</em>: how often the true actions are found among all that were tried. "
+        text += "<em>Retrieval</em>: how often the true actions are found among all that were tried. "
     if "counterfactual_gain" in follows:
-        said += (
+        text += (
             "<em>Counterfactual</em>: dB that frames under other actions are nearer to the simulator's under these "
             "than frames under the recorded ones. "
         )
     if not frames:
-        return said + "Errors are standard errors over episodes, and over seeds where there are several."
-    return said + (
+        return text + "Errors are standard errors over episodes, and over seeds where there are several."
+    return text + (
         "PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of repeating the "
         "last given frame. Errors are standard errors over episodes, and over seeds where there are several; those of "
         "<em>ahead</em> over episodes."

@@ -142,19 +142,19 @@ def _change(changes: Sequence[Change]) -> str:
     if not changes:
         return ""
     ends = changes[0]
-    said = ", ".join(f"{CHANGED[c.metric]} {_with_interval(c, '+', '95 % interval ')}" for c in changes)
+    differences = ", ".join(f"{CHANGED[c.metric]} {_with_interval(c, '+', '95 % interval ')}" for c in changes)
     over = f"seeds ({ends.seeds}) and episodes" if ends.seeds > 1 else "episodes of one seed: it says nothing of others"
     known = any(math.isfinite(c.low) for c in changes)
-    told = f"The interval is over {over}." if known else "One held-out episode per robot tells no interval."
-    return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {said}. {told}</p>"
+    interval = f"The interval is over {over}." if known else "One held-out episode per robot tells no interval."
+    return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {differences}. {interval}</p>"
 
 
 def _with_interval(found: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
     """'0.31 (`words`0.22 to 0.4)', the mean alone where nobody knows its error; `sign`: "+" for one before every
     value."""
     low, high = (f"{end:{sign}.3g}" for end in (found.low, found.high))
-    told = f" ({words}{low} to {high})" if math.isfinite(found.low) else ""
-    return f"{found.mean:{sign}.3g}{told}".replace("-", "\u2212")
+    interval = f" ({words}{low} to {high})" if math.isfinite(found.low) else ""
+    return f"{found.mean:{sign}.3g}{interval}".replace("-", "\u2212")
 
 
 def _names(sweep: Sweep, rows: Sequence[Row]) -> str:

@@ -132,12 +132,12 @@ def _same(a: float, b: float) -> bool:
 
 def _follows(result: Mapping[str, Any], windows: WindowTable, group: int) -> bool:
     """Whether the means of a result, and their errors, are those of the windows."""
-    said, found = Summary.from_dict(result["evaluation"]).datasets, summarise(windows, group).datasets
-    return said.keys() == found.keys() and all(
-        metric in found[robot]
-        and _close(stat.mean, found[robot][metric].mean)
-        and _close(stat.sem, found[robot][metric].sem)
-        for robot, stats in said.items()
+    stated, computed = Summary.from_dict(result["evaluation"]).datasets, summarise(windows, group).datasets
+    return stated.keys() == computed.keys() and all(
+        metric in computed[robot]
+        and _close(stat.mean, computed[robot][metric].mean)
+        and _close(stat.sem, computed[robot][metric].sem)
+        for robot, stats in stated.items()
         for metric, stat in stats.items()
     )
 

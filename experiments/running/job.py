@@ -18,9 +18,9 @@ def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, Shared]:
     Earlier versions counted how a trial is computed to the trial itself. Raises ConfigError for what is no job.
     """
     try:
-        trial, said = migrate(record["trial"])
+        trial, former_execution = migrate(record["trial"])
         execution = record.get("execution") or {"mesh": record["mesh"]}
     except (KeyError, TypeError) as error:
         raise ConfigError(f"job.json: not a job of this project ({error!r}); run its study again") from error
     shared = from_dict(Shared, record.get("shared", {}))
-    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | said), shared
+    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | former_execution), shared

@@ -77,6 +77,6 @@ def latest_common(trials: Path, before: Iterable[tuple[str, int]]) -> tuple[str,
     any."""
     from hma_jax.training.branch import last_step
 
-    there = [(last_step(trials / id / RUN, until), id) for id, until in before]
-    step, id = max(there, key=lambda one: one[0], default=(0, ""))
+    common = [(last_step(trials / id / RUN, until), id) for id, until in before]
+    step, id = max(common, key=lambda one: one[0], default=(0, ""))
     return id, step

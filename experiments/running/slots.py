@@ -48,15 +48,15 @@ class Slot:
 
     def environment(self) -> dict[str, str]:
         """What a child is told of its accelerators."""
-        told: dict[str, str] = {}
+        variables: dict[str, str] = {}
         if self.sharers > 1:
-            told["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY / self.sharers:.3f}"
+            variables["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY / self.sharers:.3f}"
         if self.accelerators is None:
-            return told
+            return variables
         names = ",".join(self.accelerators.names)
         if self.accelerators.kind == "gpu":
-            return told | {"CUDA_VISIBLE_DEVICES": names}
-        return told | {
+            return variables | {"CUDA_VISIBLE_DEVICES": names}
+        return variables | {
             "TPU_VISIBLE_CHIPS": names,
             "TPU_CHIPS_PER_PROCESS_BOUNDS": CHIP_BOUNDS[len(self.accelerators.names)],
             "TPU_PROCESS_BOUNDS": "1,1,1",
@@ -69,16 +69,16 @@ def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerato
     if platforms and not set(platforms.split(",")) & {"cuda", "gpu", "tpu"}:
         return None
     for kind, variable, find in (("gpu", "CUDA_VISIBLE_DEVICES", _gpus), ("tpu", "TPU_VISIBLE_CHIPS", _tpu_chips)):
-        told = environment.get(variable)
-        names = find() if told is None else _named(told)
+        visible = environment.get(variable)
+        names = find() if visible is None else _named(visible)
         if names:
             return Accelerators(kind, names)
     return None
 
 
-def _named(told: str) -> tuple[str, ...]:
+def _named(visible: str) -> tuple[str, ...]:
     """Of a list as CUDA reads it: what is no device, such as -1 or what Slurm says of a job without any, ends it."""
-    names = (name.strip() for name in told.split(",") if name.strip())
+    names = (name.strip() for name in visible.split(",") if name.strip())
     return tuple(takewhile(lambda name: name != "NoDevFiles" and not name.startswith("-"), names))
 
 

@@ -64,8 +64,8 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     try:
         trial, execution, shared = read_job(job)
         record_start(directory, inputs_of(job["provenance"]), closure)
-        if begun := begin_shared(directory, shared.before):
-            print(f"goes on from step {begun[1]} of trial {begun[0]}", flush=True)
+        if branched_from := begin_shared(directory, shared.before):
+            print(f"goes on from step {branched_from[1]} of trial {branched_from[0]}", flush=True)
         begin = None
         if trial.source:
             source = directory.parent / trial_id(trial.source, inputs_of(job["provenance"])) / RUN

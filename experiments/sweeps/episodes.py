@@ -64,15 +64,15 @@ def count_episodes(study: Study, cap: int | None) -> int:
     from data_pipelines.suite.generate import episode_count
 
     simulated = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
-    there = {name: simulated.get(name) or get_spec(name).episodes for name in study.dataset_names()}
-    unknown = [name for name, n in there.items() if not n]
+    episodes = {name: simulated.get(name) or get_spec(name).episodes for name in study.dataset_names()}
+    unknown = [name for name, n in episodes.items() if not n]
     require(
         not unknown,
         f"the axis episodes counts trajectories, and nobody says how many there are of {few(unknown)}: write `episodes` into "
         "the entries of your registry (`hma data inspect DIR --entry FILE` counts them), or leave the axis out",
     )
     most = study.trajectory_counts[-1]
-    return sum(min(n, most, cap or most) for n in there.values())
+    return sum(min(n, most, cap or most) for n in episodes.values())
 
 
 if __name__ == "__main__":

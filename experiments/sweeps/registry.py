@@ -184,14 +184,14 @@ def _require_fits(study: Study, trial: Trial, where: str) -> None:
         replace(study, train=replace(trial.train, seed=0), **own)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
-    for what, here, there in (
+    for what, here, expected in (
         ("rate", trial.rate, study.rate),
         ("eval.windows_per_dataset", trial.eval.windows_per_dataset, study.eval.windows_per_dataset),
     ):
         require(
-            here == there,
+            here == expected,
             f"{where} has {what} {here}, and all trials of a study are judged on the same windows, which are frozen for "
-            f"{there}: compare two studies with --set {what}=... and an --out of their own",
+            f"{expected}: compare two studies with --set {what}=... and an --out of their own",
         )
 
 

@@ -151,10 +151,10 @@ def make_sweep(
     """
     require(len(values) > 0, f"axis {name}: values is empty, so that its control alone would run; give it positions")
     seeds = study.seeds if seeds is None else seeds
-    there = reference_trial(study, seeds[0], steps)
-    changed = change(there, reference_x)
+    unchanged = reference_trial(study, seeds[0], steps)
+    changed = change(unchanged, reference_x)
     require(isinstance(changed, Trial), f"axis {name}: change has to return a trial, and returned {changed!r}")
-    lines = diff(there, replace(changed, evaluated=there.evaluated))
+    lines = diff(unchanged, replace(changed, evaluated=unchanged.evaluated))
     require(
         not lines,
         f"axis {name}: the reference trial of this study does not stand at reference_x {reference_x}, where it would be "

@@ -68,8 +68,10 @@ def compare(
         if progress:
             progress(i + 1, total, "compared")
     lines = ["episode,frame,psnr,psnr_still"]
-    for number, mine, kept in rows:
-        lines += [f"{number},{given + t},{a:.3f},{b:.3f}" for t, (a, b) in enumerate(zip(mine, kept, strict=True))]
+    for number, generated, still_psnr in rows:
+        lines += [
+            f"{number},{given + t},{a:.3f},{b:.3f}" for t, (a, b) in enumerate(zip(generated, still_psnr, strict=True))
+        ]
     write_file(home / "psnr.csv", "\n".join(lines) + "\n")
-    means = np.array([[mine.mean(), kept.mean()] for _, mine, kept in rows])
+    means = np.array([[generated.mean(), still_psnr.mean()] for _, generated, still_psnr in rows])
     return Compared(*(interval_of(mean_and_sem(column, np.arange(len(column)))) for column in means.T))

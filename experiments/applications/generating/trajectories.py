@@ -97,10 +97,10 @@ class RldsTrajectories(Trajectories):
         spec = self.spec
         episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
         images = fit_images(episode.images, self._size)
-        said: Sequence[bytes] = ()
+        instructions: Sequence[bytes] = ()
         if INSTRUCTION_KEY in self._source.features:
-            said = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())
-        instruction = said[0].decode(errors="replace") if len(said) else ""
+            instructions = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())
+        instruction = instructions[0].decode(errors="replace") if len(instructions) else ""
         return _trajectory(self.origin(i), images, spec.convert(episode.actions), self._robot, instruction)
 
     def outline(self, i: int) -> Outline:
@@ -179,9 +179,10 @@ def open_trajectories(
     """
     path = Path(place)
     if not path.exists() and stores.is_dir() and "/" not in place:
-        there = TokenStore(stores).names
+        available = TokenStore(stores).names
         require(
-            place in there, f"{place}: no such directory, and {stores} has tokens of {', '.join(there) or 'nothing'}"
+            place in available,
+            f"{place}: no such directory, and {stores} has tokens of {', '.join(available) or 'nothing'}",
         )
         path = stores / place
     stored = (path / MANIFEST).is_file()

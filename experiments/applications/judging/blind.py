@@ -113,14 +113,14 @@ def _film(images: np.ndarray) -> bytes:
 def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
     """{(policy, world, start): a person calls it success}. Raises ConfigError for labels of another page."""
     try:
-        said: dict[str, Any] = json.loads(path.read_text())
+        saved: dict[str, Any] = json.loads(path.read_text())
         key: dict[str, Any] = json.loads((out / "blind.json").read_text())
-        labels = {int(number): bool(value) for number, value in said["labels"].items()}
+        labels = {int(number): bool(value) for number, value in saved["labels"].items()}
         clips: Sequence[Any] = key["clips"]
     except (OSError, ValueError, KeyError, AttributeError) as error:
         raise ConfigError(f"{path} cannot be read as labels of {out / 'blind.html'} ({error})") from error
     require(
-        said.get("page") == key["page"], f"{path} has labels of another page ({said.get('page')}, not {key['page']})"
+        saved.get("page") == key["page"], f"{path} has labels of another page ({saved.get('page')}, not {key['page']})"
     )
     require(
         bool(labels) and all(0 <= n < len(clips) for n in labels), f"{path} labels clips that the page has not, or none"
@@ -130,10 +130,10 @@ def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
 
 def compare_labels(labels: dict[tuple[str, str, int], bool], outcomes: Sequence[Outcome]) -> dict[str, Interval]:
     """How often a person and a judge agree: with the head in each world, with the state in the true one."""
-    said = {(o.policy, o.world, o.start, o.judge): o.success for o in outcomes}
-    found = {}
+    judged = {(o.policy, o.world, o.start, o.judge): o.success for o in outcomes}
+    rates = {}
     for world, judge in ((LEARNED, HEAD), (TRUE, HEAD), (TRUE, STATE)):
-        same = [said[p, w, m, judge] == label for (p, w, m), label in labels.items() if w == world]
-        if same:
-            found[f"{judge}, {world} world"] = rate_interval(np.array(same))
-    return found
+        agreements = [judged[p, w, m, judge] == label for (p, w, m), label in labels.items() if w == world]
+        if agreements:
+            rates[f"{judge}, {world} world"] = rate_interval(np.array(agreements))
+    return rates

@@ -150,7 +150,9 @@ def write_page(judged: Judgement, summary: dict[str, Any], out: Path, command: s
 
 def _doubts(summary: dict[str, Any]) -> list[str]:
     return [
-        f"<p><b>{html.escape(said)}</b></p>" for said in (describe_control(summary), describe_clipping(summary)) if said
+        f"<p><b>{html.escape(warning)}</b></p>"
+        for warning in (describe_control(summary), describe_clipping(summary))
+        if warning
     ]
 
 
@@ -228,8 +230,8 @@ def describe_recorded_head(measured: dict[str, float]) -> str:
     if "successes" not in measured:
         return ""
     n, good = round(measured["episodes"]), round(measured["successes"])
-    told = round(measured["successes told"]), round(measured["failures told"])
-    accuracy, usual = count_interval(sum(told), n), max(good, n - good) / n
+    correct = round(measured["successes told"]), round(measured["failures told"])
+    accuracy, usual = count_interval(sum(correct), n), max(good, n - good) / n
     doubt = "" if accuracy.low > usual else " By these few it is not known to be better: do not trust the rates."
     learnt = (
         f"It learnt from {measured['learnt from']:.0f} recordings, {measured['successes among them']:.0f} of them successes; "
@@ -244,7 +246,7 @@ def describe_recorded_head(measured: dict[str, float]) -> str:
         else ""
     )
     return (
-        f"It tells {told[0]} of {good} successes and {told[1]} of {n - good} failures: {accuracy.mean:.2f} "
+        f"It tells {correct[0]} of {good} successes and {correct[1]} of {n - good} failures: {accuracy.mean:.2f} "
         f"({accuracy.low:.2f} to {accuracy.high:.2f}) of all, {measured['episode accuracy, decoded']:.2f} when they are "
         f"shown as the model's tokenizer draws them. To call every one the same would be right in {usual:.2f}.{doubt} {learnt}"
         f"left out were {measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short.{taken}"
@@ -264,14 +266,14 @@ CALLED = {TRUE: "true", LEARNED: "model", SHUFFLED: "control"}
 def _clips(judged: Judgement, *sides: tuple[str, str]) -> str:
     """Of policies spread over the ladder, one start each, and what the judges said."""
     chosen = np.unique(np.linspace(0, len(judged.policies) - 1, CLIPS).round().astype(int))
-    said = [successes(judged.outcomes, judged.policies, *side) for side in sides]
+    successes_by_side = [successes(judged.outcomes, judged.policies, *side) for side in sides]
     figures = []
     for rank, p in enumerate(chosen):
         name, start = judged.policies[p], rank % judged.config.starts
         clips = [judged.rollouts(name, world).images[start] for world, _ in sides]
         words = "".join(
             f"<span>{CALLED[world]}: {'success' if found[p, start] else 'failure'} by {judge}</span>"
-            for found, (world, judge) in zip(said, sides, strict=True)
+            for found, (world, judge) in zip(successes_by_side, sides, strict=True)
         )
         figures.append(
             f"<figure class=trio><figcaption>{html.escape(name)}, start {start}</figcaption>"

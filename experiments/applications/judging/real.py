@@ -29,8 +29,8 @@ def read_real(path: Path) -> dict[str, Count]:
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path} cannot be read as counts of the real robot ({error})") from error
-    there = list(rows[0][1]) if rows else []
-    missing = [name for name in COLUMNS if name not in there]
+    columns = list(rows[0][1]) if rows else []
+    missing = [name for name in COLUMNS if name not in columns]
     require(not missing, f"{path}: no column {', '.join(missing)}, or no row; a row has {', '.join(COLUMNS)}")
     found: dict[str, Count] = {}
     for line, row in rows:

@@ -97,7 +97,7 @@ class RecordedTruth:
         self.held_out = sorted((i for kind in kinds for i in kind[: len(kind) // HELD_OUT]), key=usable.index)
         self.learnt = [i for i in usable if i not in set(self.held_out)]
         frames = task.frames or int(np.ceil(np.quantile(length[kinds[0]], MOST))) - 1  # one is the start's
-        said = recorded[self.held_out[0]].instruction
+        instruction = recorded[self.held_out[0]].instruction
         # As starts in true worlds do, those begin before their goal is reached, of which that is known.
         self._begun_from = [i for i in self.held_out if self._reached is None or not self._reached[i][0]]
         require(
@@ -107,7 +107,7 @@ class RecordedTruth:
         )
         starts = min(config.starts, len(self._begun_from))
         batch = min(config.batch, starts)
-        goal = said or "what its recordings call success"
+        goal = instruction or "what its recordings call success"
         self.config = replace(
             config,
             task=replace(task, frames=frames, goal=goal),

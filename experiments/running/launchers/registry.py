@@ -51,8 +51,8 @@ class LauncherOptions:
     def require_installed(self) -> None:
         """Raises ConfigError without the package that the launcher works through."""
         needs = launcher_class(self.name).needs
-        there = not needs or importlib.util.find_spec(needs) is not None
-        require(there, f"--launcher {self.name} needs {needs}: pip install 'hma-jax[{self.name}]'")
+        installed = not needs or importlib.util.find_spec(needs) is not None
+        require(installed, f"--launcher {self.name} needs {needs}: pip install 'hma-jax[{self.name}]'")
 
     def launcher(self, root: Path) -> Launcher:
         """For the study in `root`. Raises ConfigError where it cannot work."""
