@@ -66,8 +66,51 @@ def test_few_episodes_say_less_and_too_few_nothing():
     few, many = Difference(0.3, 0.1, 4), Difference(0.3, 0.1, 1000)
     assert many.errors == pytest.approx(3.0, abs=0.02) and 1.8 < few.errors < 2.0
     assert Difference(-0.3, 0.1, 4).errors == -few.errors and Difference(0.0, 0.0, 4).errors == 0.0
+    assert Difference(-0.3, 0.0, 4).errors == -np.inf  # of every episode alike
     with pytest.raises(ConfigError, match="3 episodes; what actions do is told from at least 4"):
         find_effects(lambda actions: np.ones(len(actions)), recorded(), np.zeros(DIM), np.arange(WINDOWS) % 3)
+
+
+def find_by_distance(given: np.ndarray, truth: np.ndarray, mean: np.ndarray):
+    """Of actions `given` for `truth`, [WINDOWS, 5, 2, A], by the squared distance, every window an episode."""
+    return find_effects(lambda actions: ((actions - truth) ** 2).mean((1, 2)).sum(-1), given, mean, range(WINDOWS))
+
+
+@pytest.mark.parametrize("dims", [2, 11], ids=["all pairs", "doubtful pairs alone"])
+def test_worth_is_that_of_actions_in_which_all_is_changed_back(dims: int):
+    sizes, mean = np.array([1.0, 2.0] + [1.0] * (dims - 2)), np.linspace(-0.5, 0.5, dims)
+    truth = np.random.default_rng(0).normal(size=(WINDOWS, 5, 2, dims)) * sizes
+    effects = find_by_distance(Change(0, "swapped", other=1)(truth, mean), truth, mean)
+    assert [e.better for e in effects] == [Change(0, "swapped", other=1)] * 2 + [None] * (dims - 2)
+    np.testing.assert_allclose([e.worth.mean for e in effects], ((mean - truth) ** 2).mean((0, 1, 2)))
+
+
+def test_a_dimension_is_changed_once():
+    """Ninety times too large it is divided by 50, and what is left not by 3, which would come nearer still."""
+    truth = np.random.default_rng(0).normal(size=(WINDOWS, 5, 2, 2))
+    effects = find_by_distance(truth * [90, 1], truth, np.zeros(2))
+    assert [e.better for e in effects] == [Change(0, "scaled", 1 / 50), None]
+
+
+def test_a_value_that_is_merely_harmful_is_not_changed():
+    """The less of dimension 1 the better: held still it costs least, and neither a fiftieth nor a smaller dimension in
+    its place is what it should have been."""
+    given = recorded() * [0.01, 1, 1, 1]
+    effects = find_effects(lambda actions: np.abs(actions[..., 1]).mean((1, 2)), given, np.zeros(DIM), range(WINDOWS))
+    assert all(e.better is None for e in effects)
+
+
+@pytest.mark.parametrize(("gain", "found"), [(0.5, None), (0.9, Change(0, "negated"))], ids=["2.4", "3.8"])
+def test_what_helps_by_less_than_three_errors_is_chance(gain: float, found: Change | None):
+    """Of 26 episodes, whose gains lie one on either side of the mean: an error of a fifth."""
+    episodes, gains = 26, gain + np.tile([1.0, -1.0], 13)
+
+    def loss_of(actions: np.ndarray) -> np.ndarray:
+        at = actions[:, 0, 0, 0]
+        return np.where(at == 1, 0.0, np.where(at == -1, -gains, 10.0))
+
+    (effect,) = find_effects(loss_of, np.ones((episodes, 1, 1, 1)), np.zeros(1), range(episodes))
+    assert effect.better == found
 
 
 def test_a_model_that_is_deaf_ignores_every_dimension():

@@ -84,6 +84,16 @@ def test_factor_zero_is_the_low_digit():
     assert metrics.factored_cross_entropy(logits, jnp.array([5 + 3 * 8]))[0] > 100
 
 
+def test_padding_is_part_of_no_mean_and_no_last_frame():
+    x = jnp.asarray([[[1.0, 3.0], [5.0, 7.0], [99.0, 99.0]], [[0.0, 2.0], [4.0, 6.0], [8.0, 10.0]]])
+    real = jnp.asarray([[True, True, False], [True, True, True]])
+    assert metrics.mean_over_frames(x, real).tolist() == [4, 5]
+    assert metrics.mean_over_frames(x, None).tolist() == pytest.approx([214 / 6, 5])
+    assert metrics.last_frames(x, real).tolist() == [[5, 7], [8, 10]]
+    assert metrics.last_frames(x, None).tolist() == [[99, 99], [8, 10]]
+    assert metrics.last_frames(x[:, None], real, axis=2).tolist() == [[[5, 7]], [[8, 10]]]
+
+
 def test_images_that_cannot_be_compared_are_refused():
     image = np.zeros((8, 8, 3), np.uint8)
     with pytest.raises(ConfigError, match="differ in shape"):
