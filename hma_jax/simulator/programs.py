@@ -69,7 +69,9 @@ class Programs:
         self.weights = ProgramParams(model.params, tokenizer.params)
         declared, capacity = model.declared, model.config.frames - 1
         hidden = model.run.train.masking.ignores_actions
-        decode: Callable[[ProgramParams, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(w.tokenizer, x)
+        to_images: Callable[[ProgramParams, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(
+            w.tokenizer, x
+        )
 
         def fresh(weights: ProgramParams, tokens: jax.Array, at: ResetInputs) -> Episodes:
             chunks, robots = jnp.asarray(at.chunks), jnp.asarray(at.robots)
@@ -79,7 +81,7 @@ class Programs:
         def reset_from_tokens(weights: ProgramParams, state: Episodes, at: ResetInputs) -> tuple[Episodes, jax.Array]:
             tokens = jnp.asarray(at.frames)
             newest = jnp.take_along_axis(tokens, at.given.reshape(-1, *(1,) * (tokens.ndim - 1)) - 1, axis=1)[:, 0]
-            return put(state, at.rows, fresh(weights, tokens, at)), decode(weights, newest)
+            return put(state, at.rows, fresh(weights, tokens, at)), to_images(weights, newest)
 
         def reset_from_images(
             weights: ProgramParams, state: Episodes, at: ResetInputs
@@ -96,7 +98,7 @@ class Programs:
             keys = jax.vmap(key_of)(seed_n)
             before, hma = take(state, rows_n), declared.merge(weights.model)
             new, frames = advance_each(hma, before, chunk_nU, keys, decode, hidden=hidden)
-            return put(state, rows_n, new), frames, decode(weights, frames)
+            return put(state, rows_n, new), frames, to_images(weights, frames)
 
         self.reset_from_images = jax.jit(reset_from_images, donate_argnums=1)
         self.reset_from_tokens = jax.jit(reset_from_tokens, donate_argnums=1)
