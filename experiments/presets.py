@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from data_pipelines.registry.mixtures import FORTY
-from data_pipelines.suite.embodiments import NEW
+from data_pipelines.suite.embodiments import UNSEEN
 from experiments.study import DesignConfig, StoreConfig, Study, SuiteConfig, TransferConfig
 from hma_jax.config import (
     ConfigError,
@@ -122,7 +122,7 @@ CPU_FULL = replace(
     # From 128 trajectories, so that none is learnt by heart within the long runs (docs/designs.md), to 2,000.
     suite=SuiteConfig(scale=4.0, fewest=128),
     trajectory_counts=(2000,),
-    unseen=tuple(e.name for e in NEW),
+    unseen=tuple(e.name for e in UNSEEN),
     # Teacher forcing: with the released objective, perplexity of a true past stops falling (docs/models.md).
     train=replace(CPU.train, steps=4000, masking=replace(CPU.train.masking, teacher_forcing=True)),
     eval=replace(CPU.eval, other_actions=15),  # retrieval among sixteen, of the reference

@@ -14,7 +14,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.sources.convertible import unsupported_images_text
 from data_pipelines.sources.rlds.schema import field_slice
-from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
@@ -200,11 +200,13 @@ def _choose_angles(facts: Facts, keys: Sequence[str], dims: Sequence[int]) -> tu
 
 def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:
     """Windows of `frames` at `stride`, counted over the sampled episodes."""
-    cut, least = Cut(frames, stride, stride), min(MIN_TRAIN_FRAMES, frames)
+    slicer, min_real = WindowSlicer(frames, stride, stride), min(MIN_TRAIN_FRAMES, frames)
     steps = np.array(facts.steps)
-    counts = cut.count(steps, least)
-    whole, some, mean = int((steps >= cut.native).sum()), int((counts > 0).sum()), float(counts.mean())
-    return WindowFacts(frames, stride, cut.native, least * stride, whole, some, mean, mean * facts.episodes)
+    counts = slicer.count(steps, min_real)
+    whole, some, mean = int((steps >= slicer.native_frames).sum()), int((counts > 0).sum()), float(counts.mean())
+    return WindowFacts(
+        frames, stride, slicer.native_frames, min_real * stride, whole, some, mean, mean * facts.episodes
+    )
 
 
 def _text(value: str) -> str:

@@ -122,16 +122,20 @@ class _Stream:
 
     def read(self, i: int, at: int) -> dict[str, np.ndarray]:
         """Window `at`, the i-th ever drawn of this dataset."""
-        windows, cut = self.windows, self.windows.cut
+        windows, slicer = self.windows, self.windows.slicer
         episode, start = windows.locate(at)
         item = self.store.episode(windows.name, "train", episode)
-        row = {"tokens": cut.tokens(item, start), "embodiment": self.embodiment, "real": cut.valid(item, start)}
+        row = {
+            "tokens": slicer.tokens(item, start),
+            "embodiment": self.embodiment,
+            "real": slicer.real_mask(item, start),
+        }
         if self.shuffle_actions:
             episode, start = windows.locate(self._other(at, i))
             item = self.store.episode(windows.name, "train", episode)
-        actions = cut.actions(item, start, self.action_width)
+        actions = slicer.actions(item, start, self.action_width)
         if self.shuffle_actions:  # a shorter window's chunks come again, so that every real frame has one
-            actions = actions[np.arange(cut.frames) % cut.real(item, start)] * row["real"][:, None]
+            actions = actions[np.arange(slicer.frames) % slicer.count_real(item, start)] * row["real"][:, None]
         return row | {"actions": actions}
 
     def _other(self, at: int, i: int) -> int:
@@ -139,7 +143,7 @@ class _Stream:
 
         Windows of one episode overlap: their actions would still tell of this one's.
         """
-        first, end = self.windows.siblings(at)
+        first, end = self.windows.episode_range(at)
         n = len(self.windows)
         others = n - (end - first)
         if others == 0:  # a single episode: at least not the same window

@@ -67,7 +67,7 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
         weighed = {name: _windows(store, name, config, None) for name in names}
     # Nothing can be drawn of a dataset whose trajectories under the cap were all skipped, whatever else it has.
     counts = {name: len(weighed[name]) if len(s) else 0 for name, s in sets.items()}
-    return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.shortage() for n, s in sets.items()}))
+    return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.why_empty() for n, s in sets.items()}))
 
 
 def training_table(store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation") -> EmbodimentTable:
@@ -84,8 +84,8 @@ def training_embodiment(
     all_of_them = not len(used) or len(used) == len(manifest.train.episodes)
     if all_of_them or not manifest.spec.action_dim:
         return manifest.embodiment(config.rate, scale=scale)
-    spread = store.action_spread(name, used) if scale == "quantiles" else None
-    return manifest.embodiment(config.rate, store.action_moments(name, used), scale, spread)
+    action_range = store.action_range(name, used) if scale == "quantiles" else None
+    return manifest.embodiment(config.rate, store.action_moments(name, used), scale, action_range)
 
 
 def _windows(store: TokenStore, name: str, config: LoaderConfig, limit: int | None) -> WindowSet:

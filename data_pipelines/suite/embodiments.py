@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 
-from data_pipelines.suite.families import FAMILIES, NEWCOMERS
+from data_pipelines.suite.families import FAMILIES, UNSEEN_FAMILIES
 from data_pipelines.suite.spec import EmbodimentSpec
 
 Family = tuple[EmbodimentSpec, ...]
@@ -33,10 +33,10 @@ def _in_rounds(families: Iterable[Family]) -> tuple[EmbodimentSpec, ...]:
 TRAINED = _in_rounds(FAMILIES)
 """Forty robots, in the order in which studies add them."""
 
-NEW = _in_rounds(NEWCOMERS)
+UNSEEN = _in_rounds(UNSEEN_FAMILIES)
 """Ten robots that no study trains on unless it names them."""
 
-EMBODIMENTS = TRAINED + NEW
+EMBODIMENTS = TRAINED + UNSEEN
 
 
 def siblings(spec: EmbodimentSpec) -> tuple[EmbodimentSpec, ...]:

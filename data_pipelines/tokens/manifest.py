@@ -22,7 +22,7 @@ from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sampling.splits import MAX_VAL, MIN_VAL, VAL_FRACTION, check_bounds, count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
-from data_pipelines.tokens.row_sample import Spread, moves
+from data_pipelines.tokens.row_sample import ActionRange, quantiles_vary
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.config.training import ActionScale
@@ -183,15 +183,15 @@ class Manifest:
         rate: float | None = FRAME_RATE,
         moments: Moments | None = None,
         scale: ActionScale = "deviation",
-        spread: Spread | None = None,
+        action_range: ActionRange | None = None,
     ) -> Embodiment:
-        """The model's view of this dataset's actions at `rate`. `moments` and `spread` are of the actions that count,
-        if those are not all of the train split's.
+        """The model's view of this dataset's actions at `rate`. `moments` and `action_range` are of the trajectories
+        that are used; by default of the whole train split.
 
         By `quantiles`, a value that from 1 % to 99 % is one number, or one and its rounding (`DEAD_STD`), and yet
         varies is measured by its extremes. Raises DataError for a manifest of a version that kept no quantiles.
         """
-        return self._embodiment(self.stride_at(rate), moments, scale, spread)
+        return self._embodiment(self.stride_at(rate), moments, scale, action_range)
 
     def check(self) -> None:
         """Raises ConfigError unless its parts fit each other."""
@@ -202,10 +202,10 @@ class Manifest:
         stride: int,
         moments: Moments | None,
         scale: ActionScale,
-        spread: Spread | None,
+        action_range: ActionRange | None,
     ) -> Embodiment:
-        spread = spread or Spread(self.action_quantiles, self.action_min, self.action_max)
-        low, high = self._quantile_scale(spread) if scale == "quantiles" else ((), ())
+        action_range = action_range or ActionRange(self.action_quantiles, self.action_min, self.action_max)
+        low, high = self._quantile_scale(action_range) if scale == "quantiles" else ((), ())
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
@@ -218,16 +218,23 @@ class Manifest:
             layout=self.spec.action_layout(),
         )
 
-    def _quantile_scale(self, spread: Spread) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _quantile_scale(self, action_range: ActionRange) -> tuple[tuple[float, ...], tuple[float, ...]]:
         if not self.action_mean:
             return (), ()
-        if not spread.quantiles:
+        if not action_range.quantiles:
             raise DataError(
                 f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
                 "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
-        first, last = spread.quantiles[0], spread.quantiles[-1]
-        pairs = zip(first, last, spread.low or first, spread.high or last, moves(spread.quantiles), strict=True)
+        first, last = action_range.quantiles[0], action_range.quantiles[-1]
+        pairs = zip(
+            first,
+            last,
+            action_range.low or first,
+            action_range.high or last,
+            quantiles_vary(action_range.quantiles),
+            strict=True,
+        )
         chosen = [(a, b) if moving else (least, most) for a, b, least, most, moving in pairs]
         return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 

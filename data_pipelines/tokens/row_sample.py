@@ -1,10 +1,9 @@
-"""Quantiles of actions that come in pieces: of all rows while they are few, of a sample of them beyond.
+"""Quantiles of actions that are computed part by part: exact for few rows, from a random sample for many.
 
-The sample are the rows whose (episode, step) has the smallest hash. Which rows those are depends on
-the rows alone, not on the pieces, their order or who merged them. Up to `ROWS` rows the quantiles are
-exact. Beyond, the rows are a simple random sample: the value given as the p-quantile is that of a
-share p ± sqrt(p (1 - p) / ROWS) of the rows (one standard deviation): 0.16 points at 1 % and 99 %,
-0.78 at the median.
+A row is the action of one step. The sample is the bottom-k sample by hash: the `ROWS` rows whose (episode, step) has
+the smallest hashes. It depends on the rows alone, not on the parts, their order or which process merged them. Up to
+`ROWS` rows the quantiles are exact. Beyond, the value given as the p-quantile is that of a share p ± sqrt(p (1 - p)
+/ ROWS) of the rows (one standard deviation): 0.16 points at 1 % and 99 %, 0.78 at the median.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from data_pipelines.sampling.order import hash64, stream_seed
 from hma_jax.model.embodiments import DEAD_STD
 
 ROWS = 4096
-"""Rows that a dataset's quantiles are taken of, at most."""
+"""Largest number of rows that a dataset's quantiles are computed from."""
 
 QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
-"""Those that are kept."""
+"""The quantiles that a manifest stores."""
 
 MAX_STEPS = np.uint64(2**32)
 """Steps of an episode, so that episode * MAX_STEPS + step is unique."""
@@ -36,17 +35,18 @@ PIECE = 2**22
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Over which values rows of actions extend, per column: `quantiles` as `QUANTILES` lists them, the smallest and the
-    largest. All () without rows, the last two also where every value `moves` or is constant and they tell nothing."""
+class ActionRange:
+    """The range of each action value: `quantiles`, one row per `QUANTILES`, and the smallest and the largest value. All
+    are () without rows; `low` and `high` also if they are not needed, as the quantiles of all values vary or the values
+    are constant."""
 
     quantiles: tuple[tuple[float, ...], ...] = ()
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
 
 
-def moves(quantiles: tuple[tuple[float, ...], ...]) -> np.ndarray:
-    """bool per column: whether the outermost of `quantiles` are apart by more than rounding (`DEAD_STD`)."""
+def quantiles_vary(quantiles: tuple[tuple[float, ...], ...]) -> np.ndarray:
+    """bool per action value: whether its outermost quantiles differ by more than rounding (`DEAD_STD`)."""
     return (np.asarray(quantiles[-1]) - np.asarray(quantiles[0])) / 2 > DEAD_STD
 
 

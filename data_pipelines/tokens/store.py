@@ -19,7 +19,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
-from data_pipelines.tokens.row_sample import RowSampler, Spread, moves, sampled_episodes
+from data_pipelines.tokens.row_sample import ActionRange, RowSampler, quantiles_vary, sampled_episodes
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
 from hma_jax.config.training import ActionScale
@@ -95,11 +95,11 @@ class TokenStore:
                 f"{path}: episode {at} cannot be read: {error}. Remove {path.parent} and tokenise the dataset again."
             ) from error
 
-    def action_spread(self, name: str, episodes: Sequence[int]) -> Spread:
-        """Over which values the actions of these training episodes alone extend (positions in the store).
+    def action_range(self, name: str, episodes: Sequence[int]) -> ActionRange:
+        """The range of the actions of these training episodes alone (positions in the store).
 
-        Reads the episodes that the quantiles are taken of, and all of them where a value that varies does not move
-        between these. Raises DataError for a damaged record.
+        Reads the episodes that the quantiles are computed from, and all of them if some value changes but its
+        quantiles do not. Raises DataError for a damaged record.
         """
         facts, episodes = self.manifest(name).train, np.asarray(episodes, np.int64)
         numbers, steps = (np.asarray(column, np.int64)[episodes] for column in (facts.episodes, facts.steps))
@@ -109,14 +109,14 @@ class TokenStore:
             sampler.add(item.actions, item.episode)
         quantiles = sampler.sample().quantiles()
         if not quantiles:
-            return Spread()
-        varies = np.asarray(self.action_moments(name, episodes).std) > DEAD_STD
-        if not (varies & ~moves(quantiles)).any():
-            return Spread(quantiles)
+            return ActionRange()
+        changing = np.asarray(self.action_moments(name, episodes).std) > DEAD_STD
+        if not (changing & ~quantiles_vary(quantiles)).any():
+            return ActionRange(quantiles)
         with_steps = (self.episode(name, "train", i).actions for i in episodes[steps > 0].tolist())
         extremes = [(actions.min(axis=0), actions.max(axis=0)) for actions in with_steps]
         low, high = np.min([a for a, _ in extremes], axis=0), np.max([b for _, b in extremes], axis=0)
-        return Spread(quantiles, tuple(low.tolist()), tuple(high.tolist()))
+        return ActionRange(quantiles, tuple(low.tolist()), tuple(high.tolist()))
 
     def action_moments(self, name: str, episodes: np.ndarray) -> Moments:
         """Statistics of the actions of these training episodes alone (int [N], positions in the store).

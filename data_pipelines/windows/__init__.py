@@ -1,1 +1,1 @@
-"""Windows over the episodes of a token store: which there are, how they are cut, which are held out for evaluation."""
+"""Windows over the episodes of a token store: which exist, how they are sliced, which are held out for evaluation."""

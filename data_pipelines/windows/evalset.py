@@ -18,8 +18,8 @@ from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.counterfactual import CounterfactualFrames
-from data_pipelines.windows.cut import make_cut
 from data_pipelines.windows.other_actions import OtherWindows
+from data_pipelines.windows.slicer import make_slicer
 from data_pipelines.windows.windows import require_windows, val_windows
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
@@ -46,7 +46,7 @@ class EvalManifest:
     store: str  # hash of the datasets' manifests
     datasets: tuple[DatasetWindows, ...] = field(default_factory=tuple)
     rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
-    least: int = 0  # real frames of the shortest window; 0, as before there was padding: of each
+    least: int = 0  # real frames of the shortest window; 0 in files from before there was padding
 
     def hash(self) -> str:
         return stable_hash(self)
@@ -61,9 +61,10 @@ class EvalManifest:
         """Datasets without a window, and why."""
         return {d.dataset: d.reason for d in self.datasets if not d.windows}
 
-    def thinned(self, most: int) -> EvalManifest:
-        """The same with at most so many windows of each dataset, of as many episodes as can be."""
-        return replace(self, datasets=tuple(replace(d, windows=spread(d.windows, most)) for d in self.datasets))
+    def subsampled(self, max_windows: int) -> EvalManifest:
+        """This set with at most `max_windows` of each dataset, as `subsample_windows` chooses them."""
+        datasets = (replace(d, windows=subsample_windows(d.windows, max_windows)) for d in self.datasets)
+        return replace(self, datasets=tuple(datasets))
 
     def save(self, path: str | Path) -> None:
         """Writes JSON with its own hash; whole or not at all. ConfigError if it cannot be written."""
@@ -93,11 +94,11 @@ class EvalManifest:
         return manifest
 
 
-def spread(frozen: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, int], ...]:
-    """So many of the windows (episode, start), of as many episodes as can be: errors are clustered by episode.
+def subsample_windows(frozen: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, int], ...]:
+    """Up to `count` of the windows (episode, start), of as many episodes as possible: errors are clustered by episode.
 
-    One of each comes before a second one of any, and where there are too many episodes, every so many-th is taken:
-    neighbours share a scene or a day.
+    Every episode gives one window before any gives a second. If there are more episodes than windows to choose, they
+    are taken at equal distances, as neighbouring episodes share a scene or a day.
     """
     seen: defaultdict[int, int] = defaultdict(int)
     rounds: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)  # a window of each episode that has one left
@@ -140,13 +141,13 @@ def freeze_manifest(
     require_windows(sets)
     chosen, shortest = [], frames
     for name, windows in sets.items():
-        apart = np.flatnonzero(windows.start % (spacing * windows.cut.spacing) == 0)
+        apart = np.flatnonzero(windows.start % (spacing * windows.slicer.spacing) == 0)
         order = np.argsort(hash64(apart, stream_seed(seed, "evaluation", name)), kind="stable")
         picked = np.sort(apart[order[:windows_per_dataset]])
         pairs = tuple(windows.locate(int(i)) for i in picked)
         steps = store.manifest(name).val.steps
-        shortest = min([shortest, *(int(windows.cut.longest(steps[episode])) for episode, _ in pairs)])
-        chosen.append(DatasetWindows(name, pairs, "" if pairs else windows.shortage()))
+        shortest = min([shortest, *(int(windows.slicer.max_real(steps[episode])) for episode, _ in pairs)])
+        chosen.append(DatasetWindows(name, pairs, "" if pairs else windows.why_empty()))
     return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen), rate, shortest)
 
 
@@ -232,31 +233,31 @@ class _Rows:
         counterfactual: CounterfactualFrames | None,
     ):
         self._store, self._table, self._names = store, table, tuple(names)
-        self._cuts = {name: make_cut(store, name, manifest.frames, manifest.rate) for name in names}
+        self._slicers = {name: make_slicer(store, name, manifest.frames, manifest.rate) for name in names}
         self._some_are_short = 0 < manifest.least < manifest.frames
         self._count, self._counterfactual = other_actions, counterfactual
-        self._other_windows = OtherWindows(store, self._cuts, manifest.frames, manifest.rate, manifest.seed)
+        self._other_windows = OtherWindows(store, self._slicers, manifest.frames, manifest.rate, manifest.seed)
         self._at = {(d.dataset, *window): i for d in manifest.datasets for i, window in enumerate(d.windows)}
         if names:
             self._statistics = store.embodiment_table(names, manifest.rate).statistics()
 
     def __call__(self, name: str, episode: int, start: int) -> dict:
-        cut, item = self._cuts[name], self._store.episode(name, "val", episode)
+        slicer, item = self._slicers[name], self._store.episode(name, "val", episode)
         width = self._table.action_width
         mean, std = (x[self._names.index(name)] for x in self._statistics)
         row = {
-            "tokens": cut.tokens(item, start),
-            "actions": cut.actions(item, start, width),
-            "images": cut.of_frames(item.frames, item, start),
+            "tokens": slicer.tokens(item, start),
+            "actions": slicer.actions(item, start, width),
+            "images": slicer.slice_frames(item.frames, item, start),
             "embodiment": np.int32(self._table.index(name)),
             "dataset": name,
             "episode": np.int32(item.episode),
-            "start": np.int32(start * cut.frame_step),
+            "start": np.int32(start * slicer.frame_step),
             "action_mean": np.pad(mean, (0, width - len(mean))),
             "action_std": np.pad(std, (0, width - len(std))),
         }
         if self._some_are_short:
-            row["real"] = cut.valid(item, start)
+            row["real"] = slicer.real_mask(item, start)
         if self._count:
             row |= self._other_actions(name, episode, start, width)
         return row | self._other_images(name, episode, start, row) if self._counterfactual else row

@@ -14,7 +14,7 @@ import numpy as np
 
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES, WindowSet, train_windows, val_windows
 
 CACHED_EPISODES = 512
@@ -32,8 +32,8 @@ class OtherWindow(NamedTuple):
 class OtherWindows:
     """Chooses windows of other episodes by a hash of the frozen window's name, and reads their actions."""
 
-    def __init__(self, store: TokenStore, cuts: dict[str, Cut], frames: int, rate: float | None, seed: int):
-        self._store, self._cuts, self._frames, self._rate, self._seed = store, cuts, frames, rate, seed
+    def __init__(self, store: TokenStore, slicers: dict[str, WindowSlicer], frames: int, rate: float | None, seed: int):
+        self._store, self._slicers, self._frames, self._rate, self._seed = store, slicers, frames, rate, seed
         self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray]] = {}
         # Copied: a view would keep the whole record, which may hold hundreds of frames.
         self._actions = lru_cache(CACHED_EPISODES)(lambda name, split, i: store.episode(name, split, i).actions.copy())
@@ -46,8 +46,8 @@ class OtherWindows:
         """
         own = int(self._store.manifest(name).val.episodes[episode])
         steps = int(self._store.manifest(name).val.steps[episode])
-        cut = self._cuts[name]
-        real = int(cut.longest(steps - start * cut.frame_step))
+        slicer = self._slicers[name]
+        real = int(slicer.max_real(steps - start * slicer.frame_step))
         seed = stream_seed(self._seed, "other actions", name, own, start)
         found: list[OtherWindow] = []
         for split in ("val", "train"):
@@ -56,9 +56,9 @@ class OtherWindows:
         return found
 
     def actions(self, name: str, others: Sequence[OtherWindow], width: int) -> np.ndarray:
-        """float32 [n, T, U = width]: the chunks of each, as `Cut.actions` cuts them."""
-        cut = self._cuts[name]
-        chunks = [cut.chunks(self._actions(name, o.split, o.episode), o.start, width) for o in others]
+        """float32 [n, T, U = width]: the chunks of each, as `WindowSlicer.actions` cuts them."""
+        slicer = self._slicers[name]
+        chunks = [slicer.chunks(self._actions(name, o.split, o.episode), o.start, width) for o in others]
         return np.stack(chunks) if chunks else np.zeros((0, self._frames, width), np.float32)
 
     def _of(self, name: str, split: str, real: int, seed: int, own: int, count: int) -> list[OtherWindow]:
@@ -82,6 +82,6 @@ class OtherWindows:
             else:
                 found = train_windows(self._store, name, self._frames, rate=self._rate)
             steps = np.asarray(self._store.manifest(name).split(split).steps, np.int64)[found.episode_idx]
-            real = found.cut.longest(steps - found.start.astype(np.int64) * found.cut.frame_step)
+            real = found.slicer.max_real(steps - found.start.astype(np.int64) * found.slicer.frame_step)
             self._sets[name, split] = found, np.asarray(real)
         return self._sets[name, split]

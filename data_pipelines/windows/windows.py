@@ -1,6 +1,6 @@
 """Windows as index arithmetic over episodes: T frames at the study's rate, each with its action chunk.
 
-Owns which windows exist; how one is cut from an episode is in `cut`. Reads no record to count them.
+Owns which windows exist; `slicer` slices one out of an episode. No record is read to count them.
 
 In an episode that is long enough every start counts whose T frames all have whole chunks. A shorter one
 gives padded windows of as many real frames as it has: at least `MIN_TRAIN_FRAMES` to train on, the prompt and one
@@ -23,7 +23,7 @@ from data_pipelines.sampling.splits import held_out_episodes, smallest_hashes, s
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.tokens.manifest import Manifest
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.windows.cut import Cut, make_cut
+from data_pipelines.windows.slicer import WindowSlicer, make_slicer
 from hma_jax.config import require
 
 MIN_TRAIN_FRAMES = 2
@@ -39,28 +39,28 @@ class WindowSet:
 
     name: str
     split: str
-    cut: Cut
-    least: int  # real frames of a window
+    slicer: WindowSlicer
+    min_real: int  # real frames of a window, at least
     episodes: np.ndarray  # int32: positions in the store
     ends: np.ndarray  # int64: windows up to and including each episode
     padded: int  # episodes whose windows are padded
     too_short: int  # episodes without a single window
-    longest: int  # native frames of the longest episode
+    longest_episode: int  # native frames of the longest episode
 
     def __len__(self) -> int:
         return int(self.ends[-1]) if len(self.ends) else 0
 
     @property
     def needed(self) -> int:
-        """Native frames that the shortest window takes."""
-        return self.least * self.cut.stride
+        """Native frames of the shortest window that is allowed."""
+        return self.min_real * self.slicer.stride
 
     def locate(self, i: int) -> tuple[int, int]:
         """(episode position in the store, start) of window `i`."""
         at = int(np.searchsorted(self.ends, i, side="right"))
         return int(self.episodes[at]), int(i - (self.ends[at - 1] if at else 0))
 
-    def siblings(self, i: int) -> tuple[int, int]:
+    def episode_range(self, i: int) -> tuple[int, int]:
         """The range [first, end) of all windows of window `i`'s episode."""
         at = int(np.searchsorted(self.ends, i, side="right"))
         return int(self.ends[at - 1]) if at else 0, int(self.ends[at])
@@ -80,15 +80,15 @@ class WindowSet:
         """int32 [windows]: the start of each window, in stored frames."""
         return (np.arange(len(self)) - np.repeat(self.ends - self.counts, self.counts)).astype(np.int32)
 
-    def shortage(self) -> str:
+    def why_empty(self) -> str:
         """Why there are no windows, for a message."""
-        if not self.longest:
+        if not self.longest_episode:
             return f"it has no {self.split} episode"
-        if self.longest >= self.needed:
+        if self.longest_episode >= self.needed:
             return "the trajectories that were drawn of it were all skipped: raise max_trajectories"
         return (
-            f"{self.least} frames, the least there may be, need {self.needed} native frames at stride "
-            f"{self.cut.stride}; the longest of its {self.too_short} {self.split} episodes has {self.longest}"
+            f"{self.min_real} frames, the least there may be, need {self.needed} native frames at stride "
+            f"{self.slicer.stride}; the longest of its {self.too_short} {self.split} episodes has {self.longest_episode}"
         )
 
 
@@ -97,13 +97,13 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
     if any(len(s) for s in sets.values()):
         return
     split = next(iter(sets.values())).split
-    reasons = "; ".join(f"{name}: {s.shortage()}" for name, s in sets.items())
-    if not any(s.longest for s in sets.values()):
+    reasons = "; ".join(f"{name}: {s.why_empty()}" for name, s in sets.items())
+    if not any(s.longest_episode for s in sets.values()):
         raise DataError(
             f"there is no {split} episode to cut windows of. {reasons}. Of a single episode none can be held out: add more. "
             "Of several, store.val_fraction, store.min_val and store.max_val say how many are, of all that there should be."
         )
-    shorter = " or a shorter prompt" if any(s.least > MIN_TRAIN_FRAMES for s in sets.values()) else ""
+    shorter = " or a shorter prompt" if any(s.min_real > MIN_TRAIN_FRAMES for s in sets.values()) else ""
     raise DataError(
         f"no {split} episode is long enough for a window. {reasons}. Use a higher rate of frames{shorter}, or datasets "
         "with more or longer episodes."
@@ -118,11 +118,11 @@ def train_windows(
     subset_seed: int = 0,
     *,
     rate: float | None = FRAME_RATE,
-    least: int = MIN_TRAIN_FRAMES,
+    min_real: int = MIN_TRAIN_FRAMES,
 ) -> WindowSet:
     """Windows of the train split, optionally of `max_trajectories` episodes chosen by hash.
 
-    Windows have `least` real frames or more, and all of theirs where the model's T are fewer.
+    Windows have `min_real` real frames or more, and all of theirs where the model's T are fewer.
 
     Subsets with one `subset_seed` are nested: 10 trajectories are among the 100. Episodes without a window
     are none of them.
@@ -131,32 +131,36 @@ def train_windows(
         max_trajectories is None or max_trajectories >= 1,
         f"max_trajectories must be at least 1, got {max_trajectories}",
     )
-    cut = make_cut(store, name, frames, rate)
-    return _windows(store, name, "train", cut, min(least, frames), max_trajectories, subset_seed)
+    slicer = make_slicer(store, name, frames, rate)
+    return _windows(store, name, "train", slicer, min(min_real, frames), max_trajectories, subset_seed)
 
 
-def val_windows(store: TokenStore, name: str, frames: int, least: int, *, rate: float | None = FRAME_RATE) -> WindowSet:
-    """Windows of the held-out split with at least `least` real frames."""
-    return _windows(store, name, "val", make_cut(store, name, frames, rate), least, None, 0)
+def val_windows(
+    store: TokenStore, name: str, frames: int, min_real: int, *, rate: float | None = FRAME_RATE
+) -> WindowSet:
+    """Windows of the held-out split with at least `min_real` real frames."""
+    return _windows(store, name, "val", make_slicer(store, name, frames, rate), min_real, None, 0)
 
 
-def _windows(store: TokenStore, name: str, split: str, cut: Cut, least: int, limit: int | None, seed: int) -> WindowSet:
-    require(1 <= least <= cut.frames, f"windows of {cut.frames} frames cannot have {least} real ones")
+def _windows(
+    store: TokenStore, name: str, split: str, slicer: WindowSlicer, min_real: int, limit: int | None, seed: int
+) -> WindowSet:
+    require(1 <= min_real <= slicer.frames, f"windows of {slicer.frames} frames cannot have {min_real} real ones")
     manifest = store.manifest(name)
     steps = np.asarray(manifest.split(split).steps, np.int64)
-    counts = cut.count(steps, least)
+    counts = slicer.count(steps, min_real)
     usable = np.flatnonzero(counts)
     chosen = usable if limit is None else _chosen(manifest, split, counts > 0, limit, f"subset/{seed}")
     return WindowSet(
         name=name,
         split=split,
-        cut=cut,
-        least=least,
+        slicer=slicer,
+        min_real=min_real,
         episodes=chosen.astype(np.int32),
         ends=np.cumsum(counts[chosen]),
-        padded=int((steps[chosen] < cut.native).sum()),
+        padded=int((steps[chosen] < slicer.native_frames).sum()),
         too_short=len(steps) - len(usable),
-        longest=int(steps.max()) if len(steps) else 0,
+        longest_episode=int(steps.max()) if len(steps) else 0,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from data_pipelines.sampling.splits import count_held_out
 from data_pipelines.tokens.manifest import JobSettings
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.windows.evalset import EvalManifest, eval_batches, spread
+from data_pipelines.windows.evalset import EvalManifest, eval_batches, subsample_windows
 from experiments.running.run_trial import PreparedData, open_prepared_data
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
@@ -79,7 +79,7 @@ def check_run(
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
     """What took how many, if so many `windows` of a robot are of too few episodes; None if they are of enough."""
     (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
-    judged, of_all = (len({episode for episode, _ in some}) for some in (spread(frozen, windows), frozen))
+    judged, of_all = (len({episode for episode, _ in some}) for some in (subsample_windows(frozen, windows), frozen))
     if judged >= MIN_EPISODES:
         return None
     token_manifest = store.manifest(robot)
@@ -130,7 +130,7 @@ def _check(
     robot: Robot,
     windows: int,
 ) -> list[Effect]:
-    batches = list(eval_batches(store, model.table, manifest.thinned(windows), BATCH, (robot.name,)))
+    batches = list(eval_batches(store, model.table, manifest.subsampled(windows), BATCH, (robot.name,)))
     valid = np.concatenate([batch["valid"] for batch in batches])
     width, chunk = model.table.action_width, robot.stride * robot.action_dim
     flat = np.concatenate([batch["actions"] for batch in batches])[..., :chunk]

@@ -13,9 +13,9 @@ from experiments.study import Study
 if TYPE_CHECKING:
     from data_pipelines.suite.spec import EmbodimentSpec
     from data_pipelines.tokens.store import TokenStore
-    from data_pipelines.windows.cut import Cut
     from data_pipelines.windows.evalset import DatasetWindows
     from data_pipelines.windows.other_actions import OtherWindows
+    from data_pipelines.windows.slicer import WindowSlicer
 
 
 def make_counterfactual(study: Study, workspace: Workspace) -> None:
@@ -28,9 +28,9 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
     from data_pipelines.suite.generate import select
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.counterfactual import CounterfactualFrames
-    from data_pipelines.windows.cut import make_cut
     from data_pipelines.windows.evalset import EvalManifest
     from data_pipelines.windows.other_actions import OtherWindows
+    from data_pipelines.windows.slicer import make_slicer
 
     store, manifest = TokenStore(workspace.store), EvalManifest.load(workspace.manifest)
     prompt = study.eval.prompt_frames
@@ -41,14 +41,14 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
                 return
         except DataError:  # it follows from what is here: made again
             pass
-    cuts = {name: make_cut(store, name, manifest.frames, manifest.rate) for name in manifest.names}
-    others = OtherWindows(store, cuts, manifest.frames, manifest.rate, manifest.seed)
+    slicers = {name: make_slicer(store, name, manifest.frames, manifest.rate) for name in manifest.names}
+    others = OtherWindows(store, slicers, manifest.frames, manifest.rate, manifest.seed)
     chosen = [d for d in manifest.datasets if d.windows and store.manifest(d.dataset).spec.action_dim]
     frames = {}
     with step(f"simulate {sum(len(d.windows) for d in chosen)} windows under other actions") as update:
         for i, dataset in enumerate(chosen):
             (spec,) = select([dataset.dataset])
-            frames[dataset.dataset] = _of_robot(spec, store, cuts[dataset.dataset], others, dataset, prompt, study)
+            frames[dataset.dataset] = _of_robot(spec, store, slicers[dataset.dataset], others, dataset, prompt, study)
             update(i + 1, len(chosen), dataset.dataset)
     CounterfactualFrames(manifest.hash(), prompt, frames).save(workspace.counterfactual)
 
@@ -56,7 +56,7 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
 def _of_robot(
     spec: EmbodimentSpec,
     store: TokenStore,
-    cut: Cut,
+    slicer: WindowSlicer,
     others: OtherWindows,
     dataset: DatasetWindows,
     prompt: int,
@@ -69,26 +69,26 @@ def _of_robot(
 
     name, size = spec.name, study.tokenizer.image_size
     own, changed, seeds, images = [], [], [], []
-    times, real = np.zeros((len(dataset.windows), cut.frames), np.int64), []
+    times, real = np.zeros((len(dataset.windows), slicer.frames), np.int64), []
     for row, (episode, start) in enumerate(dataset.windows):
-        item, first = store.episode(name, "val", episode), start * cut.frame_step
-        frames = cut.real(item, start)
-        until, end = (prompt - 1) * cut.stride, (frames - 1) * cut.stride
+        item, first = store.episode(name, "val", episode), start * slicer.frame_step
+        frames = slicer.count_real(item, start)
+        until, end = (prompt - 1) * slicer.stride, (frames - 1) * slicer.stride
         own.append(item.actions)
         changed.append(item.actions)
         for other in others.choose(name, episode, start, 1):
             other_actions, other_start = (
                 store.episode(name, other.split, other.episode).actions,
-                other.start * cut.frame_step,
+                other.start * slicer.frame_step,
             )
             changed[-1] = np.concatenate(
                 [item.actions[: first + until], other_actions[other_start + until : other_start + end]]
             )
-        times[row] = first + np.minimum(np.arange(cut.frames), frames - 1) * cut.stride
+        times[row] = first + np.minimum(np.arange(slicer.frames), frames - 1) * slicer.stride
         real.append(frames)
         seeds.append(_seed_of(store, spec, item.episode, study.suite.seed))
-        images.append(cut.of_frames(item.frames, item, start))
-    valid = np.arange(cut.frames) < np.asarray(real)[:, None]
+        images.append(slicer.slice_frames(item.frames, item, start))
+    valid = np.arange(slicer.frames) < np.asarray(real)[:, None]
     recorded = frames_under(spec, seeds, own, times, size) * valid[..., None, None, None]
     if not np.array_equal(recorded, np.stack(images)):
         raise DataError(

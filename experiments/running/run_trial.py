@@ -150,7 +150,7 @@ def validation_batches(
     from hma_jax.runtime.rows import own_rows
 
     batch = trial.train.batch
-    own, some = own_rows(execution.mesh, batch), prepared.manifest.thinned(batch)
+    own, some = own_rows(execution.mesh, batch), prepared.manifest.subsampled(batch)
     for name in trial.evaluated:  # one without windows has no batch
         for whole in eval_batches(prepared.store, table, some, batch, (name,)):
             yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from data_pipelines.suite.appearance import draw_appearance
-from data_pipelines.suite.embodiments import EMBODIMENTS, NEW
+from data_pipelines.suite.embodiments import EMBODIMENTS, UNSEEN
 from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
@@ -72,13 +72,14 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     shares, page = read_table(), [HEAD]
     families = {
-        s.family: [t for t in EMBODIMENTS if t.family == s.family] for s in sorted(EMBODIMENTS, key=lambda s: s in NEW)
+        s.family: [t for t in EMBODIMENTS if t.family == s.family]
+        for s in sorted(EMBODIMENTS, key=lambda s: s in UNSEEN)
     }
     cell = 64 * ZOOM + 2
     sheet = Image.new("RGB", (5 * (STILLS * cell + GAP), len(families) * (cell + TITLE + GAP)), "white")
     pen = ImageDraw.Draw(sheet)
     for row, (family, robots) in enumerate(families.items()):
-        note = " (never trained on by default)" if robots[0] in NEW else ""
+        note = " (never trained on by default)" if robots[0] in UNSEEN else ""
         page.append(f"<h2>{family}{note}</h2><p>{robots[0].instruction}</p><div class=row>")
         for column, spec in enumerate(robots):
             frames = clip(spec)

@@ -15,7 +15,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.import_tokens import LATENT_SCALE
 from data_pipelines.tokens.moments import Moments, merge_all
 from data_pipelines.tokens.release_folder import open_folder
-from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import train_windows
 from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.convert.official import official_shapes
@@ -129,7 +129,7 @@ def _check_starts(case: Case, data: OnDisk, one: dict[str, Any]) -> None:
         why = "we keep overlapping windows" if one["filter_overlaps"] else "our windows never leave an episode"
         case.add(Finding(label, None, note=f"not followed: {why}"))
         return
-    ours = train_windows(OneDataset((data.ends - data.firsts).tolist(), hz=2 * stride), "toy", frames, least=frames)
+    ours = train_windows(OneDataset((data.ends - data.firsts).tolist(), hz=2 * stride), "toy", frames, min_real=frames)
     got = set((data.firsts[ours.episode_idx] + ours.start).tolist())
     theirs = set(one["starts"])
     # DIFFERS: their last chunk may run over an episode's end, and they drop the last window of all.
@@ -148,13 +148,13 @@ def _check_item(case: Case, stores: dict[str, OnDisk], key: str, want: np.ndarra
     if start + frames * stride > rows[-1] + 1:
         case.add(Finding(key, None, note="not followed: its last chunk leaves the episode"))
         return
-    cut = Cut(frames, stride, frame_step=1)
+    slicer = WindowSlicer(frames, stride, frame_step=1)
     item = StoredEpisode(0, None, data.frames[rows], data.actions[rows], None)
     first = start - rows[0]
     if key.endswith("action_ids"):
-        got = cut.actions(item, first, width=data.actions.shape[1] * stride)
+        got = slicer.actions(item, first, width=data.actions.shape[1] * stride)
     else:
-        got = cut.of_frames(item.tokens, item, first)
+        got = slicer.slice_frames(item.tokens, item, first)
     case.compare(key, np.asarray(got).reshape(want.shape), want, 1e-6 if key.endswith("latents") else 0.0)
 
 

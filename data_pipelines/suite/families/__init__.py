@@ -10,9 +10,9 @@ from data_pipelines.suite.families.many_joints import HUMANOID, TENTACLES
 from data_pipelines.suite.families.pushing import ARM, OMNI, PUSHER, ROVER
 
 FAMILIES = (PUSHER, ROVER, ARM, GRIPPER, PICKER, BIMANUAL, HUMANOID, TENTACLES)
-"""Those that are trained on by default."""
+"""Families that studies train on by default."""
 
-NEWCOMERS = (OMNI, MOBILE)
-"""Those that never are: the new robots of `hma adapt`."""
+UNSEEN_FAMILIES = (OMNI, MOBILE)
+"""Families that are not: the new robots of `hma adapt`."""
 
-__all__ = ["FAMILIES", "NEWCOMERS"]
+__all__ = ["FAMILIES", "UNSEEN_FAMILIES"]

@@ -1,4 +1,4 @@
-"""Families with grippers: on a gantry, on an arm, on two arms, and on a driving base (newcomers)."""
+"""Families with grippers: on a gantry, on an arm, on two arms, and on a driving base (unseen)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Families that push: heads on rails, rovers, arms, and the holonomic bases (newcomers)."""
+"""Families that push: heads on rails, rovers, arms, and the holonomic bases (unseen)."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_pipelines.suite.embodiments import EMBODIMENTS, NEW, TRAINED, siblings, strangers
+from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED, UNSEEN, siblings, strangers
 from data_pipelines.suite.generate import MAX_EPISODES, MIN_EPISODES, episode_count
 from data_pipelines.suite.rollout import episode_lengths, episode_seeds
 from hma_jax.config import ConfigError
@@ -19,8 +19,8 @@ def test_ten_families_of_five_eight_of_them_trained_on():
     families = {s.family: [s, *siblings(s)] for s in EMBODIMENTS}
     assert len(EMBODIMENTS) == len(BY_NAME) == 50 and len(families) == 10
     assert {len(robots) for robots in families.values()} == {5}
-    assert (len(TRAINED), len(NEW)) == (40, 10)
-    assert not {s.family for s in TRAINED} & {s.family for s in NEW}
+    assert (len(TRAINED), len(UNSEEN)) == (40, 10)
+    assert not {s.family for s in TRAINED} & {s.family for s in UNSEEN}
 
 
 def test_siblings_share_what_makes_them_siblings_and_differ_in_the_rest():
@@ -42,10 +42,10 @@ def test_the_table_is_as_heterogeneous_as_promised():
     assert {s.convention for s in EMBODIMENTS} == {"absolute", "delta", "velocity"}
     assert {2, 4, 6, 8, 10, 12, 16, 20, 30} <= {s.hz for s in EMBODIMENTS}
     assert min(s.seconds[0] for s in EMBODIMENTS) == 1 and max(s.seconds[1] for s in EMBODIMENTS) == 60
-    assert sum(s.video_only for s in TRAINED) == 4 and not any(s.video_only for s in NEW)
+    assert sum(s.video_only for s in TRAINED) == 4 and not any(s.video_only for s in UNSEEN)
     assert sum(s.delay > 0 for s in EMBODIMENTS) >= 8
     assert {s.family for s in EMBODIMENTS if s.dict_actions} == {"humanoid", "mobile"}
-    assert all(s.episodes >= 64 for s in NEW), "newcomers are adapted to with up to 64 trajectories"
+    assert all(s.episodes >= 64 for s in UNSEEN), "robots are adapted to with up to 64 trajectories"
 
 
 def test_sizes_spread_over_decades_and_the_smallest_stay_small():

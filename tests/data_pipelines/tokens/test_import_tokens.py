@@ -13,7 +13,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.tokens.import_tokens import LATENT_SCALE, import_tokens, pair_folders
 from data_pipelines.tokens.release_folder import open_folder
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.windows.cut import make_cut
+from data_pipelines.windows.slicer import make_slicer
 from data_pipelines.windows.windows import train_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import GOLDEN
@@ -78,7 +78,9 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
     rows = np.arange(21)
     np.testing.assert_allclose(manifest.action_mean, [10, 5, -10])
     np.testing.assert_allclose(manifest.action_std[0], rows.std())
-    assert len(train_windows(store, "toy_arm", 3, least=3)) == 1 + 0 + 2  # 6 native frames each, starts every other one
+    assert (
+        len(train_windows(store, "toy_arm", 3, min_real=3)) == 1 + 0 + 2
+    )  # 6 native frames each, starts every other one
 
 
 def test_latents_become_scaled_patches_in_the_order_the_models_read(tmp_path):
@@ -118,7 +120,7 @@ def test_windows_of_an_imported_store_are_what_the_release_reads(tmp_path, kind,
         root = tmp_path / f"{stride}"
         manifest = import_tokens(CASE / kind, CASE / kind, root, hz=2 * stride, patch=1, frame_step=1)
         store = TokenStore(root)
-        item, cut = store.episode("toy_arm", "train", episode), make_cut(store, "toy_arm", frames, 2.0)
+        item, cut = store.episode("toy_arm", "train", episode), make_slicer(store, "toy_arm", frames, 2.0)
         if field == "action_ids":
             got = cut.actions(item, first, width=items[key].shape[1])
         else:

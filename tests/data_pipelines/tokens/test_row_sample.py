@@ -14,7 +14,15 @@ from data_pipelines.loading.selection import LoaderConfig, select_windows, train
 from data_pipelines.tokens import row_sample
 from data_pipelines.tokens import store as store_module
 from data_pipelines.tokens.manifest_file import load_manifest
-from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, Spread, merge_samples, rows_of_part
+from data_pipelines.tokens.row_sample import (
+    QUANTILES,
+    ROWS,
+    ActionRange,
+    RowSample,
+    RowSampler,
+    merge_samples,
+    rows_of_part,
+)
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config.json import from_dict, to_dict
@@ -156,13 +164,13 @@ def test_quantiles_of_some_trajectories_read_those_that_are_sampled_alone(tmp_pa
         SPEC, write_rlds(tmp_path, SPEC, [120] * 8, change=change), FakeTokenizer(), tmp_path / "s"
     )
     store, read = TokenStore(tmp_path / "s"), set()
-    whole = store.action_spread("toy", range(len(manifest.train.episodes)))
-    assert whole == Spread(manifest.action_quantiles)
-    assert manifest.embodiment(scale="quantiles", spread=whole) == manifest.embodiment(scale="quantiles")
+    whole = store.action_range("toy", range(len(manifest.train.episodes)))
+    assert whole == ActionRange(manifest.action_quantiles)
+    assert manifest.embodiment(scale="quantiles", action_range=whole) == manifest.embodiment(scale="quantiles")
     real, few = store.episode, row_sample.sampled_episodes
     monkeypatch.setattr(store, "episode", lambda *place: read.add(place[2]) or real(*place))
     monkeypatch.setattr(store_module, "sampled_episodes", lambda *rows: few(*rows, 2))
-    store.action_spread("toy", range(len(manifest.train.episodes)))
+    store.action_range("toy", range(len(manifest.train.episodes)))
     assert 1 <= len(read) <= 2
 
 
@@ -175,7 +183,7 @@ def test_quantiles_of_some_trajectories_are_of_those_alone(tmp_path):
     rlds = write_rlds(tmp_path, SPEC, [120] * 8, change=change)
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     store = TokenStore(tmp_path / "store")
-    whole = store.action_spread("toy", range(len(manifest.train.episodes)))
+    whole = store.action_range("toy", range(len(manifest.train.episodes)))
     assert (whole.quantiles, whole.low, whole.high) == (
         manifest.action_quantiles, manifest.action_min, manifest.action_max,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 from data_pipelines.errors import DataError
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
-from data_pipelines.windows.evalset import EvalManifest, eval_batches, freeze_manifest, spread
+from data_pipelines.windows.evalset import EvalManifest, eval_batches, freeze_manifest, subsample_windows
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash, to_dict
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
@@ -43,10 +43,15 @@ def test_fewer_windows_are_a_subset_of_more(store):
 
 def test_some_of_the_windows_are_of_as_many_episodes_as_can_be_and_not_of_neighbours():
     frozen = [(0, 0), (0, 4), (0, 8), (1, 4), (3, 0), (3, 8)]
-    assert spread(frozen, 3) == ((0, 0), (1, 4), (3, 0)) and spread(frozen, 4) == ((0, 0), (0, 4), (1, 4), (3, 0))
-    assert spread(frozen, 9) == tuple(frozen)
+    assert subsample_windows(frozen, 3) == ((0, 0), (1, 4), (3, 0)) and subsample_windows(frozen, 4) == (
+        (0, 0),
+        (0, 4),
+        (1, 4),
+        (3, 0),
+    )
+    assert subsample_windows(frozen, 9) == tuple(frozen)
     many = [(episode, start) for episode in range(40) for start in (0, 4)]
-    assert spread(many, 4) == ((0, 0), (10, 0), (20, 0), (30, 0))
+    assert subsample_windows(many, 4) == ((0, 0), (10, 0), (20, 0), (30, 0))
 
 
 def names_of(batch):

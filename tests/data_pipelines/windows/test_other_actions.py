@@ -7,9 +7,9 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.windows.counterfactual import CounterfactualFrames
-from data_pipelines.windows.cut import make_cut
 from data_pipelines.windows.evalset import eval_batches, freeze_manifest
 from data_pipelines.windows.other_actions import OtherWindows
+from data_pipelines.windows.slicer import make_slicer
 from data_pipelines.windows.windows import WindowSet
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
@@ -68,7 +68,7 @@ def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monke
     """Training has millions: those that are not chosen are not located, and of episodes the actions alone are kept."""
     store = small_store(tmp_path, lengths=(20,) * 8, min_val=2, max_val_fraction=0.25)
     (name,) = store.names
-    others = OtherWindows(store, {name: make_cut(store, name, 4, 2.0)}, 4, 2.0, 0)
+    others = OtherWindows(store, {name: make_slicer(store, name, 4, 2.0)}, 4, 2.0, 0)
     located, locate = [], WindowSet.locate
     monkeypatch.setattr(WindowSet, "locate", lambda self, i: located.append(i) or locate(self, i))
     chosen = others.choose(name, 0, 0, 40)
@@ -76,7 +76,7 @@ def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monke
     assert others.actions(name, chosen, 3).shape == (40, 4, 3)
     assert all(others._actions(name, o.split, o.episode).base is None for o in chosen)
     # Each window has its own order of them, and each seed.
-    again = OtherWindows(store, {name: make_cut(store, name, 4, 2.0)}, 4, 2.0, 1)
+    again = OtherWindows(store, {name: make_slicer(store, name, 4, 2.0)}, 4, 2.0, 1)
     orders = [(others, 0, 0), (others, 0, 4), (others, 0, 8), (again, 0, 0)]
     assert len({tuple(by.choose(name, episode, start, 5)) for by, episode, start in orders}) == 4
 

@@ -8,7 +8,7 @@ import pytest
 from data_pipelines.errors import DataError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.episode_record import StoredEpisode
-from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import require_windows, train_windows, val_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import OneDataset
@@ -21,7 +21,7 @@ from tests.data_pipelines.fakes import OneDataset
 @pytest.mark.parametrize("least", [2, 12])
 def test_windows_are_the_longest_that_lie_inside_one_episode(stride, frame_step, frames, least):
     steps = [1, 3, 11, 12, 13, 24, 25, 59, 60, 61, 62, 83]
-    found = train_windows(OneDataset(steps, hz=2 * stride, frame_step=frame_step), "toy", frames, least=least)
+    found = train_windows(OneDataset(steps, hz=2 * stride, frame_step=frame_step), "toy", frames, min_real=least)
     # The chunk of the last real frame is whole; T are enough.
     real = [min(n // stride, frames) for n in steps]
     least = min(least, frames)
@@ -51,10 +51,10 @@ def test_frames_and_actions_of_a_window_belong_together(steps, real):
     assert len(windows) > 0
     for i in range(len(windows)):
         _, start = windows.locate(i)
-        assert windows.cut.valid(item, start).tolist() == [t < real for t in range(4)]
-        native = windows.cut.tokens(item, start)[:, 0]
+        assert windows.slicer.real_mask(item, start).tolist() == [t < real for t in range(4)]
+        native = windows.slicer.tokens(item, start)[:, 0]
         assert native.tolist() == [start * 3 + 6 * k + 1 if k < real else 0 for k in range(4)]
-        chunks = windows.cut.actions(item, start, width=15)
+        chunks = windows.slicer.actions(item, start, width=15)
         assert chunks.shape == (4, 15) and (chunks[:, 12:] == 0).all() and (chunks[real:] == 0).all()
         assert (chunks[:real, 0:12:2] == native[:real, None] + np.arange(6)).all()
         assert (chunks[:real, 1:12:2] == native[:real, None] + np.arange(6) + 0.5).all()
@@ -66,13 +66,13 @@ def test_language_table_gives_windows():
     steps = np.random.default_rng(0).poisson(15.9, 2000).tolist()
     windows = train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12)
     assert len(windows) > 1800 and windows.padded == len(windows)
-    assert len(train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12, least=12)) == 0
+    assert len(train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12, min_real=12)) == 0
 
 
 @pytest.mark.parametrize("rate, stride", [(2.0, 5), (None, 1), (5.0, 2), (3.0, 3), (10.0, 1), (30.0, 1)])
 def test_the_rate_decides_the_stride(rate, stride):
     windows = train_windows(OneDataset([60], hz=10), "toy", 4, rate=rate)
-    assert windows.cut == Cut(frames=4, stride=stride, frame_step=1)
+    assert windows.slicer == WindowSlicer(frames=4, stride=stride, frame_step=1)
     assert len(windows) == 60 - 4 * stride + 1
 
 
