@@ -14,10 +14,10 @@ from experiments.applications import plan_actions
 from experiments.applications.plan_actions import draw, summarise
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import ActionRange, Planner
-from experiments.applications.planning.goals import goal_image_cost
+from experiments.applications.planning.goals import block_means, goal_image_cost
 from experiments.applications.planning.models import LearnedModel, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
-from experiments.applications.planning.search import SearchConfig, repeat_knots, warm_start
+from experiments.applications.planning.search import SearchConfig, SearchResult, repeat_knots, warm_start
 from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.tasks import find_task
 from hma_jax.config import ConfigError
@@ -51,6 +51,33 @@ def test_searches_that_learn_from_their_batches_beat_shooting():
     np.testing.assert_array_equal(search(plan_cem, 3)[1], search(plan_cem, 3)[1])
 
 
+@pytest.mark.parametrize("by", [plan_cem, plan_mppi])
+def test_each_batch_is_drawn_from_what_the_batch_before_says(by):
+    """Where all candidates cost the same, the first ones are the elite, and all weigh the same."""
+    rng, batches = np.random.default_rng(0), []
+    found = by(lambda c: batches.append(c) or np.ones(len(c)), CONFIG, np.full((3, 2), 0.2), np.random.default_rng(0))
+    first, second = (rng.standard_normal((16, 3, 2)) for _ in range(2))
+    np.testing.assert_array_equal(batches[0], np.clip(np.concatenate([0 * first[:1], 0.7 * first[1:]]) + 0.2, -1, 1))
+    if by is plan_cem:
+        mean = 0.1 * 0.2 + 0.9 * batches[0][:4].mean(0)
+        std = np.maximum(0.1 * 0.7 + 0.9 * batches[0][:4].std(0), 0.1)
+        np.testing.assert_array_equal(batches[1][-1], batches[0][0])  # the best so far
+        np.testing.assert_array_equal(found.plan, batches[0][0])
+    else:
+        mean, std = batches[0].mean(0), 0.7 ** (2 / 3) * 0.1 ** (1 / 3)  # of four batches, from 0.7 to 0.1
+        np.testing.assert_allclose(found.plan, batches[-1].mean(0))
+    np.testing.assert_allclose(batches[1][0], mean)
+    np.testing.assert_allclose(batches[1][1:-1], np.clip(mean + std * second[1:-1], -1, 1))
+
+
+def test_the_unit_of_costs_does_not_matter():
+    plans = [
+        plan_mppi(lambda c, by=by: by * c.sum((1, 2)), CONFIG, np.zeros((3, 2)), np.random.default_rng(0)).plan
+        for by in (1, 1000)
+    ]
+    np.testing.assert_allclose(*plans)
+
+
 def test_a_cost_that_is_not_finite_is_no_plan():
     with pytest.raises(ConfigError, match="not finite"):
         plan_cem(lambda c: np.full(len(c), np.nan), CONFIG, np.zeros((3, 2)), np.random.default_rng(0))
@@ -67,6 +94,29 @@ def test_units_span_the_recorded_range():
     units = ActionRange.of(Robot("r", 1, (0.0, -3.0), (4.0, 1.0), (0.0, 0.0)))
     np.testing.assert_allclose(units.denormalise(np.array([[-1.0, -1.0], [1.0, 1.0]])), [[0.0, -3.0], [4.0, 1.0]])
     np.testing.assert_allclose(units.denormalise(units.rest), [0.0, 0.0])
+
+
+def test_every_plan_of_a_planner_has_its_own_numbers_and_a_warm_start():
+    plan, began = np.array([[0.1], [0.2], [0.3]]), []
+
+    def search(score, config, mean, rng):
+        began.append((rng.random(), mean))
+        return SearchResult(plan, 0.0, np.zeros(1))
+
+    robot = Robot("r", 1, (-2.0,), (2.0,), (0.0,))
+    one, again, other = (Planner(search, CONFIG, None, robot, None, seed) for seed in (1, 1, 2))
+    actions = [planner.plan(2) for planner in (one, one, again, other)]
+    np.testing.assert_allclose(actions, np.full((4, 2, 1), 0.2), rtol=1e-6)
+    first, second, same, different = (number for number, _ in began)
+    assert first == same and len({first, second, different}) == 3
+    np.testing.assert_allclose(began[1][1], [[0.2], [0.3], [0.3]])
+
+
+def test_a_goal_counts_in_the_second_half_of_the_horizon():
+    goal, away = np.zeros((8, 32, 3), np.uint8), np.full((8, 32, 3), 255, np.uint8)
+    assert block_means(away).shape == (8, 16, 3)
+    cost = goal_image_cost(goal)(np.stack([[away, away, goal, goal], [goal, goal, away, goal]]))
+    assert cost.tolist() == [0, 0.5]
 
 
 def test_the_true_model_sees_what_the_robot_would():

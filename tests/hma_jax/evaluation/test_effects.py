@@ -124,3 +124,9 @@ def test_a_model_that_was_trained_without_actions_listens_to_none():
     losses = [jax.jit(make_loss(config, TABLE, setting)) for setting in settings]
     passive, forward = ([np.asarray(loss(params, batch, x * batch["actions"])) for x in (1, 3)] for loss in losses)
     assert (passive[0] == passive[1]).all() and (forward[0] != forward[1]).all()
+    # What stands in the padding of a window is no part of its loss.
+    padded = {**batch, "real": np.array([[True, True, False], [True] * 3])}
+    other = {**padded, "tokens": np.array(batch["tokens"])}
+    other["tokens"][0, 2] = (other["tokens"][0, 2] + 1) % config.factor_vocab
+    loss = jax.jit(make_loss(config, TABLE, "forward"))
+    np.testing.assert_array_equal(*(loss(params, given, batch["actions"]) for given in (padded, other)))
