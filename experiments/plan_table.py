@@ -152,7 +152,7 @@ def _places(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     return {
         trial_id(point.trial, provenance): f"{point.x:g}"
         for sweep in sweeps
-        if sweep.measured
+        if sweep.fittable
         for point in sweep.points
     }
 

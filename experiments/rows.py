@@ -234,14 +234,14 @@ def curve(
     role: str = POINT,
     scope: str = OVERALL,
     series: str = "",
-    drawn: bool = False,
+    robots_vary: bool = False,
 ) -> list[CurvePoint]:
     """The points of a curve by increasing x; none where no trial has the metric.
 
     sem^2 = variance over seeds / seeds + mean of each seed's sem^2 over episodes: all seeds are judged
-    on the same windows, so that the second part does not shrink with their number. Where robots are `drawn` for every
-    seed (`Sweep.drawn`), windows are others too, and what they do is within the variance over seeds: the first part is
-    all, where there are several.
+    on the same windows, so that the second part does not shrink with their number. Where robots are `robots_vary` for
+    every seed (`Sweep.robots_vary`), windows are others too, and what they do is within the variance over seeds: the
+    first part is all, where there are several.
     """
     groups: dict[float, list[Row]] = defaultdict(list)
     for r in rows:
@@ -253,7 +253,7 @@ def curve(
         means = [r.mean for r in group]
         mean = add_up(means) / len(means)
         spread = add_up((m - mean) ** 2 for m in means) / max(len(means) - 1, 1) / len(means)
-        episodes = add_up(r.sem**2 for r in group) / len(group) if len(group) == 1 or not drawn else 0.0
+        episodes = add_up(r.sem**2 for r in group) / len(group) if len(group) == 1 or not robots_vary else 0.0
         points.append(
             CurvePoint(
                 x, mean, sem=math.sqrt(spread + episodes),

@@ -51,7 +51,7 @@ def judge_at_best(
     steps, where its episodes can be halved. Raises NotComparable."""
     rows = []
     for sweep in sweeps:
-        if not (sweep.measured and sweep.several) or sweep.valley:
+        if not (sweep.fittable and sweep.has_series) or sweep.interior_minimum:
             continue
         tables_by_steps: dict[float, dict[int, dict[int, WindowTable]]] = defaultdict(lambda: defaultdict(dict))
         for point in sweep.points:

@@ -45,7 +45,7 @@ class Change:
 def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[Change]:
     """Of every curve over a number, between its outermost points that are finished. Raises NotComparable."""
     found = []
-    for sweep in (s for s in sweeps if s.measured):
+    for sweep in (s for s in sweeps if s.fittable):
         for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
             ends = _ends(sweep, series, provenance, windows)
             if ends is not None:

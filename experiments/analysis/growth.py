@@ -52,7 +52,7 @@ def find_growth(
     """Of axes along which the cap of trajectories changes, between neighbouring points that have seeds in common.
     `episodes` are the training ones that each robot has. Raises NotComparable."""
     found = []
-    for sweep in (s for s in sweeps if s.measured):
+    for sweep in (s for s in sweeps if s.fittable):
         for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
             own = [p for p in sweep.points if (p.role, p.series, p.scope) == (POINT, series, ())]
             if len({p.trial.max_trajectories for p in own}) > 1 and all(keeps_shares(p.trial) for p in own):

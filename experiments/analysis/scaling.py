@@ -59,7 +59,7 @@ def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
     """One for every sweep along which a loss may fall as a power, and each of its series."""
     found = []
     for sweep in sweeps:
-        if not sweep.measured or sweep.valley:
+        if not sweep.fittable or sweep.interior_minimum:
             continue
         lines: dict[str, list[Point]] = defaultdict(list)
         for point in sweep.points:
@@ -75,7 +75,7 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tup
     groups: dict[str, dict[str, Trial]] = defaultdict(dict)
     for sweep in sweeps:
         for point in sweep.points:
-            if point.role == POINT and sweep.measured:
+            if point.role == POINT and sweep.fittable:
                 groups[_all_but_size(point.trial)][trial_id(point.trial, provenance)] = point.trial
 
     def varies(group: dict[str, Trial], what: Callable[[Trial], float]) -> bool:

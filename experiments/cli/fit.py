@@ -101,7 +101,7 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
     if axis not in {s.name for s in sweeps}:
         sweeps = plan_sweeps(study, (*record.axes, axis), workspace.root)
     sweep = next((s for s in sweeps if s.name == axis), None)
-    if sweep is None or not sweep.measured:
+    if sweep is None or not sweep.fittable:
         raise ConfigError(f"--predict {target}: {axis} is no axis over a number")
     own = next((a for a, s in zip(record.axes, sweeps, strict=False) if s is sweep and is_file(a)), None)
     how = f"in {short(workspace.root / own)}" if own else "with --set"
@@ -137,7 +137,7 @@ def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: 
 
     name, _, text = target.rpartition("=")
     require(
-        not sweep.valley,
+        not sweep.interior_minimum,
         f"--predict {target}: along {sweep.name} the loss is lowest within, where no power law holds; `hma fit STUDY` "
         "says which size is best for a budget (isoflop)",
     )

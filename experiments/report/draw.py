@@ -102,7 +102,7 @@ def draw_figures(
         (workspace.figures / f"{name}.png").unlink(missing_ok=True)
     for sweep in sweeps:
         plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
-    plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")
+    plot_overview(rows, [s for s in sweeps if s.single_curve], workspace.figures / "scaling.png")
     if numbers is not None:
         plot_fits(numbers.fits, numbers.outcomes, workspace.figures / "fits.png")
         plot_isoflop(numbers.isoflop, workspace.figures / "isoflop.png")

@@ -71,16 +71,16 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
         where += f", seed {', '.join(map(str, e.seeds))}" if e.seeds else ""
         predicted = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
         observed = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
-        curve = [html.escape(e.series)] if sweep.several else []
+        curve = [html.escape(e.series)] if sweep.has_series else []
         metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
     ran = [c for c in own if c.observed is not None]
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
-    head = ["curve"] * sweep.several + [sweep.axis, "", "predicted", "came", "", "seeds"]
+    head = ["curve"] * sweep.has_series + [sweep.axis, "", "predicted", "came", "", "seeds"]
     return (
         f"<h4>Written down before</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals hold what came. "
         f"By its author's word they were written before the trials ran, in {commits}. Errors are over seeds.</p>"
-        f"<details><summary>Predicted and came</summary>{table(head, lines, text=2 + sweep.several)}</details>"
+        f"<details><summary>Predicted and came</summary>{table(head, lines, text=2 + sweep.has_series)}</details>"
     )
 
 

@@ -176,7 +176,7 @@ def _headline(
 
 
 def _at_default(rows: Sequence[Row], sweep: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
-    points = curve(rows, sweep.name, metric, role, drawn=sweep.drawn)
+    points = curve(rows, sweep.name, metric, role, robots_vary=sweep.robots_vary)
     return next((p for p in points if p.x == sweep.reference_x), None)
 
 
@@ -199,12 +199,12 @@ def _curves(
         return describe(sweep, rows, optima, along) + describe_expected(sweep, outcomes) + said
 
     sections = []
-    scaling = [s for s in sweeps if s.scaling]
+    scaling = [s for s in sweeps if s.single_curve]
     if scaling:
         overview = picture(workspace.figures / "scaling.png", "Scaling curves")
         sections.append(section("Scaling curves", overview, *(say(s) for s in scaling)))
     for sweep in sweeps:
-        if not sweep.scaling:
+        if not sweep.single_curve:
             title = sweep.title or sweep.axis.capitalize()
             figure = picture(workspace.figures / f"{sweep.name}.png", title)
             sections.append(section(title, figure, say(sweep)))

@@ -43,7 +43,7 @@ def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
     with plt.rc_context(STYLE):
         if sweep.labels:
             figure = plot_names(rows, sweep)
-        elif sweep.several:
+        elif sweep.has_series:
             figure = plot_family(rows, sweep)
         else:
             metrics = drawn_metrics(rows, [sweep.name])
@@ -82,7 +82,7 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
 
 def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     """One curve with standard errors, every seed's point, and the reference lines."""
-    points = curve(rows, sweep.name, metric, drawn=sweep.drawn)
+    points = curve(rows, sweep.name, metric, robots_vary=sweep.robots_vary)
     colour = COLOURS[metric]
     if points:
         xs = [p.x for p in points]
@@ -99,7 +99,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
         _x_axis(panel, points, sweep)
     else:
         show_nothing(panel)
-    show_control(panel, curve(rows, sweep.name, metric, CONTROL, drawn=sweep.drawn))
+    show_control(panel, curve(rows, sweep.name, metric, CONTROL, robots_vary=sweep.robots_vary))
     if metric in ON_LOG:
         plain_log(panel, panel.yaxis)
         for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve
@@ -108,7 +108,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     show_tally(panel, rows, sweep.name)
-    whose = " · controls: on their seed's robots alone" if sweep.drawn else ""
+    whose = " · controls: on their seed's robots alone" if sweep.robots_vary else ""
     name_axis(panel, sweep.axis + (" · trunk parameters" if sweep.name == "width" else "") + whose)
     panel.set_ylabel(LABELS[metric])
 

@@ -42,13 +42,13 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along
         numbers = _names(sweep, rows)
     elif sweep.base:
         numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
-    elif sweep.several:
+    elif sweep.has_series:
         names = all_series(rows, sweep.name).get(POINT, [])
         numbers = "".join(_series(sweep, rows, name, along.changes) for name in names)
         numbers += _growth(sweep, along.growth) + _at_best(sweep, along.best)
     else:
         numbers = _curve(sweep, rows, along.changes) + _growth(sweep, along.growth)
-    heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
+    heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.single_curve else ""
     return f"{heading}<p>{html.escape(sweep.question)} Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
 
 
@@ -109,7 +109,7 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
 def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePoint]]:
     """{metric: {x: point}} of the metrics that there are."""
     metrics = drawn_metrics(rows, [sweep.name])
-    return {m: {p.x: p for p in curve(rows, sweep.name, m, drawn=sweep.drawn)} for m in metrics}
+    return {m: {p.x: p for p in curve(rows, sweep.name, m, robots_vary=sweep.robots_vary)} for m in metrics}
 
 
 def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Change]) -> str:
@@ -179,7 +179,7 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
     for metric in columns:
         head += [HEADINGS[metric], "to the default"]
     judged, whose = "all variants are judged on the same windows", ""
-    if sweep.drawn:
+    if sweep.robots_vary:
         judged = "each seed judges robots of its own, all variants on the same windows of these"
         whose = " The default trained on shuffled actions is of one seed and its robots: not to be held against means."
     return table([*head, "seeds"], lines) + (

@@ -64,7 +64,7 @@ def plan(study: Study) -> Sweep:
         "another suits so few better, their loss is an upper bound.",
         gain="compute",
         title="Equal compute",
-        valley=True,
+        interior_minimum=True,
     )
 
 

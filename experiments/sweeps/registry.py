@@ -131,7 +131,7 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
         len(drawn) < 2, f"{where}: some points have a series and others none, which no figure shows beside each other"
     )
     require(
-        not (sweep.labels and sweep.several),
+        not (sweep.labels and sweep.has_series),
         f"{where} has labels and several series: an axis of names has one point a name and seed, so put what differs "
         "into the names",
     )

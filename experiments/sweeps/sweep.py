@@ -44,27 +44,27 @@ class Sweep:
     title: str = ""  # of its section on the page; sweeps over one number share a section
     labels: tuple[str, ...] = ()  # an axis of names: x counts into these
     reference_x: float | None = None  # of its default: the reference trial, or one that takes its place on this axis
-    base: str = ""  # of several series, the one whose best x the others are to use
-    valley: bool = False  # the loss is expected to be lowest within, not at the end
+    base: str = ""  # of several series, the one whose best x is transferred to the others
+    interior_minimum: bool = False  # the loss is expected to be lowest inside the axis, not at an end: no power law
 
     @property
-    def several(self) -> bool:
+    def has_series(self) -> bool:
         """Whether it has several curves."""
         return any(point.series for point in self.points)
 
     @property
-    def scaling(self) -> bool:
+    def single_curve(self) -> bool:
         """Whether it is one curve over a number."""
-        return not self.labels and not self.several
+        return not self.labels and not self.has_series
 
     @property
-    def measured(self) -> bool:
-        """Whether x says how much of something there is, on one curve or several: what a law can be fitted to."""
+    def fittable(self) -> bool:
+        """Whether x is a quantity, so that a power law over it can be fitted, on one curve or several."""
         return not self.labels and not self.base
 
     @property
-    def drawn(self) -> bool:
-        """Whether seeds are judged on robots of their own: their windows differ."""
+    def robots_vary(self) -> bool:
+        """Whether every seed is judged on robots of its own, so that their windows differ."""
         places = {(p.x, p.series, p.role) for p in self.points}
         return len({(p.x, p.series, p.role, p.scope) for p in self.points}) > len(places)
 
@@ -74,7 +74,7 @@ class Sweep:
 
     def remark(self, point: Point) -> str:
         """What the title of a point's trial does not say; '' where it says all."""
-        if point.role == CONTROL or self.scaling:
+        if point.role == CONTROL or self.single_curve:
             return ""
         if self.labels:
             return self.label(point.x)
@@ -226,7 +226,7 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     for sweep in sweeps:
         for point in sweep.points:
             add(point.trial, sweep.remark(point))
-            if sweep.scaling and point.x != sweep.reference_x:
+            if sweep.single_curve and point.x != sweep.reference_x:
                 places.setdefault(trial_id(point.trial, provenance), f"{sweep.axis} {point.x:g}")
     for sweep in sweeps:
         for point in sweep.points:

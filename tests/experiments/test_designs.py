@@ -83,7 +83,7 @@ def test_judged_robots_are_others_for_every_seed_and_each_of_another_family():
 
 
 def test_the_axes_are_known_whose_seeds_are_judged_on_other_windows():
-    assert {name for name, sweep in SWEEPS.items() if sweep.drawn} == {"dilution", "transfer", "newcomers"}
+    assert {name for name, sweep in SWEEPS.items() if sweep.robots_vary} == {"dilution", "transfer", "newcomers"}
 
 
 def test_sets_of_robots_are_nested_and_hold_the_judged():

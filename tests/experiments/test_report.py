@@ -115,7 +115,7 @@ def test_curve_joins_seeds_and_windows(drawn):
 def test_errors_of_robots_drawn_for_every_seed_count_their_windows_once(drawn, tmp_path, monkeypatch):
     """What windows do to the mean of a seed is within the spread over seeds, if they are others for each."""
     rows, sweep = rows_of(drawn, [plan_width(STUDY)]), plan_width(STUDY)
-    one, several = curve(rows, "width", "perplexity", drawn=True)
+    one, several = curve(rows, "width", "perplexity", robots_vary=True)
     assert several.sem == several.seed_sem > 0 and one.sem == curve(rows, "width", "perplexity")[0].sem > 0
     kept = []
     monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))

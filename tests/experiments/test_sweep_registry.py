@@ -28,7 +28,7 @@ def test_every_file_with_a_plan_is_registered():
 def test_every_axis_says_what_the_page_needs():
     for axis, sweep in zip(AXES, plan_sweeps(CPU_FULL, AXES), strict=True):
         assert sweep.name == axis and sweep.question and sweep.gain
-        assert sweep.title or sweep.scaling, f"{axis} has a section of its own, without a title"
+        assert sweep.title or sweep.single_curve, f"{axis} has a section of its own, without a title"
 
 
 def test_every_axis_is_a_program_of_its_own():

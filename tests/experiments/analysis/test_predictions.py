@@ -235,6 +235,6 @@ def test_of_several_curves_one_is_chosen(root, capsys):
 
 
 def test_nothing_is_predicted_where_the_lowest_loss_is_within(root, capsys):
-    with_own_axis(root, "replace(sweep, valley=True)")
+    with_own_axis(root, "replace(sweep, interior_minimum=True)")
     assert predict_own(root, "own") == 2
     assert "along own the loss is lowest within, where no power law holds" in " ".join(capsys.readouterr().err.split())
