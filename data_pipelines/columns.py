@@ -77,7 +77,7 @@ class Columns:
             size = os.fstat(file.fileno()).st_size
             start = file.read(_START)
             if len(start) < _START or start[: len(MAGIC)] != MAGIC:
-                raise self._damaged("it does not begin as such a file")
+                raise self._damaged("it does not begin like such a file")
             length = int.from_bytes(start[len(MAGIC) : len(MAGIC) + 8], "little")
             header = file.read(min(length, size))
         if hashlib.sha256(header).digest() != start[-32:]:
@@ -87,7 +87,7 @@ class Columns:
             self.facts: dict[str, Any] = values["facts"]
             self._table = {name: (str(d), int(n), int(at), str(h)) for name, (d, n, at, h) in values["columns"].items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise self._damaged(f"its header is no table ({error})") from error
+            raise self._damaged(f"its header is not a table ({error})") from error
         self._begin, self._size = _aligned(_START + length), size
         self._mapped: dict[str, np.ndarray] = {}
 
@@ -115,7 +115,7 @@ class Columns:
             dtype, count, at, digest = self._entry(name)
             nbytes = count * int(dtype[-1]) if dtype in DTYPES else -1
             if nbytes < 0 or count < 0 or at < 0 or self._begin + at + nbytes > self._size:
-                raise self._damaged(f"its column {name!r} does not lie inside of it")
+                raise self._damaged(f"its column {name!r} reaches beyond the end of the file")
             if count:
                 array = np.memmap(self.path, dtype, "r", self._begin + at, (count,)).view(np.ndarray)
             else:
@@ -141,7 +141,7 @@ class Column(Sequence[int]):
         array = values if isinstance(values, np.ndarray) else np.fromiter(values, np.int64)
         self._array: np.ndarray | None = array.astype(dtype)
         if array.ndim != 1 or not np.array_equal(self._array, array):
-            raise ValueError(f"{array.dtype} {list(array.shape)} is no column of {dtype}")
+            raise ValueError(f"{array.dtype} {list(array.shape)} is not a column of {dtype}")
         self._lazy: tuple[Columns, str] | None = None
 
     @classmethod

@@ -13,7 +13,7 @@ MAX_LISTED = 6
 """Cases that a message lists one by one; of the others it gives the number. Of a dataset that was fetched in part,
 every shard may be damaged."""
 
-ADVICE = re.compile(r"[.;] (?:Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
+ADVICE = re.compile(r"[.;] (?:Download|Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
 """The end of a message that says how damage is left out."""
 
 
@@ -60,8 +60,8 @@ class CorruptRecordError(EpisodeError):
         self.offset = offset
         self.reason = reason
         super().__init__(
-            f"{path}: corrupt record at byte {offset}: {reason}. "
-            "Fetch the file again, or read the dataset with corrupt='skip' to leave the record out."
+            f"{path}: corrupt record at byte {offset}: {reason}. Download the file again, or read the dataset with "
+            "corrupt='skip' to leave the record out."
         )
 
     def __reduce__(self):

@@ -68,9 +68,9 @@ def _read(path: Path | UPath, if_missing: str) -> bytes:
 
 def _parse(text: bytes, where: object, advice: str) -> Any:
     if len(text) > MAX_BYTES:
-        raise DataError(f"{where} has more than {MAX_BYTES:,} bytes, too many for what it should say. {advice}")
+        raise DataError(f"{where} has more than {MAX_BYTES:,} bytes, too many for such a file. {advice}")
     if len(text) > MAX_VALUES and sum(map(text.count, STRUCTURE)) > MAX_VALUES:
-        raise DataError(f"{where} has more than {MAX_VALUES:,} values, too many for what it should say. {advice}")
+        raise DataError(f"{where} has more than {MAX_VALUES:,} values, too many for such a file. {advice}")
     try:
         return json.loads(text.decode("utf-8-sig"))
     except ValueError as error:

@@ -25,7 +25,7 @@ def is_dataset_name(text: object) -> bool:
 def safe_join(root: Path, text: object) -> Path:
     """`root` / `text`. Raises ValueError, saying why, unless `text` is a relative path that stays below `root`."""
     if not isinstance(text, str) or not 0 < len(text) <= MAX_PATH_LENGTH or not text.isprintable():
-        raise ValueError(f"{quote(text)} is no path of up to {MAX_PATH_LENGTH} printable characters")
+        raise ValueError(f"{quote(text)} is not a path of up to {MAX_PATH_LENGTH} printable characters")
     if text[0] == "/" or "\\" in text or ".." in text.split("/"):
         raise ValueError(f"{quote(text)} leaves the dataset's directory")
     return root / text

@@ -56,8 +56,11 @@ class TrueSimulator(ABC, Generic[W]):
         require_choice(outside, get_args(Outside), "outside")
         for robot in robots:
             dim = self.dims().get(robot.name)
-            require(dim is not None, f"there is no robot {robot.name!r}: it has no true simulator here")
-            require(robot.action_dim == dim, f"{robot.name} has {dim} action values in truth, not {robot.action_dim}")
+            require(dim is not None, f"robot {robot.name!r} has no true simulator here")
+            require(
+                robot.action_dim == dim,
+                f"{robot.name} has {dim} action values in the true simulator, not {robot.action_dim}",
+            )
         self.robots = {robot.name: robot for robot in robots}
         self.starts: tuple[Start, ...] = ()
         self.outside, self.image_size = outside, image_size
@@ -96,7 +99,7 @@ class TrueSimulator(ABC, Generic[W]):
         require(len(each) == len(which), f"{len(which)} episodes need as many starts, got {len(each)}")
         for start in each:
             require(start.robot in self.robots, f"no robot {start.robot!r} here; there are {', '.join(self.robots)}")
-            require(start.seed is not None, f"the start of {start.robot} does not say with which seed the truth begins")
+            require(start.seed is not None, f"the start of {start.robot} has no seed for the true simulator")
         for b, start in zip(which, each, strict=True):
             now = self._worlds[b]
             again = now is not None and now[1].name == start.robot
@@ -136,7 +139,9 @@ class TrueSimulator(ABC, Generic[W]):
         worlds = {b: self._begun(b)[0] for b in which}
         for b in which:
             max_rewind = self.max_rewind(b)
-            require(0 <= frames <= max_rewind, f"episode {b} can be taken back by {max_rewind} frames, not by {frames}")
+            require(
+                0 <= frames <= max_rewind, f"in episode {b} at most {max_rewind} frames can be rewound, got {frames}"
+            )
         for b, world in worlds.items():
             before = self._before[b]
             if frames:

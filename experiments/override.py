@@ -34,7 +34,7 @@ def override(study: Study, settings: Sequence[str], model: ModelConfig | None = 
         if not separator and path.split(".")[-1] == "help":
             _show(values, path.removesuffix("help").removesuffix("."))
             raise SystemExit(0)
-        advice = "write it as path=value, such as model.frames=4; --set help shows what there is"
+        advice = "write it as path=value, such as model.frames=4; --set help lists all settings"
         require(bool(separator), f"--set {setting}: {advice}")
         _assign(values, path.strip(), text.strip())
     return from_dict(Study, values)

@@ -45,25 +45,25 @@ class StudyArguments:
 
     preset: Preset = "cpu"
     """Named study: smoke (seconds), cpu (minutes), cpu-full (half a day), accelerator (one GPU), paper (as published).
-    With -continuous: on latents instead of ids. play: the model of `make play`."""
+    With -continuous: tokens are latents instead of ids. play: the model of `make play`; play-gpu: larger."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/PRESET)")] = None
-    """Directory for everything that is written."""
+    """Directory for all output."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]", help_behavior_hint="(default: the simulated suite)")] = ()
-    """Your datasets: RLDS directories (paths, or URLs such as gs://...), LeRobot folders, robomimic files. Their names
-    must be in the registry."""
+    """Your datasets: RLDS directories (paths, or URLs such as gs://...), LeRobot folders, robomimic files.
+    Their names must be in the registry."""
     registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None
-    """TOML file with registry entries of your own, as `hma data inspect --entry` writes it."""
+    """TOML file with your own registry entries, as `hma data inspect --entry` writes it."""
     mixture: Annotated[str | None, arg(metavar="NAME"), UNSET] = None
-    """Named list of datasets, such as dataset10; --data then takes the directories that hold them."""
+    """Named list of datasets, such as dataset10; --data then takes the directories that contain them."""
     tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None
     """Directory of a tokenizer to use, instead of training one on the data.
-    The model's tokens follow it."""
+    It sets the model's number and kind of tokens."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
     """Change one setting, such as --set model.frames=4 --set train.steps=100.
-    --set help shows all, --set model.help those of a group."""
+    --set help lists all settings, --set model.help those of a group."""
     mesh: Annotated[tuple[int, int, int] | None, arg(metavar="DATA FSDP TENSOR"), UNSET] = None
-    """Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
-    Short for --set execution.mesh.data=... and so on. No result depends on it."""
+    """Number of devices for data, fsdp and tensor parallelism; -1 takes all that are left.
+    Short for --set execution.mesh.data=... and so on. Does not change results."""
 
     def anywhere(self) -> StudyArguments:
         """The same, meant in the same way from any working directory. Raises ConfigError for an `out` at a URL."""

@@ -26,8 +26,8 @@ class Described(NamedTuple):
 
 def show_settings(found: list[Described], title: str) -> None:
     table = tidy_table(title, "setting")
-    table.add_column("is", overflow="fold")
-    table.add_column("what it is", min_width=30)
+    table.add_column("value", overflow="fold")
+    table.add_column("meaning", min_width=30)
     for one in found:
         table.add_row(one.path, escape(one.value), escape(one.text))
     console.print(table)

@@ -34,9 +34,10 @@ from hma_jax.config.base import require_seed
 class SuiteConfig:
     """The simulated datasets; not used when a study runs on the user's own."""
 
-    scale: float = 1.0  # multiplies the largest dataset's number of episodes
-    fewest: int = 8  # episodes of the smallest dataset; what lies between is stretched evenly in the logarithm
-    seed: int = 0  # of episodes and appearances
+    scale: float = 1.0  # factor on the number of episodes of the largest dataset
+    # Episodes of the smallest dataset; the sizes of the others are interpolated in the logarithm.
+    fewest: int = 8
+    seed: int = 0  # random seed of episodes and appearances
     validation: int = 24  # held-out episodes of every dataset
 
     def __post_init__(self):
@@ -48,19 +49,20 @@ class SuiteConfig:
 class StoreConfig:
     """What the token store keeps (`data_pipelines.tokens.tokenize_job`)."""
 
-    val_fraction: float = VAL_FRACTION  # of episodes that are held out
-    min_val: int = MIN_VAL  # held-out episodes per dataset, at least
-    max_val: int = MAX_VAL  # and at most
-    max_val_fraction: float = MAX_VAL_FRACTION  # of a dataset, at most, whatever min_val says
-    frame_step: int | None = None  # None: only the frames of the study's rate; 1: those of any rate
-    corrupt: Literal["raise", "skip"] = "raise"  # damaged records: stop, or leave out and count
-    max_skipped: float = 16.0  # damaged episodes per dataset that may be left out; below 1: this share of them
+    val_fraction: float = VAL_FRACTION  # fraction of episodes that are held out
+    min_val: int = MIN_VAL  # smallest number of held-out episodes per dataset
+    max_val: int = MAX_VAL  # largest number of held-out episodes per dataset
+    # Largest fraction of a dataset that is held out; takes precedence over min_val.
+    max_val_fraction: float = MAX_VAL_FRACTION
+    frame_step: int | None = None  # store every N-th native frame; 1: all; null: those of the study's rate
+    corrupt: Literal["raise", "skip"] = "raise"  # at a damaged record, stop with an error, or leave it out and count it
+    max_skipped: float = 16.0  # largest number of damaged episodes per dataset to leave out; below 1: a fraction
 
     def __post_init__(self):
         m = self.max_skipped
         require(
             m >= 0 and (m < 1 or float(m).is_integer()),
-            f"store.max_skipped must be a whole number of episodes or, below 1, a share of them, got {m:g}",
+            f"store.max_skipped must be a whole number of episodes or, below 1, a fraction of them, got {m:g}",
         )
         # As tokenising asks for them, which may come hours later.
         check_bounds(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, "store.")
@@ -74,12 +76,12 @@ class StoreConfig:
 class TransferConfig:
     """The grid of the learning-rate sweep (`transfer_lr`), on a smaller trial if so declared."""
 
-    rates: int = 5  # per width; an odd number, so that one is in the middle
-    factor: float = 2.0  # between one rate and the next
-    shift: int = 0  # how many rates the middle is above the study's own
-    widths: tuple[int, ...] = ()  # (): those of the study
-    datasets: int | None = None  # only the first so many; None: all
-    steps: int | None = None  # None: as many as every other trial
+    rates: int = 5  # number of learning rates per width; odd, so that one is in the middle
+    factor: float = 2.0  # ratio of neighbouring learning rates
+    shift: int = 0  # move the grid up by this many rates; 0: the study's own rate is in the middle
+    widths: tuple[int, ...] = ()  # widths of the sweep; []: those of the study
+    datasets: int | None = None  # train on the first N datasets only; null: all
+    steps: int | None = None  # training steps; null: those of the study
 
     def __post_init__(self):
         require(
@@ -99,22 +101,26 @@ class DesignConfig:
     `compute`, `horizon`, `lr_horizon`); the demonstration has none of them. Fields of steps name decay branches of
     runs that trials share (`experiments.running.shared_runs`)."""
 
-    judged: int = 5  # robots drawn at random, others for every seed, on whom designs over robots judge
-    counts: tuple[int, ...] = (5, 10, 20, 40)  # robots in the mixture
-    poor: int = 8  # trajectories of the judged robots, where they are to be poor
-    kinship: int = 20  # robots in the mixture where newcomers are siblings or strangers
-    shots: tuple[int, ...] = (4, 16, 64)  # trajectories of each unseen robot
-    shots_after: tuple[int, ...] = (5, 20, 40)  # robots that the model knows by then
-    shots_steps: int = 1000  # of adapting
-    caps: tuple[int, ...] = (4, 16, 64, 256)  # trajectories per robot at most; the last point has all
-    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference; those of `train` are added
-    long: tuple[int, ...] = ()  # more steps of the reference, of the first seed alone
-    compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # steps of the reference whose FLOPs every width may use
-    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at fewest steps and at those of `train`
-    ablation_steps: int | None = None  # of `settings` and `conditioning`; None: as many as every other trial
-    end_controls: bool = False  # controls at both ends of an axis, not at the reference alone
-    # Other episodes' actions that all are judged under but the reference, at any steps, and its control; None: as many
-    # as `eval` says.
+    # dilution, transfer, newcomers: number of judged robots (those that are evaluated), drawn at random for every seed.
+    judged: int = 5
+    counts: tuple[int, ...] = (5, 10, 20, 40)  # dilution, transfer: numbers of robots in the mixture
+    poor: int = 8  # newcomers: trajectories of each judged robot
+    kinship: int = 20  # newcomers: robots in the mixture where the newcomers are siblings, or strangers
+    shots: tuple[int, ...] = (4, 16, 64)  # fewshot: numbers of trajectories of each unseen robot
+    shots_after: tuple[int, ...] = (5, 20, 40)  # fewshot: numbers of robots that the model was trained on before
+    shots_steps: int = 1000  # fewshot: steps in which the unseen robots are added
+    # episodes: largest numbers of trajectories per robot; one more point has all.
+    caps: tuple[int, ...] = (4, 16, 64, 256)
+    # horizon: numbers of steps of the reference trial; train.steps is added. The first is the short one of lr_horizon.
+    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)
+    long: tuple[int, ...] = ()  # horizon, ladder: further numbers of steps, for the first seed only
+    compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # compute: budgets, as steps of the reference trial
+    # lr_horizon: factors on the learning rate, at the smallest number of steps and at train.steps.
+    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)
+    ablation_steps: int | None = None  # settings, conditioning, ladder: training steps; null: train.steps
+    end_controls: bool = False  # train controls at both ends of an axis, not only at the reference trial
+    # Replaces eval.other_actions for all trials but the reference trial, at any number of steps, and its control; null:
+    # eval.other_actions for all.
     other_actions: int | None = None
 
     def __post_init__(self):
@@ -144,35 +150,36 @@ class Study:
     """One scaling study. The reference trial, which most axes share, uses all datasets, the
     largest trajectory count and the base model."""
 
-    name: str  # that of the preset, shown in titles
+    name: str  # name of the preset, shown in titles
     model: ModelConfig
     train: TrainConfig
     eval: EvalConfig
-    dataset_counts: tuple[int, ...]  # the first of them is of the robots that the axis is judged on
-    trajectory_counts: tuple[int, ...]  # per dataset
-    widths: tuple[int, ...]  # of the width axis, which has the reference trial's as well
+    dataset_counts: tuple[int, ...]  # axis datasets: numbers of datasets; all are evaluated on those of the first
+    trajectory_counts: tuple[int, ...]  # axis trajectories: largest numbers of trajectories per dataset
+    widths: tuple[int, ...]  # axis width: widths; that of the reference trial is added
     tokenizer: AnyTokenizerConfig = field(default_factory=TokenizerConfig)
     tokenizer_train: TokenizerTrainConfig = field(default_factory=TokenizerTrainConfig)
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
-    datasets: tuple[str, ...] = ()  # in the order they are added; () takes the suite's own order
-    tau: float = 3.0  # temperature of the mixture
-    # Hz at which frames are seen: 2 in the paper's pre-training; null, the native rate, in its post-training. An
+    datasets: tuple[str, ...] = ()  # datasets, in the order in which the axis datasets adds them; []: the suite's
+    tau: float = 3.0  # temperature of the mixture: a dataset with n windows has weight n^(1/tau)
+    # Frames per second of the model: 2 in the paper's pre-training; null, the native rate, in its post-training. An
     # entry of the registry may have its own.
     rate: float | None = 2.0
-    # Whose windows weigh in the mixture: those of the trajectories that are used, as in the release's sampler, or
-    # all, so that on the trajectories axis nothing but the trajectories changes.
+    # Which windows give the weights of the mixture: those of the trajectories that are used, as in the release, or
+    # all, so that on the axis trajectories the weights stay the same.
     weighed: Literal["used", "all"] = "used"
-    seeds: tuple[int, ...] = (0,)  # of initial values, order of data and subsets of trajectories together
-    ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
+    seeds: tuple[int, ...] = (0,)  # random seeds of trials: of initial values, order of data and choice of trajectories
+    ablation_seeds: tuple[int, ...] = (0, 1, 2)  # random seeds of the ablations, whose error bars are over seeds
     transfer: TransferConfig = field(default_factory=TransferConfig)
     designs: DesignConfig = field(default_factory=DesignConfig)
-    axes: tuple[str, ...] = ("datasets", "trajectories", "width")  # what `hma study` runs
-    judged: Literal["first", "drawn"] = "first"  # on the datasets axis: the first datasets, or random ones per seed
-    unseen: tuple[str, ...] = ()  # robots that no model is trained on but to adapt to them
+    axes: tuple[str, ...] = ("datasets", "trajectories", "width")  # sweeps that `hma study` runs
+    # Axis datasets: evaluate on the first datasets, or on random ones for every seed.
+    judged: Literal["first", "drawn"] = "first"
+    unseen: tuple[str, ...] = ()  # axis fewshot: robots that no model is trained on before it is adapted to them
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)  # how trials are computed; names none
-    flops_per_second: float = 1e13  # sustained, of one device; as the next only for the estimates of --dry-run
-    trial_seconds: float = 120.0  # of a trial, besides computing: start, compilation, decoding, files
+    flops_per_second: float = 1e13  # sustained FLOP/s of one device, for the estimates of --dry-run
+    trial_seconds: float = 120.0  # --dry-run: seconds per trial for start, compilation, decoding, files
 
     def __post_init__(self):
         for axis in ("dataset_counts", "trajectory_counts", "widths", "seeds", "ablation_seeds"):

@@ -28,7 +28,7 @@ def encode(episode: Episode, layout: Layout) -> bytes:
     """The record of `episode`. Raises UnitError where it contradicts `layout`, naming the field."""
     steps = len(episode.instructions)
     if not steps:
-        raise UnitError(f"{episode.origin}: an episode without a step.")
+        raise UnitError(f"{episode.origin}: the episode has no steps.")
     rewards = np.zeros(steps, np.float32) if episode.rewards is None else np.asarray(episode.rewards)
     if rewards.shape != (steps,):
         raise UnitError(f"{episode.origin}: {rewards.shape} rewards for {steps} steps.")
@@ -36,7 +36,7 @@ def encode(episode: Episode, layout: Layout) -> bytes:
     features["episode_metadata/file_path"] = [episode.origin.encode()]
     if layout.knows_success:
         if episode.success is None:  # a record has no third value, and nobody should take it for a failure
-            raise UnitError(f"{episode.origin}: it does not say whether it succeeded, though others do.")
+            raise UnitError(f"{episode.origin}: it does not say whether it succeeded, but other recordings do.")
         features["episode_metadata/success"] = np.array([episode.success], np.int64)
     for key in layout.images:
         frames = list(episode.images[key])

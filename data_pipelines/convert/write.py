@@ -104,7 +104,8 @@ def convert(
             stack.enter_context(lock_output(final.with_name(f".{VERSION}")))
         except Held as held:
             raise Held(
-                f"another conversion is writing {final.parent} ({held.who}); wait for it or stop it", held.holder
+                f"another conversion is writing {final.parent} ({held.who}); wait until it has finished, or stop it",
+                held.holder,
             ) from None
         if final.exists():  # made by another process meanwhile
             return _finished(final, fingerprint, source, name)
@@ -160,9 +161,9 @@ def _finish(
     episodes = sum(s.records for s in shards)
     skipped = dict(sorted(sum((Counter(s.left_out) for s in shards), Counter()).items()))
     if not episodes:
-        reasons = "; ".join(f"{n} x {reason.rstrip('.')}" for reason, n in skipped.items()) or "it has no unit"
+        reasons = "; ".join(f"{n} x {reason.rstrip('.')}" for reason, n in skipped.items()) or "it has no recordings"
         shutil.rmtree(partial)
-        raise DataError(f"{source.description.rstrip('.')}: no episode can be made of it: {reasons}.")
+        raise DataError(f"{source.description.rstrip('.')}: no episode can be made from it: {reasons}.")
     kept = [(k, s) for k, s in enumerate(shards) if s.records]
     for to, (k, _) in enumerate(kept):
         target = partial / shard_name(name, to, len(kept))
@@ -190,8 +191,8 @@ def _finished(final: Path, fingerprint: str, source: ConvertibleSource, name: st
     metadata, lengths = read_metadata(final), shard_lengths(final)
     require(
         metadata.get(FINGERPRINT) == fingerprint and bool(lengths),
-        f"{final} exists already and was not made of this source with these settings; choose another --name "
-        "or --out, or remove it",
+        f"{final} exists already and was made from another source or with other settings; choose another --name or "
+        "--out, or remove it",
     )
     return Conversion(final, suggest_spec(source, name), sum(lengths), len(lengths), metadata["left_out"])
 

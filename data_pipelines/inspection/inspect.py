@@ -150,7 +150,7 @@ def inspect_dataset(
     Raises DataError for a directory that is no dataset or has no readable episode, ConfigError for an
     unknown split.
     """
-    require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
+    require(episodes >= 1 and frames >= 2, f"episodes and frames must be at least 1, got {episodes} and {frames}")
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
     _require_steps(source, fields)
@@ -232,8 +232,8 @@ def _require_steps(source: EpisodeSource, fields: Sequence[FieldFacts]) -> None:
     if not any(f.per_step for f in fields):
         keys = ", ".join(f.key for f in fields[:MAX_LISTED])
         raise DataError(
-            f"{source.schema}: none of its fields ({keys}) is one of a step, below `steps`: these are no episodes. Give a "
-            "dataset in the layout of RLDS, or write this one so (docs/own_data.md, Writing RLDS)."
+            f"{source.schema}: none of its fields ({keys}) is below `steps`, so its records are not episodes. Give a "
+            "dataset in the RLDS layout, or write this one in it (docs/own_data.md, Writing RLDS)."
         )
 
 

@@ -65,7 +65,13 @@ def _damaged(facts: Facts) -> list[Issue]:
         )
     short = sum(n < 2 for n in facts.steps)
     if short:
-        lost.append(Issue("warning", "single steps", f"{short} episodes of {facts.sampled} have one step: no motion"))
+        lost.append(
+            Issue(
+                "warning",
+                "single steps",
+                f"{short} of {facts.sampled} episodes have only one step, so they show no motion",
+            )
+        )
     return lost
 
 
@@ -82,7 +88,7 @@ def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
     if not missing:
         return []
     available = [c.key for c in facts.cameras] + [f"{key} ({n})" for key, n in sizes.items()]
-    text = f"the registry's entry wants {', '.join(missing)}; there are {', '.join(available) or 'neither'}"
+    text = f"the registry's entry needs {', '.join(missing)}; the dataset has {', '.join(available) or 'neither'}"
     return [Issue("error", MISFIT, text)]
 
 
@@ -90,16 +96,20 @@ def _rate(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
     """Formats that say their rate say it of the recording; another one makes another stride of it."""
     if entry is None or facts.hz is None or facts.hz == entry.hz:
         return []
-    return [Issue("warning", "another rate", f"its files say {facts.hz:g} Hz; {entry.hz:g} Hz are taken")]
+    return [Issue("warning", "another rate", f"its files say {facts.hz:g} Hz, but {entry.hz:g} Hz are used")]
 
 
 def _windows(facts: Facts, windows: WindowFacts | None) -> list[Issue]:
     if windows is None:
-        return [Issue("warning", "rate unknown", "no file says how many frames a second were recorded: give --hz")]
+        return [
+            Issue(
+                "warning", "rate unknown", "no file contains the rate of the recording in frames per second: give --hz"
+            )
+        ]
     short = facts.sampled - windows.long_enough
     if not short:
         return []
-    needs = f"the shortest window at stride {windows.stride} takes {windows.needed} steps"
+    needs = f"the shortest window at stride {windows.stride} needs {windows.needed} steps"
     if not windows.long_enough:
         return [
             Issue("error", "no window", f"{needs}; the longest of {facts.sampled} episodes has {facts.lengths.longest}")
@@ -120,13 +130,13 @@ def _cameras(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
             )
             issues.append(Issue("error" if used else "warning", "undecodable frames", text))
         if camera.is_blank:
-            text = f"{camera.key} ({whose}): every frame looked at shows one colour"
+            text = f"{camera.key} ({whose}): every frame that was read has one colour only"
             issues.append(Issue("error" if used else "warning", "blank camera", text))
         elif camera.blank:
-            text = f"{camera.key} ({whose}): {camera.blank} of {camera.frames} frames show one colour"
+            text = f"{camera.key} ({whose}): {camera.blank} of {camera.frames} frames have one colour only"
             issues.append(Issue("warning", "blank frames", text))
         if camera.still and not camera.is_blank:
-            text = f"{camera.key} ({whose}): no episode's frames differ"
+            text = f"{camera.key} ({whose}): in every episode all frames are the same"
             issues.append(Issue("error" if used else "warning", "still camera", text))
         if len(camera.sizes) > 1:
             sizes = ", ".join(f"{h}x{w}" for h, w in camera.sizes)
@@ -148,7 +158,9 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Issue]:
     broken = [i for i, d in enumerate(field.dimensions) if d.not_finite]
     if broken:
         count = sum(field.dimensions[i].not_finite for i in broken)
-        text = f"{_values(field, broken)}: {count} numbers are NaN or infinite; their episodes cannot be used"
+        text = (
+            f"{_values(field, broken)}: {count} numbers are NaN or infinite; episodes with such numbers cannot be used"
+        )
         issues.append(Issue("error", "not finite", text))
     start = _first_value(field.key, entry)
     handled = set(entry.angles) if entry is not None and entry.angle_form != "as_recorded" else set()
@@ -156,8 +168,8 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Issue]:
     if wraps:
         numbers = ", ".join(str(start + i) for i in wraps)
         text = (
-            f"{_values(field, wraps)} jump{'s' if len(wraps) == 1 else ''} by a whole turn; an entry with "
-            f'angles = [{numbers}] and angle_form = "sine_cosine" (or "unwrapped") mends it'
+            f"{_values(field, wraps)} jump{'s' if len(wraps) == 1 else ''} by a whole turn; to correct this, add "
+            f'angles = [{numbers}] and angle_form = "sine_cosine" (or "unwrapped") to the entry'
         )
         issues.append(Issue("warning", "wrapping angle", text))
     for unit, hint in WRAPPING.items():
@@ -183,14 +195,14 @@ def _duplicates(groups: Sequence[tuple[Fingerprint, ...]]) -> list[Issue]:
     issues = []
     if across:
         text = (
-            f"{len(across)} recordings are in more than one split: {_listed(across)}. Held-out episodes of "
-            "one must not be trained on in the other"
+            f"{len(across)} recordings are in more than one split: {_listed(across)}. So held-out episodes may also "
+            "be training episodes"
         )
         issues.append(Issue("error", "same episodes in two splits", text))
     within = [g for g in groups if g not in across]
     if within:
         extra = sum(len(g) - 1 for g in within)
-        text = f"{extra} episodes repeat another: {_listed(within)}"
+        text = f"{extra} episodes are copies of another one: {_listed(within)}"
         issues.append(Issue("warning", "likely duplicates", text))
     return issues
 

@@ -26,8 +26,8 @@ NO_RATE = 0.0
 """Stands in an entry for a rate that nobody gave; a `DatasetSpec` refuses it."""
 
 NO_CAMERA = (
-    "none of its fields is an image of 8 bits; pictures that are kept as plain numbers are to be written as "
-    "images (docs/own_data.md, Writing RLDS)"
+    "none of its fields is an image of 8 bits; write pictures that are stored as plain numbers as images "
+    "(docs/own_data.md, Writing RLDS)"
 )
 """Why a dataset without one is given no entry."""
 
@@ -115,11 +115,11 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
     angles, unit = _choose_angles(facts, keys, dims)
     if angles:
         reasons.append(
-            f"angles: {', '.join(map(str, angles))} of the action jump by a whole turn ({unit}s); as sine and cosine "
-            "they do not"
+            f"angles: {', '.join(map(str, angles))} of the action jump by a whole turn ({unit}s); their sine and "
+            "cosine do not"
         )
     if not hz:
-        reasons.append("hz: not in the files; say it with --hz, or fill it in")
+        reasons.append("hz: not in the files; give --hz, or fill it in")
     return Suggestion(
         facts.name, camera.key, keys, dims, hz or NO_RATE, facts.split, facts.version,
         not camera.is_blank, tuple(reasons), angles, unit,
@@ -134,7 +134,7 @@ def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, s
     decoded = [c for c in cameras if c.frames] or cameras
     seeing = [c for c in decoded if not c.is_blank]
     if not seeing:
-        return decoded[0], "every camera is blank; nothing to predict"
+        return decoded[0], "every camera is blank, so there is nothing to predict"
 
     def rank(camera: CameraFacts) -> tuple:
         name = camera.key.rsplit("/", 1)[-1]
@@ -145,7 +145,7 @@ def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, s
     blank = [c.key for c in cameras if c.is_blank]
     why = f"of {len(cameras)}" + (f", {len(blank)} of them blank" if blank else "")
     why += f", {lacking} that cannot be decoded" if (lacking := len(cameras) - len(decoded)) else ""
-    where = "rides on the arm, as all do" if ON_THE_ARM.search(best.key) else "by its name not on the arm"
+    where = "by its name on the arm, like all others" if ON_THE_ARM.search(best.key) else "by its name not on the arm"
     return best, f"{best.key.removeprefix('observation/')} {why}; {where}"
 
 
@@ -161,14 +161,16 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
         lists = ", ".join(f.key for f in parts if f.kind == "list")
         others = ", ".join(k for k in by_key if not NO_ACTION.search(k))
         if kept:
-            why = f"{kept} is kept as bytes, which are not read; write the dataset again with encoding 'none' for it"
+            why = (
+                f"{kept} is stored as bytes, which cannot be read; write the dataset again with encoding 'none' for it"
+            )
         elif lists:
-            why = f"{lists} has no fixed length, and is not read; write the dataset again with one"
+            why = f"{lists} has no fixed length, so it cannot be read; write the dataset again with a fixed length"
         else:
             why = "no numeric field `action`"
         if others:
-            why += f"; name in action_keys what was done, of {others}"
-        return (), (), f"{why}: video alone"
+            why += f"; give the fields of the action in action_keys, from {others}"
+        return (), (), f"{why}: used as video without actions"
     names, dims, dropped = [], [], []
     for key in keys:
         hints = [d.hint for d in by_key[key].dimensions]

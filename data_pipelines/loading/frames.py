@@ -59,7 +59,7 @@ def make_frame_loader(
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     require(split in ("train", "val"), f"split must be 'train' or 'val', got {split!r}")
-    require(len(datasets) >= 1, "no dataset was given to take frames from")
+    require(len(datasets) >= 1, "no dataset was given")
     streams, counts, reasons, files = {}, {}, {}, OpenFiles()
     for spec, directory in datasets:
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
@@ -72,9 +72,9 @@ def make_frame_loader(
         if not len(episodes):
             reasons[spec.name] = f"it has no {split} episode"
             if split == "val":
-                bound = f"val_fraction={val_fraction:g}, min_val={min_val} and max_val={max_val} say how many are"
-                skipped = f"the {all_held_out.sum():,} of its {len(all_held_out):,} that are held out were all skipped"
-                none = f"of {len(mask)} none is held out, for which there must be at least two"
+                bound = f"val_fraction={val_fraction:g}, min_val={min_val} and max_val={max_val} set how many are"
+                skipped = f"all {all_held_out.sum():,} held-out episodes of its {len(all_held_out):,} were skipped"
+                none = f"of {len(mask)} none is held out: this needs at least two"
                 reasons[spec.name] += f": {skipped if all_held_out.any() else none}; {bound}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)

@@ -45,12 +45,12 @@ def make_loader(
     wanted = np.arange(config.batch) if rows is None else np.asarray(rows, np.int64)
     require(
         len(wanted) > 0 and 0 <= wanted.min() and wanted.max() < config.batch,
-        f"a batch of {config.batch} rows has none of {wanted.tolist()}",
+        f"rows {wanted.tolist()} are not in a batch of {config.batch} rows",
     )
     selected = select_windows(store, config)
     names = selected.mixture.names
     grids = {store.manifest(name).tokenizer for name in names}
-    require(len(grids) == 1, f"the datasets were tokenised differently: {sorted(map(str, grids))}")
+    require(len(grids) == 1, f"the datasets were tokenised with different tokenizers: {sorted(map(str, grids))}")
     store.check_table(table, names, config.rate)
     batches = _Batches(store, table, selected, config, wanted)
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads * prefetch, 1))

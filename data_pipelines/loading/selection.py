@@ -41,7 +41,7 @@ class LoaderConfig:
         require(self.tau > 0, f"loader.tau must be positive, got {self.tau}")
         require(
             len(set(self.datasets)) == len(self.datasets),
-            f"loader.datasets repeat: {', '.join(self.datasets)}",
+            f"loader.datasets contains a dataset twice: {', '.join(self.datasets)}",
         )
 
 

@@ -40,7 +40,7 @@ def stride_of(hz: float, rate: float | None = FRAME_RATE) -> int:
     """
     if rate is None:
         return 1
-    require(rate > 0, f"the rate of a window's frames must be positive, in Hz, got {rate}")
+    require(rate > 0, f"the frame rate must be positive, in Hz, got {rate}")
     ratio = hz / rate
     below = max(int(ratio), 1)
     return below if ratio * ratio <= below * (below + 1) else below + 1
@@ -83,7 +83,7 @@ class DatasetSpec:
 
     def __post_init__(self):
         name = self.name
-        require(is_dataset_name(name), f"dataset {quote(name)}: no name of a dataset: {NAME_RULE}")
+        require(is_dataset_name(name), f"{quote(name)} cannot be the name of a dataset: {NAME_RULE}")
         require(
             len(self.action_keys) == len(self.action_dims),
             f"dataset {name!r}: action_keys and action_dims must have the same length",
@@ -94,7 +94,7 @@ class DatasetSpec:
         )
         require(
             self.rate is None or 0 < self.rate < math.inf,
-            f"dataset {name!r}: rate, of its frames in Hz, must be positive and finite, got {self.rate}",
+            f"dataset {name!r}: rate, the frame rate in Hz, must be positive and finite, got {self.rate}",
         )
         require(
             all(d >= 1 for d in self.action_dims),
@@ -102,23 +102,23 @@ class DatasetSpec:
         )
         require(
             not self.val_split or self.val_split in self.split.split("+")[1:],
-            f"dataset {name!r}: val_split {self.val_split!r} is held out, so it must follow another in split, "
-            f"such as 'train+{self.val_split}'; got {self.split!r}",
+            f"dataset {name!r}: val_split {self.val_split} is the held-out split, so split must name it after another "
+            f"one, such as 'train+{self.val_split}'; got {self.split!r}",
         )
         for key, dim in zip(self.action_keys, self.action_dims, strict=True):
             part = field_slice(key)[1]
             if part.stop is not None:
                 taken = part.stop - part.start
-                require(taken == dim, f"dataset {name!r}: {key!r} takes {taken} values, action_dims says {dim}")
+                require(taken == dim, f"dataset {name!r}: {key!r} uses {taken} values, but action_dims says {dim}")
         width = sum(self.action_dims)
         require(
             list(self.angles) == sorted(set(self.angles)) and all(0 <= d < width for d in self.angles),
-            f"dataset {name!r}: angles must be increasing numbers of its {width} action values, counted from 0, "
-            f"got {self.angles}",
+            f"dataset {name!r}: angles must be increasing positions in its {width} action values, counted from 0, got "
+            f"{self.angles}",
         )
         require(
             bool(self.angles) or self.angle_form == "as_recorded",
-            f"dataset {name!r}: angle_form {self.angle_form!r} needs to know which values are angles: add `angles`",
+            f"dataset {name!r}: angle_form {self.angle_form!r} needs the list of values that are angles: add `angles`",
         )
 
     @property
@@ -141,16 +141,16 @@ class DatasetSpec:
         again = "in a file for --registry (`hma data inspect --entry` writes one), and tokenise into another --out"
         if self.action_dim != robot.action_dim:
             raise ConfigError(
-                f"{name}: the model was made for {robot.action_dim} action values, the registry's entry gives "
-                f"{self.action_dim}: {self._takes()}. Name those of the model in the entry of {name}, {again}."
+                f"{name}: the model was trained with {robot.action_dim} action values, but the registry's entry has "
+                f"{self.action_dim}: {self._takes()}. Write those of the model into the entry of {name}, {again}."
             )
         stride = self.stride_at(rate)
         if stride != robot.stride:
             right = f"{self.rate_for(robot.stride):g}"
             raise ConfigError(
-                f"{name}: the model was made for frames at stride {robot.stride}, here they are at stride {stride} of "
-                f"{self.hz:g} Hz. Put `rate = {right}` into the entry of {name}, {again}; --set rate={right} does the "
-                "same to all datasets that have no rate of their own."
+                f"{name}: the model was trained with frames at stride {robot.stride}, but here the stride is {stride} "
+                f"at {self.hz:g} Hz. Write `rate = {right}` into the entry of {name}, {again}; --set rate={right} "
+                "does the same for all datasets whose entries have no rate."
             )
         self.check_layout(robot, f", {again}")
 
@@ -159,8 +159,8 @@ class DatasetSpec:
         `again`: what is to be done besides."""
         if robot.layout and self.action_layout() != robot.layout:  # tables of earlier versions do not say
             raise ConfigError(
-                f"{self.name}: the values of an action are others, or stand in another order, than when the model was "
-                f"made: the registry's entry gives {self._takes()}. Restore the entry of {self.name}{again}."
+                f"{self.name}: the action has other values, or another order of them, than when the model was "
+                f"trained: the registry's entry has {self._takes()}. Restore the entry of {self.name}{again}."
             )
 
     def _takes(self) -> str:

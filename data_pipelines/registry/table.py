@@ -54,8 +54,8 @@ def get_spec(name: str) -> DatasetSpec:
     else:
         hint = f"known: {', '.join([*table][:MAX_LISTED])}, ... (`hma data list` shows all)."
     raise ConfigError(
-        f"unknown dataset {name!r}; {hint} A new one is an entry: `hma data inspect DIR` suggests it, for "
-        "data_pipelines/registry/own.py or for a file given with --registry."
+        f"unknown dataset {name!r}; {hint} A new dataset needs an entry, in data_pipelines/registry/own.py or in a "
+        "file given with --registry: `hma data inspect DIR` suggests it."
     )
 
 

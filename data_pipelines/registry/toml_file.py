@@ -34,19 +34,19 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
     except ValueError as error:  # of which TOMLDecodeError and UnicodeDecodeError are kinds
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
     except RecursionError:
-        raise ConfigError(f"{path}: not a TOML file of entries: it is nested too deeply") from None
+        raise ConfigError(f"{path}: not a TOML file of registry entries: it is nested too deeply") from None
     entries = []
     for name, fields in tables.items():
         try:
             if not isinstance(fields, dict):
-                raise ConfigError(f"{name} = {fields!r} stands outside of a [dataset] table")
+                raise ConfigError(
+                    f"{name} = {fields!r} is not in a table; write it below a heading [NAME] with the dataset's name"
+                )
             if "name" in fields:  # it would be the entry of another dataset than the heading says
-                raise ConfigError(f"{name}: leave out name = {fields['name']!r}: the heading is an entry's name")
+                raise ConfigError(f"{name}: remove name = {fields['name']!r}; the heading is the name of the entry")
             entry = from_dict(DatasetSpec, {"name": name} | fields, name)
             if entry.angles and "angle_form" not in fields:  # by default they would stay as they are
-                raise ConfigError(
-                    f'{name}: angles say which values wrap; add angle_form = "sine_cosine" or "unwrapped"'
-                )
+                raise ConfigError(f'{name}: angles needs angle_form too; add angle_form = "sine_cosine" or "unwrapped"')
             entries.append(entry)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
@@ -79,5 +79,5 @@ def put_entry(text: str, spec: DatasetSpec, where: str) -> str:
         right = tomllib.loads(put) == tomllib.loads(text) | tomllib.loads(to_toml(spec))
     except tomllib.TOMLDecodeError:  # it is there in another form than a table of its own
         right = False
-    require(right, f"{where}: no place for the entry of {spec.name} is found there; write it to another file")
+    require(right, f"{where}: the entry of {spec.name} cannot be added to this file; write it to another file")
     return put

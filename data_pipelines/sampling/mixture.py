@@ -30,7 +30,7 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.
     require(tau > 0, f"the mixture temperature tau must be positive, got {tau}")
     counts = np.asarray(counts, np.float64)
     if counts.sum() <= 0:
-        raise DataError("every dataset of the mixture is empty; add one that has data")
+        raise DataError("every dataset of the mixture is empty; add one with data")
     powers = np.where(counts > 0, (counts / counts.sum()) ** (1.0 / tau), 0.0)
     if not powers.any():  # tau is so small that even the largest is too small for a number
         powers = (counts == counts.max()).astype(np.float64)

@@ -31,8 +31,8 @@ def held_out_episodes(
     own = [run.split == spec.val_split for run in runs]
     require(
         any(own),
-        f"dataset {spec.name!r}: val_split is {spec.val_split!r}, which is none of the splits that are read, "
-        f"{spec.split!r}. Correct its entry.",
+        f"dataset {spec.name!r}: val_split {spec.val_split!r} is not among the splits that are read, {spec.split!r}. "
+        "Correct its entry.",
     )
     return np.repeat(own, [run.count for run in runs])
 

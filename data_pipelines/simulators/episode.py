@@ -73,8 +73,8 @@ class StartState:
             return cls(values["env"], int(values["seed"]), tuple(map(float, values["physics"])))
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"{text[:80]!r} is no start state ({error}). "
-                "Take it from episode_metadata/start of a dataset that `hma data sim` wrote."
+                f"{text[:80]!r} is not a start state ({error}). Use episode_metadata/start of a dataset that `hma "
+                "data sim` wrote."
             ) from error
 
 
@@ -126,12 +126,12 @@ def replay_episode(simulator: Simulator, start: StartState, actions: Sequence[np
     simulator.start(start.env, start.seed)
     size = len(simulator.low)
     if actions.ndim != 2 or actions.shape[1] != size:
-        raise DataError(f"actions of shape {actions.shape} cannot be run: this robot takes [N, {size}].")
+        raise DataError(f"actions of shape {actions.shape} cannot be run: this robot needs [N, {size}].")
     expected = len(simulator.physics())
     if len(start.physics) != expected:
         raise DataError(
-            f"{start.env}: the start state has {len(start.physics)} numbers, the simulator {expected}. "
-            "It was recorded with another robot or another version of the simulator."
+            f"{start.env}: the start state has {len(start.physics)} numbers, but the simulator needs {expected}. It "
+            "was recorded with another robot or another version of the simulator."
         )
     simulator.set_physics(np.asarray(start.physics))
     frames, rewards, reached = [simulator.frame()], [], False

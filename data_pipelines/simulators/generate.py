@@ -59,7 +59,7 @@ def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: 
     metadata = read_metadata(directory)
     made_as = metadata.get(FINGERPRINT)
     if made_as is None:
-        return ["it says nothing of what it was made from"]
+        return ["it does not say how it was made"]
     if made_as == fingerprint(spec, episodes, size, seed) or not is_complete(directory, made_as):
         return None
     existing = {
@@ -81,9 +81,9 @@ def made_by_other_versions(root: Path, specs: Sequence[SimSpec], episodes: int, 
     more = f" and {len(lines) - MAX_LISTED} more" if len(lines) > MAX_LISTED else ""
     require(
         not lines,
-        f"datasets are there that were made otherwise (there -> asked for): {', '.join(lines[:MAX_LISTED])}{more}. Nothing "
-        "was changed. Choose another directory, or give the settings that they were made with, or remove them to have them "
-        "made again.",
+        "datasets exist that were made with other settings (there -> asked for): "
+        f"{', '.join(lines[:MAX_LISTED])}{more}. Nothing was changed. Choose another directory, use the settings that "
+        "they were made with, or remove them to make them again.",
     )
     return [name for name, how in found.items() if how is not None]
 
@@ -124,7 +124,7 @@ def generate_sim(
         failures = run.work(jobs, workers)
     if failures:
         raise DataError(
-            f"{len(failures)} of {len(specs)} datasets were not made; the others are complete. "
+            f"{len(failures)} of {len(specs)} datasets could not be made; the others are complete. "
             + " ".join(failures)
             + " The same command tries them again."
         )
@@ -172,7 +172,8 @@ class _Run:
             return self.stack.enter_context(lock_output(home / f".{VERSION}"))
         except Held as held:
             raise Held(
-                f"{home}: {held.who} is making this dataset; wait for it, stop it, or name other datasets",
+                f"{home}: {held.who} is making this dataset; wait until it has finished, stop it, or choose other "
+                "datasets",
                 held.holder,
             ) from None
 
@@ -203,8 +204,8 @@ class _Run:
         with self.lock:
             self.children.discard(child)
         if code:
-            last = log.read_text(errors="replace").strip().splitlines()[-1:] or ["nothing was said"]
-            return f"{job.name}: its simulator ended with code {code}: {last[0]} ({log} has the rest)."
+            last = log.read_text(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            return f"{job.name}: its simulator ended with exit code {code}: {last[0]} (the full output is in {log})."
         with self.finishing:
             (spec,) = select([job.name])
             if self.staging(job.name).is_dir() and not self.missing(job.name):

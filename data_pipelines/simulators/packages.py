@@ -84,14 +84,16 @@ def find_obstacle(specs: Iterable[SimSpec]) -> str:
     """Why these embodiments cannot be simulated on this machine, with what to install; "" where they can."""
     missing = missing_packages(specs)
     if missing:
-        return f"simulators not installed ({', '.join(missing)}): {EXTRA} and, to draw without a screen, {APT}"
+        return (
+            f"simulators are not installed ({', '.join(missing)}). Run: {EXTRA} and, to render without a screen, {APT}"
+        )
     try:
         backend = gl_backend()
     except ConfigError as error:
         return str(error)
     if ctypes.util.find_library(GL[backend]) is None:
         other = f"(or set MUJOCO_GL to the other of {' and '.join(GL)})"
-        return f"the simulators cannot draw: no {GL[backend]} library on this machine; {APT} {other}"
+        return f"the simulators cannot render: this machine has no {GL[backend]} library; {APT} {other}"
     return ""
 
 
@@ -111,7 +113,7 @@ def gl_backend() -> str:
     """The library that draws: MUJOCO_GL, egl without it. Raises ConfigError for one with a screen."""
     backend = os.environ.get("MUJOCO_GL") or "egl"
     if backend not in GL:
-        raise ConfigError(f"MUJOCO_GL is {backend!r}; frames are drawn without a screen by {' or '.join(GL)}")
+        raise ConfigError(f"MUJOCO_GL is {backend!r}; rendering without a screen needs {' or '.join(GL)}")
     return backend
 
 
@@ -122,8 +124,8 @@ def prepare_process() -> None:
     """
     require(
         may_draw(),
-        "TensorFlow is loaded in this process, which ends with a segmentation fault when a simulator draws; "
-        "simulate in a process of its own, without `import tensorflow`",
+        "TensorFlow is loaded in this process, so rendering would end in a segmentation fault; simulate in a process "
+        "without `import tensorflow`",
     )
     backend = gl_backend()
     os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend

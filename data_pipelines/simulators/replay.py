@@ -19,8 +19,8 @@ def read_start(dataset: RldsDataset, episode: int) -> StartState:
     values = dataset.record(episode, [START_KEY]).get(START_KEY)
     if not values:
         raise EpisodeError(
-            f"{dataset.name}, episode {episode}: it has no {START_KEY}, from which to run it again; "
-            "only datasets that `hma data sim` wrote have one."
+            f"{dataset.name}, episode {episode}: it has no {START_KEY}, so it cannot be simulated again; only "
+            "datasets that `hma data sim` wrote have one."
         )
     return StartState.from_json(values[0])
 

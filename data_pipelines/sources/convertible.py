@@ -26,7 +26,7 @@ class UnitError(EpisodeError):
 
 def unsupported_images_text(keys: Iterable[str]) -> str:
     """A message on image fields that cannot be read as cameras, such as depth images."""
-    return f"left out: {', '.join(keys)}; docs/own_data.md says what is a camera"
+    return f"not used as cameras: {', '.join(keys)}; docs/own_data.md says what is a camera"
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,9 @@ def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:
     twice = ordered[1:][ordered[1:] == ordered[:-1]]
     if len(twice):
         at = int(np.flatnonzero(ids == twice[0])[1])
-        raise DataError(f"{describe(runs, at)}: two episodes have this name. Name each split, and each file, once.")
+        raise DataError(
+            f"{describe(runs, at)}: two episodes have this name. Give each split, and each file, only once."
+        )
     return ids
 
 

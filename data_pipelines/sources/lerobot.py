@@ -51,7 +51,7 @@ class LeRobotSource:
         }
         if not available:
             listed = ", ".join(f"{quote(key)}: {'x'.join(map(str, shape))}" for key, shape in others.items())
-            found = f" (there are {listed}; grey ones are to be written as red, green and blue)" if others else ""
+            found = f" (it has {listed}; write grey images with three channels)" if others else ""
             raise DataError(
                 f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels{found}."
             )
@@ -62,8 +62,8 @@ class LeRobotSource:
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self.vectors}:
             raise DataError(
-                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among {', '.join(features)}. "
-                "Call what was done so, there and in the tables below data."
+                f"{self.root / 'meta' / 'info.json'}: it has no numeric feature 'action', but {', '.join(features)}. "
+                "Rename the feature that holds the actions to 'action', here and in the tables below data."
             )
         sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self.vectors.items()}
         self.layout = Layout({k: image_field(None, None) for k in self.cameras}, sizes, SUCCESS in features)
@@ -133,12 +133,12 @@ class LeRobotSource:
             raise UnitError(f"{entry.data}: no column {quote(missing[0])}. {ADVICE}")
         place = self._tables.find(entry.data, entry.index)
         if place is None:
-            raise UnitError(f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}")
+            raise UnitError(f"{entry.data}: the rows of episode {entry.index} are missing or not contiguous. {ADVICE}")
         return place
 
     def _check_camera(self, entry: EpisodeEntry, name: str, where: str) -> None:
         if name not in self._tables.columns(entry.data):
-            raise UnitError(f"{where} has no column {quote(name)}, though the feature is an image. {ADVICE}")
+            raise UnitError(f"{where} has no column {quote(name)}, but the feature is an image. {ADVICE}")
 
     def times(self, table: Any, where: str) -> np.ndarray:
         """Seconds since the episode's first frame. Raises UnitError for a row out of step."""
@@ -148,8 +148,8 @@ class LeRobotSource:
         if len(wrong):
             row = int(wrong[0])
             raise UnitError(
-                f"{where}: timestamp {times[row]:.4f} s at row {row}, where {self.hz:g} frames per second "
-                f"make {expected[row]:.4f} s. {ADVICE}"
+                f"{where}: timestamp {times[row]:.4f} s at row {row}, but at {self.hz:g} frames per second it should "
+                f"be {expected[row]:.4f} s. {ADVICE}"
             )
         return times
 
@@ -178,7 +178,7 @@ class LeRobotSource:
                 return retry(path, path.read_bytes)
             except FileNotFoundError as error:
                 raise UnitError(f"{where}: {path} cannot be read ({error.strerror}). {ADVICE}") from error
-        raise UnitError(f"{where} holds neither bytes nor a path. {ADVICE}")
+        raise UnitError(f"{where} contains neither bytes nor a path. {ADVICE}")
 
     def numbers(self, table: Any, name: str, where: str) -> np.ndarray:
         """float64 [N, size] of a feature."""

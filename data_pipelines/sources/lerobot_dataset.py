@@ -56,7 +56,7 @@ class LeRobotDataset(EpisodeSource):
         max_skipped: float = MAX_SKIPPED,
     ):
         super().__init__(corrupt, max_skipped)
-        require(split == "train", f"{root}: no split {split!r}; a LeRobot dataset has one, 'train'.")
+        require(split == "train", f"{root}: no split {split!r}; a LeRobot dataset has only 'train'.")
         self.location, self.split = Path(root), split
         self.schema = self.location / "meta" / "info.json"
         self.name = dataset_name(self.location)
@@ -105,7 +105,7 @@ class LeRobotDataset(EpisodeSource):
         camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
         entry, where = self._entries[i], self._where(i)
         if not entry.length:
-            what = f"{where}: by the meta folder an episode without a step; leave it out with corrupt='skip'."
+            what = f"{where}: the meta folder lists this episode with no steps; leave it out with corrupt='skip'."
             raise EpisodeError(what).at(entry.data, -1)
         with ExitStack() as stack:
             if not keys and self._cameras[camera] in entry.videos:  # frames alone: no table is needed
@@ -153,8 +153,8 @@ class LeRobotDataset(EpisodeSource):
         table = self._read.rows(entry, columns)
         if table.num_rows != entry.length:
             raise EpisodeError(
-                f"{self._where(i)} has {table.num_rows} rows, but the meta folder says {entry.length}. "
-                "Fetch the dataset again, or leave the episode out with corrupt='skip'."
+                f"{self._where(i)} has {table.num_rows} rows, but the meta folder says {entry.length}. Download the "
+                "dataset again, or leave the episode out with corrupt='skip'."
             ).at(entry.data, -1)
         return table
 
@@ -199,8 +199,8 @@ def dataset_name(root: Path) -> str:
     name = re.sub(r"[^a-z0-9_]+", "_", root.absolute().name.lower()).strip("_")
     if not name:
         raise DataError(
-            f"{root}: a LeRobot dataset is called as its folder, which has none of a to z and 0 to 9 in its name. Rename "
-            "it, or give a link to it of another name."
+            f"{root}: a LeRobot dataset gets the name of its folder, but this name contains none of a to z and 0 to "
+            "9. Rename the folder, or give a link to it with another name."
         )
     return name
 

@@ -55,7 +55,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     version = info.get("codebase_version")
     if version not in VERSIONS:
         raise DataError(
-            f"{info_path}: codebase_version is {quote(version)}; {', '.join(VERSIONS)} can be read. Convert the "
+            f"{info_path}: codebase_version is {quote(version)}; only {', '.join(VERSIONS)} can be read. Convert the "
             "dataset with LeRobot's own scripts first."
         )
     for field in ("fps", "features", "data_path"):
@@ -65,7 +65,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     features = info["features"]
     videos = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if videos and not info.get("video_path"):
-        raise DataError(f"{info_path}: no 'video_path', but {quote(videos[0])} is a video. {ADVICE}")
+        raise DataError(f"{info_path}: 'video_path' is missing, but {quote(videos[0])} is a video. {ADVICE}")
     read = _episodes_3 if version == "v3.0" else _episodes_2
     episodes = read(root, info, videos)
     if not episodes:
@@ -73,8 +73,8 @@ def read_meta(root: Path) -> LeRobotMeta:
     for one, following in pairwise(episodes):
         if one.index == following.index:
             raise DataError(
-                f"{root / 'meta'}: episode {one.index} is listed twice, as after a recording that was taken up again. "
-                "Remove one of the two there, or fetch the dataset again."
+                f"{root / 'meta'}: episode {one.index} is listed twice, as happens when recording was resumed. Remove "
+                "one of the two lines, or download the dataset again."
             )
     return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), _tasks(root, version))
 
@@ -133,7 +133,7 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     text = [c for c in texts if c in table.column_names]
     if not text or "task_index" not in table.column_names:
         present = ", ".join(table.column_names) or "neither"
-        raise DataError(f"{path}: of task and task_index, which are needed, it has {present}.")
+        raise DataError(f"{path}: it needs the columns task and task_index, but has {present}.")
     rows = enumerate(_rows(table.select(["task_index", text[0]]), path))
     return {_count(row, "task_index", f"{path}: row {line}"): str(row[text[0]]) for line, row in rows}
 

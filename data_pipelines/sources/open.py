@@ -26,7 +26,7 @@ def find_format(location: str | Location) -> str:
         found = "lerobot"
     else:
         return "rlds"
-    require(not is_remote(place), f"{place}: {found} is read from a disk only. Copy the dataset to one.")
+    require(not is_remote(place), f"{place}: {found} can be read only from a disk. Copy the dataset to a disk.")
     return found
 
 

@@ -75,7 +75,7 @@ def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
     for start, size in chunks:
         at, end = start, start + size
         if end > whole:
-            raise ValueError(f"a column reaches to byte {end}, the file has {whole}")
+            raise ValueError(f"a column reaches to byte {end}, but the file has {whole} bytes")
         while at < end:
             file.seek(at)
             header = _Compact(file.read(min(MAX_HEADER, end - at)))
@@ -84,9 +84,11 @@ def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
             limit = max(MAX_UNCOMPRESSED, MAX_COMPRESSION_RATIO * compressed)
             after = at + header.at + compressed
             if compressed < 0 or after > end:
-                raise ValueError(f"a page of {compressed} bytes reaches out of its column, which ends at byte {end}")
+                raise ValueError(f"a page of {compressed} bytes reaches beyond its column, which ends at byte {end}")
             if not 0 <= uncompressed <= limit:
-                raise ValueError(f"the page at byte {at} says that it holds {uncompressed} bytes, {limit} are the most")
+                raise ValueError(
+                    f"the page at byte {at} says that it holds {uncompressed} bytes, but {limit} is the largest size"
+                )
             at = after
 
 
@@ -96,7 +98,7 @@ def _read_footer(file: BinaryIO) -> dict[int, Any]:
     end = file.read(FOOTER_TAIL)
     length = int.from_bytes(end[:4], "little")
     if end[4:] != MAGIC or length > size - FOOTER_TAIL - len(MAGIC):
-        raise ValueError("it does not end as a Parquet file does")
+        raise ValueError("it does not end like a Parquet file")
     file.seek(size - FOOTER_TAIL - length)
     return _Compact(file.read(length)).read_struct()
 
@@ -116,7 +118,7 @@ def _chunk(meta: dict[int, Any]) -> Chunk:
 def _structs(values: dict[int, Any], field: int) -> list[dict[int, Any]]:
     found = values.get(field, [])
     if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-        raise ValueError(f"the footer's field {field} is no list of structs")
+        raise ValueError(f"the footer's field {field} is not a list of structs")
     return found
 
 
@@ -145,7 +147,7 @@ class _Compact:
 
     def _read(self, kind: int, depth: int) -> Any:
         if depth > MAX_DEPTH:
-            raise ValueError("it is nested too deep")
+            raise ValueError("it is nested too deeplylylylyly")
         if kind in (I16, I32, I64):
             return self._integer()
         if kind in (TRUE, FALSE, BYTE):
@@ -162,7 +164,7 @@ class _Compact:
             return [self._read(byte & 15, depth + 1) for _ in range(self._varint() if count == 15 else count)]
         if kind == STRUCT:
             return self.read_struct(depth + 1)
-        raise ValueError(f"a field of kind {kind} is not known")
+        raise ValueError(f"unknown kind of field, {kind}")
 
     def _byte(self) -> int:
         self._pass(1)
@@ -171,7 +173,7 @@ class _Compact:
     def _pass(self, count: int) -> None:
         self.at += count
         if self.at > len(self.data):
-            raise ValueError("footer or header are cut off")
+            raise ValueError("the footer or a header is cut off")
 
     def _varint(self) -> int:
         value = shift = 0

@@ -21,7 +21,7 @@ from data_pipelines.sources.rlds.location import is_io_error, retry
 
 T = TypeVar("T")
 
-ADVICE = "Fetch the dataset again, meta folder included."
+ADVICE = "Download the dataset again, including its meta folder."
 
 CACHE_BYTES = 64 * 2**20
 """Bytes of decoded columns in the cache. The row group that was read last stays, whatever its size."""
@@ -156,7 +156,7 @@ def _read_layout(path: Path, label: str) -> _Layout:
         columns = tuple(file.schema_arrow.names)
         values = np.asarray(file.read([label])[label]) if label in columns else np.zeros(0, np.int64)
     if (rows < 0).any() or len(values) not in (0, rows.sum()):
-        raise ValueError(f"its groups have {rows.tolist()} rows, {label} has {len(values)}")
+        raise ValueError(f"its row groups have {rows.tolist()} rows, but {label} has {len(values)}")
     starts = np.flatnonzero(np.append(True, values[1:] != values[:-1])[: len(values)])
     return _Layout(columns, tuple(groups), np.cumsum(rows), values[starts], np.append(starts, len(values)))
 
@@ -172,6 +172,6 @@ def _read_groups(path: Path, layout: _Layout, wanted: dict[int, list[str]]) -> d
         for g, names in wanted.items():
             table = file.read_row_group(g, columns=names)
             if table.num_rows != layout.groups[g].rows:
-                raise ValueError(f"a group of {layout.groups[g].rows} rows has {table.num_rows}")
+                raise ValueError(f"a row group of {layout.groups[g].rows} rows has {table.num_rows}")
             found[g] = {name: table[name] for name in names}
     return found

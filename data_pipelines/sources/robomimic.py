@@ -37,7 +37,9 @@ CONTROL_RATE = 20.0
 SUCCESS_REWARD = 1.0
 """robosuite's reward of a solved task, sparse or shaped; shaping alone stays below it."""
 
-ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damaged (when tokenising, corrupt='skip')."
+ADVICE = (
+    "Download the file again, or leave the demonstration out with --skip-damaged (when tokenising, corrupt='skip')."
+)
 
 
 DAMAGED = (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError)
@@ -136,7 +138,7 @@ class RobomimicSource:
             except OSError as error:
                 if is_io_error(error):
                     raise  # to be tried again
-                raise DataError(f"{self.path}: no readable HDF5 file ({error}). Fetch it again.") from error
+                raise DataError(f"{self.path}: not a readable HDF5 file ({error}). Download it again.") from error
 
         return retry(self.path, opened)
 
@@ -153,14 +155,15 @@ class RobomimicSource:
         pictures = sorted(k for k in obs if obs[k].dtype == np.uint8 and obs[k].ndim == 4 and obs[k].shape[3] == 3)
         if not available and pictures:  # as LIBERO's, agentview_rgb
             raise DataError(
-                f"{where}/obs has no *_image, as robomimic calls pictures, but {', '.join(pictures)}: rename each to end "
-                "in _image in every demonstration, in a copy of the file (h5py: obs.move(OLD, NEW))."
+                f"{where}/obs has no *_image, the name of images in robomimic files, but {', '.join(pictures)}: in a "
+                "copy of the file, rename each in every demonstration so that it ends in _image (h5py: obs.move(OLD, "
+                "NEW))."
             )
         if not available:
             raise DataError(
-                f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a "
-                "low-dimensional or raw file. Download the image file of the task, or render one from "
-                "its states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
+                f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): it is a "
+                "low-dimensional or raw file. Download the image file of the task, or render images from its states "
+                "with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
             )
         cameras = choose(wanted, available, "camera", where)
         if "actions" not in demo:
@@ -189,7 +192,7 @@ def damage(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
     except DAMAGED as error:
         if is_io_error(error):
             raise UnreachableError(f"{where} cannot be read ({error}). Run the same command again.") from error
-        advice = ADVICE if kind is UnitError else "Fetch the file again."
+        advice = ADVICE if kind is UnitError else "Download the file again."
         raise kind(f"{where} is damaged ({error}). {advice}") from error
 
 
@@ -228,7 +231,7 @@ def _env_args(path: Path, text: Any) -> dict[str, Any]:
     try:
         args = json.loads(text)
     except (ValueError, TypeError) as error:  # the latter of an attribute that is no text
-        message = f"{path}: the attribute env_args of 'data' is no JSON ({error}). Fetch the file again."
+        message = f"{path}: the attribute env_args of 'data' is not JSON ({error}). Download the file again."
         raise DataError(message) from error
     return args if isinstance(args, dict) else {}
 
@@ -241,7 +244,7 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
         return None
     if type(rate) not in (int, float) or not 0 < rate < math.inf:
         raise DataError(
-            f"{path}: the attribute env_args of 'data' says control_freq {quote(rate)}, which is no rate in Hz. "
+            f"{path}: the attribute env_args of 'data' says control_freq {quote(rate)}, which is not a rate in Hz. "
             "Correct it."
         )
     return float(rate)

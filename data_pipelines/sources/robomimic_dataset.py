@@ -92,7 +92,7 @@ class RobomimicDataset(EpisodeSource):
                 demo = file["data"][self._demos[i]]
                 frames = _Frames(demo, _path(camera, image=True), where)
                 if not len(frames):
-                    self._refuse(i, "a demonstration without a step")
+                    self._refuse(i, "a demonstration without steps")
                 if "actions" in demo and len(frames) != len(demo["actions"]):
                     self._refuse(i, f"{len(frames)} frames of {camera!r} for {len(demo['actions'])} actions")
                 fields = {field_slice(key)[0] for key in keys}
@@ -158,7 +158,9 @@ class _Frames(Sequence[Fetched]):
         array = demo.get(key)
         if array is None or array.dtype != np.uint8 or array.ndim != 4 or array.shape[3] != 3:
             what = "is not there" if array is None else f"is {array.dtype} {list(array.shape)}"
-            raise EpisodeError(f"{where}/{key} {what}; uint8 images [N, H, W, 3] were expected. Fetch the file again.")
+            raise EpisodeError(
+                f"{where}/{key} {what}; uint8 images [N, H, W, 3] were expected. Download the file again."
+            )
         self._demo, self._key, self._where, self._length = demo, key, where, len(array)
         self._rows = max(array.chunks[0] if array.chunks else 1, BLOCK)
         self._at, self._block = -1, np.zeros((0, 0, 0, 3), np.uint8)

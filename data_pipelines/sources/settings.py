@@ -13,7 +13,10 @@ from hma_jax.config import require
 HUMAN_SHORT_SIDE = 256
 """Pixels of the shorter side of frames of human video: what the release's tokenizers see."""
 
-Cameras = Annotated[tuple[str, ...], arg(metavar="[NAME ...]")]
+UNSET = arg(help_behavior_hint="")
+"""For an option whose text says what happens without it."""
+
+Cameras = Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET]
 
 
 def _check_side(short_side: int | None) -> None:
@@ -22,14 +25,14 @@ def _check_side(short_side: int | None) -> None:
 
 @dataclass(frozen=True)
 class RobomimicSettings:
-    """What is taken of the file."""
+    """What is taken from the file."""
 
     camera: Cameras = ()
-    """Cameras to keep, such as agentview; all if not given."""
+    """Cameras to keep, such as agentview. Default: all."""
     filter_key: str | None = None
-    """Take the demonstrations of this mask only."""
-    hz: float | None = None
-    """Control rate; the file's own, or 20, if not given."""
+    """Take only the demonstrations of this mask (filter key)."""
+    hz: Annotated[float | None, UNSET] = None
+    """Control rate in Hz. Default: the file's own, or 20."""
     short_side: int | None = None
     """Shrink images to this shorter side."""
 
@@ -41,10 +44,10 @@ class RobomimicSettings:
 
 @dataclass(frozen=True)
 class LeRobotSettings:
-    """What is taken of the dataset."""
+    """What is taken from the dataset."""
 
     camera: Cameras = ()
-    """Cameras to keep, such as top; all if not given."""
+    """Cameras to keep, such as top. Default: all."""
     short_side: int | None = None
     """Shrink images to this shorter side."""
 
@@ -58,7 +61,7 @@ class EpicKitchensSettings:
     """Which frames make episodes."""
 
     min_score: float = 0.5
-    """A detection counts from this score on; the authors of the detections advise 0.5."""
+    """Lowest score of a detection that is used; the authors of the detections recommend 0.5."""
     min_frames: int = 61
     """Shortest run of frames with both hands that makes an episode: 61 at 10 Hz are 6 s."""
     short_side: int | None = HUMAN_SHORT_SIDE
@@ -93,9 +96,9 @@ class EgoExo4dSettings:
     """Which takes and frames make episodes."""
 
     camera: str = "cam01"
-    """The fixed camera."""
+    """Name of the fixed camera."""
     split: str = "train"
-    """Which annotations: train, val or test."""
+    """Split of the annotations: train, val or test."""
     min_frames: int = 300
     """Shortest run of labelled frames that makes an episode: 300 at 30 Hz are 10 s."""
     short_side: int | None = HUMAN_SHORT_SIDE

@@ -42,7 +42,7 @@ def count_skippable(limit: float, episodes: int) -> int:
     """How many of `episodes` may be left out: `limit`, or this share of them, rounded down, if it is below 1."""
     require(
         limit >= 0 and (limit < 1 or float(limit).is_integer()),
-        f"max_skipped must be a whole number of episodes or, below 1, a share of them, got {limit:g}",
+        f"max_skipped must be a whole number of episodes or, below 1, a fraction of them, got {limit:g}",
     )
     return int(limit if limit >= 1 else limit * episodes)
 
@@ -207,8 +207,9 @@ class EpisodeSource(ABC):
             feature = self.features.get(step_key(field))
             if feature is not None and feature.encoding:
                 raise ConfigError(
-                    f"{self.name}: {field!r} in {self.schema} is kept as bytes (encoding {feature.encoding!r}), which are "
-                    "not read; write the dataset again with encoding 'none' for it, or take another field."
+                    f"{self.name}: {field!r} in {self.schema} is stored as bytes (encoding {feature.encoding!r}), "
+                    "which cannot be read; write the dataset again with encoding 'none' for it, or use another "
+                    "field."
                 )
             if feature is None or not feature.size:
                 raise ConfigError(
@@ -238,9 +239,8 @@ class EpisodeSource(ABC):
         total = sum(self.skipped.values())
         if total > self.max_skipped:
             raise DataError(
-                f"{self.name}: {total} episodes are unusable, more than max_skipped={self.max_skipped}. "
-                f"The last: {without_advice(reason)} If the rest is worth it, raise the limit: "
-                "--set store.max_skipped=N."
+                f"{self.name}: {total} episodes cannot be used, more than max_skipped={self.max_skipped}. The last: "
+                f"{without_advice(reason)} To use the others, raise the limit: --set store.max_skipped=N."
             )
 
 
@@ -278,7 +278,7 @@ def join_actions(
                 f"{steps * size}. Repair the episode, or read with corrupt='skip'."
             )
         if values.dtype.kind not in "biuf":
-            what = f"{key!r} holds no numbers, but {values.dtype}"
+            what = f"{key!r} contains no numbers, but {values.dtype}"
             raise unusable(f"{what}. Repair the episode, or read with corrupt='skip'.")
         values = values.reshape(steps, size)[:, part].astype(np.float32)
         finite = np.isfinite(values).all(axis=1)

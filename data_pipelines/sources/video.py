@@ -21,7 +21,7 @@ from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import is_io_error, retry
 from data_pipelines.sources.rlds.writer import encode_jpeg
 
-ADVICE = "Fetch the file again, or leave it out with --skip-damaged (when tokenising, corrupt='skip')."
+ADVICE = "Download the file again, or leave it out with --skip-damaged (when tokenising, corrupt='skip')."
 
 FAR = 2.0
 """Seconds from which on a jump forward is a seek: frames in between are decoded otherwise."""
@@ -137,14 +137,14 @@ def open_video(path: Path) -> Iterator[Video]:
         except (OSError, av.FFmpegError) as error:
             if _is_io_error(error):
                 raise  # to be tried again
-            raise UnitError(f"{path}: no readable video ({error}). {ADVICE}") from error
+            raise UnitError(f"{path}: not a readable video ({error}). {ADVICE}") from error
 
     with retry(path, opened) as container:
         if not container.streams.video:
             raise UnitError(f"{path}: it has no video stream. {ADVICE}")
         if container.streams.video[0].codec_context is None:
-            raise UnitError(f"{path}: its video is encoded in no known way. {ADVICE}")
+            raise UnitError(f"{path}: the encoding of its video is not known. {ADVICE}")
         video = Video(path, container)
         if not video.rate:
-            raise UnitError(f"{path}: it does not say how many frames it has per second. {ADVICE}")
+            raise UnitError(f"{path}: it has no frame rate. {ADVICE}")
         yield video

@@ -38,7 +38,7 @@ class Environment:
         """One native step, 1 / spec.hz seconds. Raises ConfigError unless `action` is [A] and finite."""
         action = np.asarray(action, np.float32)
         wanted = (self.spec.action_dim,)
-        require(action.shape == wanted, f"{self.spec.name}: an action is of shape {wanted}, got {action.shape}")
+        require(action.shape == wanted, f"{self.spec.name}: an action must have shape {wanted}, got {action.shape}")
         require(bool(np.isfinite(action).all()), f"{self.spec.name}: the action is not finite: {action.tolist()}")
         self._world.step(action[None].astype(np.float64))
 
@@ -63,5 +63,5 @@ class Environment:
     def set_state(self, state: State) -> None:
         """Goes on from a state of the same robot. Raises ConfigError for one of another shape."""
         have, given = ({k: np.shape(v) for k, v in vars(s).items()} for s in (self._world.state, state))
-        require(have == given, f"{self.spec.name}: the state is of another robot: shapes {given}, not {have}")
+        require(have == given, f"{self.spec.name}: the state is from another robot: it has shapes {given}, not {have}")
         self._world.state = state

@@ -85,7 +85,7 @@ def generate_suite(
     """
     require(0 < scale < math.inf, f"suite scale must be positive and finite, got {scale}")
     require(validation >= 1, f"suite validation must be at least 1 episode, got {validation}")
-    require(fewest >= 1, f"the fewest episodes of a dataset must be at least 1, got {fewest}")
+    require(fewest >= 1, f"the smallest number of episodes of a dataset must be at least 1, got {fewest}")
     require(workers >= 1, f"suite workers must be at least 1, got {workers}")
     specs, root = select(names), Path(root)
     try:

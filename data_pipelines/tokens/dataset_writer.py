@@ -148,8 +148,10 @@ def _publish(maker: PartMaker) -> None:
                 facts.append(known)
             manifest = _merge(plan, facts, maker.skipped)
             if not manifest.train.episodes:
-                last = f" The last left out: {without_advice(manifest.skipped[-1].reason)}" if manifest.skipped else ""
-                raise DataError(f"{plan.spec.name}: no usable episode is left to train on.{last}")
+                last = (
+                    f" The last one skipped: {without_advice(manifest.skipped[-1].reason)}" if manifest.skipped else ""
+                )
+                raise DataError(f"{plan.spec.name}: no episode can be used for training.{last}")
             manifest.save(work, lock.scratch)
             sync(work)
             try:
@@ -194,8 +196,8 @@ def _published(final: Path, plan: Manifest) -> Manifest | None:
     changes = _changes(existing, plan)
     require(
         not changes,
-        f"{final}: already tokenised in another way ({'; '.join(changes)}). "
-        "Choose another store directory, or remove this dataset from the store.",
+        f"{final}: already tokenised with other settings ({'; '.join(changes)}). Choose another store directory, or "
+        "remove this dataset from the store.",
     )
     return existing
 
@@ -221,7 +223,9 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
     for other in others:
         if held := find_held_lock(locks_of(other)):
             raise Held(
-                f"{final}: {held.who} is making this dataset in another way; wait for it or stop it", held.holder
+                f"{final}: {held.who} is making this dataset with other settings; wait until it has finished, or stop "
+                "it",
+                held.holder,
             )
     if final.exists():
         try:

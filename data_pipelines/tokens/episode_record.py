@@ -57,7 +57,7 @@ def encode_episode(item: StoredEpisode) -> bytes:
 def decode_episode(data: bytes) -> StoredEpisode:
     """Inverse of `encode_episode`. Raises ValueError for bytes of another layout or length."""
     if len(data) < 4 * HEADER:
-        raise ValueError(f"{len(data)} bytes are no episode record")
+        raise ValueError(f"{len(data)} bytes are not an episode record")
     header = np.frombuffer(data, "<i4", HEADER).tolist()
     version, episode, success, frames, tokens, steps, action_dim, width, size, channels = header
     if version != VERSION:

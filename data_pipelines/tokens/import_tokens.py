@@ -97,21 +97,22 @@ def _plan(
             have, want = getattr(tokenizer, field), getattr(decoder, field)
             require(
                 have == want,
-                f"{train.path}: its tokens have {field} {want}, but the tokenizer makes {have}; "
-                f"give the one that made them (latents here are joined by --patch {patch})",
+                f"{train.path}: its tokens have {field} {want}, but the tokenizer makes {have}; give the tokenizer "
+                f"that made them (latents are joined with --patch {patch})",
             )
         facts[0] = decoder
     if name is None and not is_dataset_name(train.name):
         raise DataError(
-            f"{train.path / 'metadata.json'}: name is {quote(train.name)}; {NAME_RULE}. Say another one with --name."
+            f"{train.path / 'metadata.json'}: name is {quote(train.name)}; {NAME_RULE}. Give another name with --name."
         )
     name = name or train.name
     known = find_spec(name)
     rate = known.hz if hz is None and known is not None else hz
     require(
         rate is not None,
-        f"{name!r} is not in the registry, so its rate is unknown: give --hz, in native frames per second "
-        f"(metadata.json says {train.metadata.get('hz')!r}, from a table that is wrong for many datasets)",
+        f"{name!r} is not in the registry, so its rate is unknown: give --hz, the native frames per second "
+        f"(metadata.json says {train.metadata.get('hz')!r}, but this comes from a table that is wrong for many "
+        "datasets)",
     )
     # Where these frames came from is not known here, so the keys say no more than what they are.
     spec = DatasetSpec(name, "video", ("actions",), (train.actions.shape[1],), float(rate))
@@ -145,7 +146,8 @@ def _facts(folder: ReleaseFolder, patch: int) -> TokenizerFacts:
     factors = round(np.log(vocab) / np.log(FACTOR_VOCAB))
     require(
         factors >= 1 and FACTOR_VOCAB**factors == vocab,
-        f"{folder.path}: a vocabulary of {vocab} is no power of {FACTOR_VOCAB}, which the factors of ids are",
+        f"{folder.path}: the vocabulary size {vocab} is not a power of {FACTOR_VOCAB}, so ids cannot be split into "
+        "factors",
     )
     return TokenizerFacts(folder.encoder, image_size, side, side**2, vocab, factors, FACTOR_VOCAB)
 
@@ -176,8 +178,8 @@ def _tokens(folder: ReleaseFolder, start: int, stop: int, step: int, patch: int)
         wrong = part[(part < 0) | (part >= folder.vocab_size)]
         if len(wrong):
             raise DataError(
-                f"{folder.path / 'video.bin'}: id {wrong[0]} in frames {start} to {stop - 1}, "
-                f"but vocab_size is {folder.vocab_size}. Fetch the folder again."
+                f"{folder.path / 'video.bin'}: id {wrong[0]} in frames {start} to {stop - 1}, but vocab_size is "
+                f"{folder.vocab_size}. Download the folder again."
             )
         return part.reshape(len(part), -1).astype(token_dtype(folder.vocab_size))
     if not np.isfinite(part).all():

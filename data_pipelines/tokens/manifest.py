@@ -153,9 +153,9 @@ class Manifest:
         own = rate if self.spec.rate is None else self.spec.rate
         require(
             stride % self.frame_step == 0,
-            f"{self.spec.name}: {rate_in_words(own)} is every {ordinal(stride)} recorded frame, the "
-            f"token store keeps every {ordinal(self.frame_step)}. Tokenise it again with frames for any rate, "
-            "`hma tokenize ... --set store.frame_step=1 --replace tokens`, or choose another rate.",
+            f"{self.spec.name}: {rate_in_words(own)} needs every {ordinal(stride)} recorded frame, but the token "
+            f"store keeps every {ordinal(self.frame_step)}. Tokenise all frames, with `hma tokenize ... --set "
+            "store.frame_step=1 --replace tokens`, or choose another rate.",
         )
         return stride
 
@@ -223,8 +223,8 @@ class Manifest:
             return (), ()
         if not action_range.quantiles:
             raise DataError(
-                f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
-                "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
+                f"{self.spec.name}: its tokens were made by an earlier version, which stored no quantiles of actions. "
+                "Remove the dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
         first, last = action_range.quantiles[0], action_range.quantiles[-1]
         pairs = zip(

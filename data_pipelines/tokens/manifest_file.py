@@ -28,7 +28,8 @@ def load_manifest(path: Path) -> Manifest:
         values = json.loads(path.read_text())
         if values.get("format") not in READABLE_FORMATS:
             raise DataError(
-                f"{path}: manifest format {values.get('format')!r}; this reads {' and '.join(map(str, READABLE_FORMATS))}. {advice}"
+                f"{path}: manifest format {values.get('format')!r}, but only "
+                f"{' and '.join(map(str, READABLE_FORMATS))} can be read. {advice}"
             )
         take = _from_json if values["format"] == 2 else _from_file
         columns_by_split = take(path, values)
@@ -61,7 +62,7 @@ def _from_file(path: Path, values: dict[str, Any]) -> EpisodeColumns:
     for split, by_name in columns_by_split.items():
         for name, column in by_name.items():
             if stated[f"{split}.{name}"] != column.digest():
-                raise ValueError(f"{columns.path.name} is not the one it was written with")
+                raise ValueError(f"{columns.path.name} does not belong to it")
             if len(column) != sum(values[split]["parts"]):
                 raise ValueError(f"{split}.{name} has {len(column)} entries, not one per episode")
     return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in columns_by_split.items()}

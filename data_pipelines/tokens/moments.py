@@ -93,12 +93,12 @@ def read_moments(part: Path, episodes: int) -> np.ndarray | None:
         return None
     except (OSError, ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
         raise DataError(
-            f"{path}: statistics of actions cannot be read ({error}). Remove the file: they are then computed again."
+            f"{path}: the action statistics cannot be read ({error}). Remove the file, and they are computed again."
         ) from error
     if rows.ndim != 2 or len(rows) != episodes or rows.dtype != np.float64:
         raise DataError(
-            f"{path}: {rows.dtype} {list(rows.shape)} are no statistics of {episodes} episodes. Remove the file: "
-            "they are then computed again."
+            f"{path}: {rows.dtype} {list(rows.shape)} cannot be the action statistics of {episodes} episodes. Remove "
+            "the file, and they are computed again."
         )
     return rows
 

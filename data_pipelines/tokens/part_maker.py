@@ -115,7 +115,7 @@ class PartMaker:
         total = sum(entry.episodes for entry in skipped)
         if total > self.max_skipped:
             raise DataError(
-                f"{self.plan.spec.name}: {total} episodes are unusable, more than max_skipped={self.max_skipped}. "
-                f"The last: {without_advice(skipped[-1].reason)} If the rest is worth it, raise the limit: "
-                "--set store.max_skipped=N."
+                f"{self.plan.spec.name}: {total} episodes cannot be used, more than max_skipped={self.max_skipped}. "
+                f"The last: {without_advice(skipped[-1].reason)} To use the others, raise the limit: --set "
+                "store.max_skipped=N."
             )

@@ -24,7 +24,7 @@ from data_pipelines.json_file import read_object
 from data_pipelines.names import quote
 from hma_jax.config import ConfigError
 
-ADVICE = "Fetch the folder again."
+ADVICE = "Download the folder again."
 DTYPES = ("uint8", "uint16", "uint32", "int32", "float16", "float32")
 MAX_COUNT = 10**9
 """Largest accepted number in metadata.json."""
@@ -84,8 +84,8 @@ def open_folder(path: str | Path) -> ReleaseFolder:
     if falls.any():
         frame = int(np.flatnonzero(falls)[0])
         raise DataError(
-            f"{path / 'segment_ids.bin'}: the episode falls from {segments[frame]} to "
-            f"{segments[frame + 1]} at frame {frame + 1}; they must not decrease. {ADVICE}"
+            f"{path / 'segment_ids.bin'}: the episode number falls from {segments[frame]} to {segments[frame + 1]} at "
+            f"frame {frame + 1}, but it must not decrease. {ADVICE}"
         )
     bounds = np.concatenate([[0], np.flatnonzero(segments[1:] != segments[:-1]) + 1, [frames]]).astype(np.int64)
     return ReleaseFolder(path, str(meta.get("name") or path.name), meta, video, actions, bounds)
@@ -101,7 +101,9 @@ def _metadata(path: Path) -> dict[str, Any]:
         if type(value) is not int or not 1 <= value <= MAX_COUNT:
             raise DataError(f"{path}: {field} is {quote(value)}, not a positive number. {ADVICE}")
     if meta.get("token_dtype", "uint32") not in DTYPES:
-        raise DataError(f"{path}: token_dtype is {quote(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}")
+        raise DataError(
+            f"{path}: token_dtype is {quote(meta['token_dtype'])}, but must be one of {', '.join(DTYPES)}. {ADVICE}"
+        )
     return meta
 
 
@@ -114,7 +116,9 @@ def _video_shape(path: Path, meta: dict[str, Any]) -> tuple[int, tuple[int, ...]
     if dtype.kind == "f":
         return frames, (frames, channels or 4, *grid), dtype
     if dtype == np.uint8:
-        raise ConfigError(f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents.")
+        raise ConfigError(
+            f"{path}: it holds raw images (token_dtype uint8), not tokens; give the folder of ids or latents."
+        )
     vocab_size = meta.get("vocab_size")
     if type(vocab_size) is not int or not 2 <= vocab_size <= 2**32:
         raise DataError(f"{path / 'metadata.json'}: vocab_size is {quote(vocab_size)}. {ADVICE}")
@@ -127,7 +131,8 @@ def _map(path: Path, dtype: Any, shape: tuple[int, ...], because: str) -> np.nda
         found = path.stat().st_size
         if found != expected:
             raise DataError(
-                f"{path}: {found} bytes, but {because} make {expected} ({np.dtype(dtype)} {list(shape)}). {ADVICE}"
+                f"{path}: it has {found} bytes, but by {because} it should have {expected} ({np.dtype(dtype)} "
+                f"{list(shape)}). {ADVICE}"
             )
         return np.memmap(path, dtype, "r", shape=shape)
     except OSError as error:
@@ -138,6 +143,7 @@ def _actions(path: Path, frames: int) -> np.ndarray:
     size = path.stat().st_size if path.is_file() else 0
     if not size or size % (4 * frames):
         raise DataError(
-            f"{path}: {size} bytes are no float32 [{frames}, A], for the num_images of metadata.json. {ADVICE}"
+            f"{path}: its {size} bytes are not an array float32 [{frames}, A], with num_images of metadata.json as "
+            f"first size. {ADVICE}"
         )
     return np.memmap(path, np.float32, "r", shape=(frames, size // (4 * frames)))

@@ -44,16 +44,16 @@ class TokenStore:
     def __init__(self, root: str | Path):
         self.root = Path(root)
         if not self.root.is_dir():
-            raise DataError(f"{self.root}: no such token store. Tokenise datasets into it first.")
+            raise DataError(f"{self.root}: there is no token store. Tokenise datasets into it first.")
         found = sorted(p.parent for p in self.root.glob(f"*/{FILE}") if not p.parent.name.startswith("."))
         if not found:
-            raise DataError(f"{self.root}: no dataset in this token store. Tokenise datasets into it first.")
+            raise DataError(f"{self.root}: the token store is empty. Tokenise datasets into it first.")
         self._manifests = {directory.name: load_manifest(directory / FILE) for directory in found}
         for directory, manifest in zip(found, self._manifests.values(), strict=True):
             if directory.name != manifest.spec.name:
                 raise DataError(
-                    f"{directory}: it holds the dataset {manifest.spec.name!r}, whose name it must bear in a token "
-                    "store. Rename it, or move a copy out of the store."
+                    f"{directory}: in a token store this directory must have the name of its dataset, "
+                    f"{manifest.spec.name!r}. Rename it, or move it out of the store if it is a copy."
                 )
         self._start()
 

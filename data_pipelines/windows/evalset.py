@@ -90,7 +90,7 @@ class EvalManifest:
         except (ValueError, AttributeError, TypeError) as error:
             raise DataError(f"{path}: not an evaluation set ({error}). {advice}") from error
         if found != stated:  # of what the file says: one of an earlier version lacks fields
-            raise DataError(f"{path}: its contents do not match its hash {stated}: it was changed. {advice}")
+            raise DataError(f"{path}: its contents do not match the hash in it, {stated}: it was changed. {advice}")
         return manifest
 
 
@@ -189,8 +189,8 @@ def eval_batches(
     require(not unknown, f"not in the evaluation set: {', '.join(unknown)}; it has {', '.join(frozen)}")
     require(
         store.hash(tuple(frozen)) == manifest.store,
-        f"{store.root}: the token store is not the one the evaluation set was frozen on. "
-        "Freeze it again, or restore the store.",
+        f"{store.root}: the token store is not the one on which the evaluation set was frozen. Freeze the set again, "
+        "or restore the store.",
     )
     for name in wanted:
         require(
@@ -200,7 +200,7 @@ def eval_batches(
     store.check_table(table, wanted, manifest.rate)
     require(
         counterfactual is None or counterfactual.manifest == manifest.hash(),
-        "the frames under other actions were made for other windows than those frozen here; prepare the study again",
+        "the frames under other actions were made for other windows than the frozen ones; prepare the study again",
     )
     windows = [(name, *window) for name in wanted for window in frozen[name].windows[:first]]
     return _batches(_Rows(store, table, manifest, wanted, other_actions, counterfactual), batch, windows)

@@ -85,10 +85,10 @@ class WindowSet:
         if not self.longest_episode:
             return f"it has no {self.split} episode"
         if self.longest_episode >= self.needed:
-            return "the trajectories that were drawn of it were all skipped: raise max_trajectories"
+            return "all trajectories that were drawn from it were skipped: raise max_trajectories"
         return (
-            f"{self.min_real} frames, the least there may be, need {self.needed} native frames at stride "
-            f"{self.slicer.stride}; the longest of its {self.too_short} {self.split} episodes has {self.longest_episode}"
+            f"a window has at least {self.min_real} frames, which at stride {self.slicer.stride} need {self.needed} "
+            f"native frames; the longest of its {self.too_short} {self.split} episodes has {self.longest_episode}"
         )
 
 
@@ -100,12 +100,12 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
     reasons = "; ".join(f"{name}: {s.why_empty()}" for name, s in sets.items())
     if not any(s.longest_episode for s in sets.values()):
         raise DataError(
-            f"there is no {split} episode to cut windows of. {reasons}. Of a single episode none can be held out: add more. "
-            "Of several, store.val_fraction, store.min_val and store.max_val say how many are, of all that there should be."
+            f"there is no {split} episode for windows. {reasons}. Of a single episode none can be held out: add more. "
+            "With several, store.val_fraction, store.min_val and store.max_val set how many are held out."
         )
     shorter = " or a shorter prompt" if any(s.min_real > MIN_TRAIN_FRAMES for s in sets.values()) else ""
     raise DataError(
-        f"no {split} episode is long enough for a window. {reasons}. Use a higher rate of frames{shorter}, or datasets "
+        f"no {split} episode is long enough for a window. {reasons}. Use a higher frame rate{shorter}, or datasets "
         "with more or longer episodes."
     )
 
@@ -145,7 +145,10 @@ def val_windows(
 def _windows(
     store: TokenStore, name: str, split: str, slicer: WindowSlicer, min_real: int, limit: int | None, seed: int
 ) -> WindowSet:
-    require(1 <= min_real <= slicer.frames, f"windows of {slicer.frames} frames cannot have {min_real} real ones")
+    require(
+        1 <= min_real <= slicer.frames,
+        f"windows of {slicer.frames} frames cannot have at least {min_real} recorded ones",
+    )
     manifest = store.manifest(name)
     steps = np.asarray(manifest.split(split).steps, np.int64)
     counts = slicer.count(steps, min_real)

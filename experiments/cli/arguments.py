@@ -18,20 +18,21 @@ from experiments.setting import UNSET, StudyArguments, require_local
 class RunningArguments:
     """How trials are run; none of it changes a result."""
 
-    workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1; elsewhere: what there is)")] = None
-    """Trials at a time, each in its own process: on this machine with its share of cores and accelerators."""
+    workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1; on a cluster: no limit)")] = None
+    """How many trials run at the same time, each in its own process.
+    On this machine they share cores and accelerators equally."""
     launcher: Annotated[str, arg(metavar="|".join(LAUNCHERS))] = "local"
-    """Where trials run: on this machine, through Slurm, or on a Ray cluster; docs/launching.md."""
+    """Where trials run: on this machine, through Slurm, or on a Ray cluster (docs/launching.md)."""
     launcher_set: Annotated[UseAppendAction[tuple[str, ...]], arg(name="launcher-set", metavar="KEY=VALUE")] = ()
     """One setting of the launcher, such as partition=gpu or gpus=1."""
     retry_failed: Annotated[FlagCreatePairsOff[bool], arg(name="retry-failed"), UNSET] = False
-    """Run trials again that failed, from their checkpoints, or diverged, from the start.
-    Otherwise they stay as they are, and visible."""
+    """Run failed trials again from their last checkpoint, and diverged trials from the start.
+    Without it they are not run again; the report lists them as failed or diverged."""
     accept_code: Annotated[FlagCreatePairsOff[bool], arg(name="accept-code"), UNSET] = False
-    """Go on though the code changed since trials of the study ran; the page then counts the sources.
-    For changes that alter no result."""
+    """Continue although the code has changed since earlier trials of the study ran.
+    Only for changes that alter no result. The report then says how many versions of the code ran."""
     dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False
-    """Print trials, parameters, FLOPs and expected time on the devices that they would use here, and stop."""
+    """Print the trials with their parameters, FLOPs and expected time on the devices that they would use, and stop."""
 
     def words(self) -> list[str]:
         """The arguments that say where and how many at a time."""
@@ -42,11 +43,11 @@ class RunningArguments:
 
 @dataclass(frozen=True)
 class ReplaceArguments:
-    """What was made with other settings or data is never replaced without being asked for."""
+    """Results made with other settings or data are replaced only on request."""
 
     replace: Annotated[Step | None, arg(metavar="STEP"), UNSET] = None
-    """Make this step, and those that follow from it, again in place of what differs there.
-    In order: suite, tokenizer, tokens, windows, study."""
+    """Make this step and those that depend on it again, in place of results made with other settings or data.
+    The steps in order: suite, tokenizer, tokens, windows, study."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class ModelArguments:
     run: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: OUT/model)")] = None
     """Directory of the training run. Resumed if it exists."""
     trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
-    """Trajectories of each robot, chosen by hash: the same as in a sweep over trajectories."""
+    """Train on N trajectories of each robot, chosen by hash: the same ones as in a sweep over trajectories."""
 
     def directory(self) -> Path | None:
         """`run`. Raises ConfigError for a URL."""

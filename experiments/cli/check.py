@@ -22,18 +22,19 @@ def check(
     robots: Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET] = (),
     windows: int = 64,
 ) -> None:
-    """Say which action dimensions a model ignores, or has with another sign, scale or place than the recordings.
+    """Find action dimensions that a model ignores, or uses with the wrong sign, scale or position.
 
-    Held-out windows are judged under the recorded actions and with one dimension held still, negated, scaled or
-    exchanged with another. The table gives what a dimension is worth: nats per token that are lost when it is held
-    still. Robots of too few held-out episodes are left out, and named. Writes RUN/check.json.
+    Held-out windows are evaluated with the recorded actions, and again with one action dimension held constant,
+    negated, scaled or swapped with another. The table says how much each dimension is worth: by how many nats per
+    token the loss rises when it is held constant. Robots with too few held-out episodes are left out and listed.
+    Writes RUN/check.json.
 
     Args:
         run: Directory of a training run.
-        out: Directory of a study with tokens and windows of the robots: your own recordings, or those it was trained
-            on.
-        robots: Only these. Otherwise all that have windows there.
-        windows: Of each robot.
+        out: Directory of a study with tokens and windows of the robots: of your own recordings, or of those that the
+            model was trained on.
+        robots: Check only these robots. Default: all that have windows in --out.
+        windows: Windows per robot.
     """
     from experiments.applications.check import check_run, choose_robots, open_study, verdict, write_effects
     from experiments.cli.evaluate import check_fits, note_possible_leakage
@@ -62,5 +63,5 @@ def check(
         console.print(table)
     write_effects(run / "check.json", found, names)
     if left_out:
-        say(f"not checked, for want of episodes: {', '.join(left_out)}; what to do stands above")
+        say(f"not checked, too few held-out episodes: {', '.join(left_out)}; the messages above say what to do")
     say(f"wrote {run / 'check.json'}")

@@ -35,16 +35,16 @@ def compare(
     b: Annotated[Positional[Path], arg(metavar="B")],
     to: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=f"(default: {DEFAULT})")] = None,
 ) -> None:
-    """Compare two models, or the reference models of two studies, on the windows that both saw.
+    """Compare two models, or the reference models of two studies, on the windows that both were evaluated on.
 
     Prints A - B with standard errors, per robot and overall, nats per token first, and writes every metric with
-    its 95 % interval. Differences are paired window by window; errors count episodes and, between studies of several
-    seeds, seeds. Ends with exit code 2 if the two did not see the same windows.
+    its 95 % interval. Differences are paired window by window. Standard errors are over episodes and, between studies
+    of several seeds, also over seeds. Ends with exit code 2 if the two were not evaluated on the same windows.
 
     Args:
         a: Directory of a finished trial, of an evaluated model, or of a study.
-        b: The one it is compared with.
-        to: Where the CSV is written. A file there is replaced; the one of the default only by the same comparison.
+        b: Directory of the one to compare it with.
+        to: CSV file to write. An existing file is replaced; the default file only by the same comparison.
     """
     from experiments.analysis import compare as analysis
     from experiments.analysis.tables import read_side
@@ -61,8 +61,8 @@ def compare(
     text = csv_text(analysis.Difference, rows)
     require(
         to is not None or not place.exists() or place.read_bytes() == text.encode(),
-        f"{place}: another comparison is there, and stays. Name a file for this one with --to FILE, or add "
-        f"--to {place}, which puts it in place of that one",
+        f"{place} holds another comparison, which is not overwritten. Write this one elsewhere with --to FILE, or "
+        f"overwrite that one with --to {place}",
     )
     write_file(place, text)
     wrote(place)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 convert_app = SubcommandApp()
 
 HELP = (
-    "Checkpoints to and from other formats. A RUN is the directory of a training run of this project. "
-    "Nothing that exists is overwritten, and an output appears whole or not at all."
+    "Convert checkpoints to and from other formats. A RUN is the directory of a training run of this project. "
+    "Existing files are never overwritten; an output is written completely or not at all."
 )
 
 Platform = Literal["cpu", "cuda", "rocm", "tpu"]
@@ -36,21 +36,21 @@ PLAIN = DecodeConfig(sampler=SamplerConfig(temperature=0.0))
 
 
 def _unless(usual: float | str) -> object:
-    return arg(help_behavior_hint=f"(default: as RUN/decode.json says, or {usual})")
+    return arg(help_behavior_hint=f"(default: as in RUN/decode.json, or {usual})")
 
 
 @convert_app.command(name="from-official")
 def from_official(checkpoint: Positional[Path], out: Path) -> None:
-    """Make a run of a checkpoint of the official PyTorch release, discrete or continuous.
+    """Make a run from a checkpoint of the official PyTorch release, discrete or continuous.
 
-    Every tensor must be there, with the shape that config.json asks for. PyTorch is not needed, and
+    Every tensor must be present, with the shape that config.json requires. PyTorch is not needed, and
     no code of the checkpoint is run. The run can be evaluated, fine-tuned (hma train --from), given new
-    robots (hma adapt), and converted further; it cannot be resumed. docs/checkpoints.md shows each.
+    robots (hma adapt), and converted to other formats; it cannot be resumed. docs/checkpoints.md shows each.
 
     Args:
         checkpoint: Directory with config.json and model.safetensors (or pytorch_model.bin, model.bin).
-        out: The run to write. Its rates.toml has the registry entries of those of its robots that are known, with the
-            rates of frames that it was trained at.
+        out: Directory of the run to write. Its rates.toml has the registry entries of its robots, as far as the
+            registry knows them, with the frame rates that the model was trained at.
     """
     from hma_jax.convert import read_official, require_free, write_run
 
@@ -61,7 +61,10 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
     for note in without:
         say(note)
     if run.model.conditioning == "cross_attention":
-        console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
+        console.print(
+            "note: cross-attention is computed as the paper describes it; the release computes it differently",
+            soft_wrap=True,
+        )
     _describe(run)
     study = _study_of(run, out / RATES)
     wrote(
@@ -75,15 +78,15 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
 def to_official(run: Positional[Path], out: Path, weights: Weights = "auto") -> None:
     """Write a run as a checkpoint that the official PyTorch release loads.
 
-    What came from the release and was not trained since goes back byte for byte. Anything else is
-    written so that the release's from_pretrained loads it and computes the same: muP that the release
-    cannot hold (continuous models of another width than 256, other attention scales) is folded into the
-    weights, which a note says. Models that it cannot compute are refused by the field that it lacks.
+    A run that came from the release and was not trained further is written back byte for byte. Any other run is
+    written so that the release's from_pretrained loads it and computes the same. muP that the release
+    does not support (continuous models of another width than 256, other attention scales) is folded into the
+    weights, and a note says so. Models that the release cannot compute are refused; the error names the setting.
 
     Args:
         run: Directory of the training run.
         out: Directory to write: config.json and model.safetensors.
-        weights: The last weights, their moving average, or the average where there is one.
+        weights: last: the last weights; ema: their moving average; auto: the average if there is one.
     """
     from hma_jax.convert import loads_in_release, require_free, write_official
     from hma_jax.convert.official import read_config
@@ -108,7 +111,7 @@ def to_safetensors(run: Positional[Path], out: Path, weights: Weights = "auto") 
     Args:
         run: Directory of the training run.
         out: Directory to write: model.json and model.safetensors.
-        weights: The last weights, their moving average, or the average where there is one.
+        weights: last: the last weights; ema: their moving average; auto: the average if there is one.
     """
     from hma_jax.convert import require_free, write_neutral
     from hma_jax.training.runs import load_run
@@ -123,11 +126,11 @@ def to_safetensors(run: Positional[Path], out: Path, weights: Weights = "auto") 
 
 @convert_app.command(name="from-safetensors")
 def from_safetensors(directory: Positional[Path], out: Path) -> None:
-    """Make a run of what to-safetensors wrote, perhaps with weights changed in between.
+    """Make a run from what to-safetensors wrote; the weights may have been changed since.
 
     Args:
         directory: Directory with model.json and model.safetensors.
-        out: The run to write.
+        out: Directory of the run to write.
     """
     from hma_jax.convert import read_neutral, require_free, write_run
 
@@ -152,23 +155,23 @@ def to_stablehlo(
     platforms: tuple[Platform, ...] = ("cpu", "cuda", "tpu"),
     weights: Weights = "auto",
 ) -> None:
-    """Write generation as a program that runs with JAX alone, without this project.
+    """Export the generation of frames as a program that runs with JAX only, without this project.
 
-    The program continues a batch of clips: model.json lists its inputs and outputs in order, the
-    weights lie beside it.
+    The program continues a batch of clips. model.json lists its inputs and outputs in order; the
+    weights are in model.safetensors.
 
     Args:
         run: Directory of the training run.
         out: Directory to write: model.stablehlo, model.safetensors and model.json.
         batch: Clips at a time.
-        prompt: Frames that are given.
-        frames: Frames in all; those after the prompt are generated.
-        unmask_steps: Passes over each new frame.
-        temperature: 0 takes what is most likely, 1 draws as the model says.
-        sampler_steps: Steps of the diffusion sampler; of no effect on discrete models.
+        prompt: Number of given frames.
+        frames: Total number of frames; those after the prompt are generated.
+        unmask_steps: Unmasking steps per generated frame.
+        temperature: 0 takes the most likely tokens, 1 samples from the model's distribution.
+        sampler_steps: Steps of the diffusion sampler; no effect on discrete models.
         sampler: The diffusion sampler; dpm++ needs 10 to 12 steps.
-        platforms: Where the program can run.
-        weights: The last weights, their moving average, or the average where there is one.
+        platforms: Platforms that the program can run on.
+        weights: last: the last weights; ema: their moving average; auto: the average if there is one.
     """
     from hma_jax.convert import ProgramConfig, require_free, write_stablehlo
     from hma_jax.training.runs import load_run
@@ -210,10 +213,10 @@ def _rates(run: Run) -> tuple[str, list[str]]:
         else:
             entries.append(to_toml(replace(spec, rate=spec.rate_for(robot.stride))))
     return "\n".join(entries), [
-        f"note: not in {RATES}: {', '.join(names)}, {why}; to use one write an entry (docs/own_data.md)"
+        f"note: not in {RATES}: {', '.join(names)}, {why}; to use one, write its entry (docs/own_data.md)"
         for names, why in (
             (unknown, "which the registry does not know"),
-            (other, "of other actions than the registry's"),
+            (other, "whose actions differ from the registry's"),
         )
         if names
     ]

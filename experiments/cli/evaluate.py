@@ -51,10 +51,10 @@ def evaluate(
         run: Directory of the training run.
         arguments: The study whose windows, tokenizer and protocol are used.
         hosts: Several processes that evaluate together, on one host or on many.
-        weights: The last weights, their moving average (train.ema_decay), or the average where there is one.
-        to: Directory for the results, for those of several sets of windows beside each other.
-        replace: Put the results in place of those of other data, windows or settings.
-            Otherwise these stay, and the command is refused.
+        weights: last: the last weights; ema: their moving average (train.ema_decay); auto: the average if there is one.
+        to: Directory for the results, to keep those of several sets of windows.
+        replace: Overwrite existing results of other data, windows or settings.
+            Without it they are kept, and the command is refused.
     """
     hosts.join()
     evaluate_model(make_setting(arguments), run, weights, to, replace)

@@ -33,18 +33,18 @@ def fit(
 ) -> None:
     """Fit power laws to the scaling curves of a study, or predict a trial of it that has not run.
 
-    What fits a device is `hma plan`. docs/fits.md says what is fitted, and when a fit is refused.
+    docs/fits.md describes what is fitted, and when a fit is refused. (Whether a model fits on a device: `hma plan`.)
 
     Args:
         study: Directory of a study that has run.
-        predict: The trials to predict, of every seed, by axis and position, such as width=96; where an axis has several
-            curves, by AXIS-SERIES=X, such as 'episodes-4,000 steps=160'. They must not have run.
-        out: File of the prediction. Commit it before the trials are run: the commits show the order.
-        settings: Change one setting of the study for the plan, so that it has the trials to predict, such as
+        predict: Predict the trials of all seeds at this position of an axis, such as width=96; if an axis has several
+            curves, write AXIS-SERIES=X, such as 'episodes-4,000 steps=160'. These trials must not have run.
+        out: File for the prediction. Commit it before you run the trials, so that the commits prove the order.
+        settings: Change one setting of the study's plan, so that it contains the trials to predict, such as
             widths=16,32,64,96.
     """
     if predict is None:
-        require(out is None, "--out is the file of a prediction; give --predict AXIS=X, too")
+        require(out is None, "--out is the file for a prediction; give --predict AXIS=X, too")
         _show(study)
     else:
         _predict(study, predict, out, settings)

@@ -32,28 +32,28 @@ def generate(
     tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
     registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
-    """Replay recorded actions in a trained model, and write what it shows as an RLDS dataset.
+    """Replay recorded actions in a trained model, and write the generated video as an RLDS dataset.
 
-    Every recorded episode begins with its own first frames; all others are the model's. Prints PSNR against the
-    recording. The same command again goes on where it was stopped, and the bytes are the same.
+    Every episode begins with the first frames of its recording; the model generates all others. Prints PSNR against
+    the recording. Run the same command again after an interruption: it continues, and the result has the same bytes.
 
     Args:
         run: Directory of a training run.
         actions: Dataset with the recorded episodes: its directory (RLDS, LeRobot, robomimic), a directory of a token
             store, or the name of a dataset in the token store beside RUN.
-        out: Directory in which NAME/1.0.0 is written, and beside it psnr.csv and clips.
-        split: Of the dataset.
-        episodes: Only the first N.
-        robot: Of the model, that replays them; the one that the dataset is called after if not given.
-        name: Of the new dataset; ROBOT_generated if not given.
-        given: Recorded frames that an episode begins with.
-        seed: Another seed gives other draws of the same episodes.
-        batch: Episodes at once. Part of what the frames depend on, by rounding.
-        clips: So many of the episodes also as MP4, the recording on the left; with 0, PyAV is not needed.
-        unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says.
-        temperature: Of drawing tokens, instead of what RUN/decode.json says.
-        tokenizer: That the model was trained with, if it is not beside the run.
-        registry: TOML file with entries of your own.
+        out: Directory for the output: the dataset NAME/1.0.0, and beside it psnr.csv and clips.
+        split: Split of the dataset.
+        episodes: Replay only the first N episodes.
+        robot: Robot of the model that replays the actions. Default: the one that has the dataset's name.
+        name: Name of the new dataset. Default: ROBOT_generated.
+        given: Number of recorded frames that each episode begins with.
+        seed: Random seed; another one gives other samples of the same episodes.
+        batch: Episodes generated at the same time. By rounding, it has an effect on the frames.
+        clips: Number of episodes that are also written as MP4, the recording on the left. With 0, PyAV is not needed.
+        unmask_steps: Unmasking steps per frame. Default: as in RUN/decode.json.
+        temperature: Temperature at which tokens are sampled. Default: as in RUN/decode.json.
+        tokenizer: Directory of the tokenizer that the model was trained with, if it is not beside RUN.
+        registry: TOML file with your own registry entries.
     """
     from data_pipelines.convert.write import convert
     from data_pipelines.sources.convertible import require_module

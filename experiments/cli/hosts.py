@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Hosts:
-    """Several processes as one program (docs/hosts.md); the same command is started once for each."""
+    """Run several processes as one program (docs/hosts.md): start the same command once for each process."""
 
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT"), UNSET] = None
-    """Where process 0 can be reached by the others. Or HMA_COORDINATOR."""
+    """Address at which the other processes reach process 0. Or set HMA_COORDINATOR."""
     processes: Annotated[int | None, arg(metavar="N"), UNSET] = None
-    """How many there are. Or HMA_PROCESSES."""
+    """Number of processes. Or set HMA_PROCESSES."""
     process: Annotated[int | None, arg(metavar="I"), UNSET] = None
-    """Which this one is, from 0. Or HMA_PROCESS."""
+    """Number of this process, from 0. Or set HMA_PROCESS."""
     distributed: Annotated[FlagCreatePairsOff[bool], UNSET] = False
-    """Find out what is not given from Slurm (srun), Kubernetes, a TPU pod or MPI."""
+    """Detect what is not given, from Slurm (srun), Kubernetes, a TPU pod or MPI."""
     start_timeout: Annotated[float, arg(name="start-timeout", metavar="SECONDS")] = 300.0
-    """Until all processes must have come."""
+    """How long to wait until all processes have started."""
     lost_after: Annotated[float, arg(name="lost-after", metavar="SECONDS")] = 90.0
-    """Without a sign of life of one process, after which the others end with code 75."""
+    """If a process gives no sign of life for so long, the others end with exit code 75."""
 
     def _settings(self) -> Processes:
         from hma_jax.runtime.processes import Processes

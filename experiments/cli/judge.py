@@ -43,46 +43,48 @@ def judge(
     seed: int = 0,
     labels: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
-    """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
+    """Evaluate policies of different quality in the true and in the learned simulator, and compare their success rates.
 
-    Policies act on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and a
-    random one; the model itself, where it was trained to predict actions as well; your own. Success in the model is
-    told by a head, in the truth by the state; the head looks at true frames too, and a control executes what a policy
-    does in another episode. A robot without a true simulator is judged in the model alone, by a head that learns from
-    recordings. Writes table, agreement with intervals, a page with clips, and a page on which a person can label
-    successes blindly. Goes on where it was stopped. docs/judging.md says how to read it.
+    All policies begin at the same starts and act on images. They are checkpoints from the training of behaviour cloning
+    and of a Diffusion Policy, a random policy, the model itself if it was trained to predict actions, and your own. In
+    the true simulator, success is read from the state. In the model, a success head (a small network) recognises it in
+    the frames. To test the head, it also judges true frames; as a control, a policy's actions are replaced by those of
+    another episode. A robot without a true simulator is evaluated in the model only, with a head trained on recordings.
+    Writes a table, the agreement with intervals, a page with clips, and a page on which a person can label successes
+    blindly. Run the same command again after an interruption: it continues. docs/judging.md explains the results.
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.
-        robot: Which of its robots; it must have a true simulator (of the suite, or metaworld_drawer and others) or
-            recordings.
-        out: Where everything is written.
-        task: The robot's own task; of the suite's robots also reaching the mark with the tool, or hovering
-            with the tool above a puck.
-        policies: Python file with policies(robot), policies of your own by name, which are judged too. A function
-            success(images, first) in it tells success in place of a trained head.
-        recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether
-            they succeeded: the head learns from them, and episodes begin as those that are held out.
-        split: Of --recordings. Default: train.
-        reward: From which on a recorded step has reached the goal, with --recordings that have one in every step: they
-            teach the head frame by frame, which takes far fewer of them than ends alone.
-        registry: TOML file with entries of your own.
-        real: What came of policies on the real robot, with --recordings: columns policy, successes, episodes.
-        starts: Held-out episodes at whose beginning every policy starts; of --recordings at most as many as are held
-            out.
-        batch: Of these, run at once. Default: all.
-        frames: Of an episode, instead of the task's, or of what nine of ten recorded successes needed.
-        hold: Frames in a row at the goal that make a success, instead of the task's, or of 2 of --recordings, whose
-            successes are taken to have reached it at their last ones.
+        robot: One of the model's robots. It must have a true simulator (robots of the suite, metaworld_drawer and
+            others) or recordings.
+        out: Directory for everything that is written.
+        task: own: the robot's own task. For robots of the suite also reach: bring the tool to the mark, or hover: hold
+            the tool above a puck.
+        policies: Python file with a function policies(robot) that returns your own policies by name. If it also has a
+            function success(images, first), this recognises success in place of a trained head.
+        recordings: Dataset (RLDS, LeRobot, robomimic) of a robot without a true simulator, whose episodes say whether
+            they succeeded. The head is trained on them; policies start where held-out recordings start.
+        split: Split of --recordings. Default: train.
+        reward: With --recordings that have a reward in every step: the goal is reached in steps with at least this
+            reward. The head is then trained frame by frame, which needs far fewer recordings.
+        registry: TOML file with your own registry entries.
+        real: CSV file with results of the policies on the real robot, with --recordings: columns policy, successes,
+            episodes.
+        starts: Number of starts of every policy, each the beginning of a held-out episode; with --recordings at most as
+            many as are held out.
+        batch: Episodes run at the same time. Default: all starts.
+        frames: Length of an episode. Default: the task's; with --recordings what nine of ten successes needed.
+        hold: Frames in a row at the goal that make a success. Default: the task's; with --recordings 2: the last 2
+            frames of a successful recording are taken to show the goal.
         demonstrations: Episodes of the scripted expert that the policies are trained on. Default: 3000.
-        steps: Of training of each kind of policy. Default: 6000.
-        head_episodes: Recorded episodes that the success head is trained on; of --recordings at most so many are taken.
-        head_steps: Of training of the success head.
-        cloned: Checkpoints of behaviour cloning, 0 for none. Default: 6, with --recordings none.
-        diffusion: Checkpoints of the Diffusion Policy. Default: 3, with --recordings none.
-        seed: Of recordings, training and episodes.
-        labels: Saved by the blind page: only says how often that person agrees with what lies in --out, whatever else
-            is given.
+        steps: Training steps of each kind of policy. Default: 6000.
+        head_episodes: Recorded episodes that the success head is trained on; with --recordings the largest number.
+        head_steps: Training steps of the success head.
+        cloned: Number of checkpoints of behaviour cloning, 0 for none. Default: 6, with --recordings none.
+        diffusion: Number of checkpoints of the Diffusion Policy, 0 for none. Default: 3, with --recordings none.
+        seed: Random seed of recordings, training and episodes.
+        labels: File that the blind page saved. Only prints how often that person agrees with the results in --out;
+            all other options are ignored.
     """
     if labels is not None:
         _show_agreement_with_labels(labels, out)
@@ -146,7 +148,7 @@ def _show_agreement_with_labels(labels: Path, out: Path) -> None:
     for name, share in agreed.items():
         table.add_row(name, f"{share.mean:.2f} ({share.low:.2f} to {share.high:.2f})", str(share.n))
     console.print(table)
-    say(f"the judges of {out}; nothing was judged anew, and no other option was looked at")
+    say(f"agreement with the results in {out}; nothing was evaluated again, and all other options were ignored")
 
 
 def _require_options_of(
@@ -155,11 +157,17 @@ def _require_options_of(
     """Raises ConfigError for options of recordings without these, and for options of an expert with recordings."""
     if recordings is None:
         for flag, value in of_recordings.items():
-            require(value is None, f"{flag} is of robots without a true simulator: give --recordings, or leave it out")
+            require(
+                value is None, f"{flag} is only for robots without a true simulator: add --recordings, or remove {flag}"
+            )
         return
-    require(task == "own", f"--task {task} is of robots with a true simulator, not of --recordings")
+    require(task == "own", f"--task {task} is only for robots with a true simulator, not with --recordings")
     unused = [flag for flag, n in of_expert.items() if n not in (None, 0)]
-    require(not unused, f"recordings have no expert to clone: leave {', '.join(unused)} out")
+    require(
+        not unused,
+        f"with --recordings there is no scripted expert to train policies on: remove {', '.join(unused)}, or set it "
+        "to 0",
+    )
 
 
 def _write_results(judged: Judgement, counts: Mapping[str, Count] | None, out: Path, again: str) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlanArguments(StudyArguments):
-    """The model that `hma train` with the same arguments would train."""
+    """The study of the model: the one that `hma train` with the same arguments would train."""
 
     preset: Annotated[Preset | None, arg(help_behavior_hint="(default: a model of --model)")] = None
     """The study whose model, robots, batch and execution are planned."""
@@ -39,18 +39,19 @@ def _default(name: str, metavar: str | None = None) -> object:
 
 @dataclass(frozen=True)
 class Shape:
-    """A model of `hma bench`, in place of a study's."""
+    """A model of `hma bench`, instead of a study's model."""
 
     model: Annotated[Model | None, _default("model")] = None
     """base is width 256 with 32 layers, xl width 1024."""
     batch: Annotated[int | None, _default("batch", "N")] = None
     """Windows per step, over all devices."""
     robots: Annotated[int | None, _default("robots", "N")] = None
-    """Embodiments of the model."""
+    """Number of robots of the model."""
     dtype: Annotated[Dtype | None, _default("dtype")] = None
-    """What is computed in; parameters and moments are float32."""
+    """Number format of the computation; parameters and moments are float32."""
     remat: Annotated[Remat | None, _default("remat")] = None
-    """What a block keeps for the backward pass; the rest is computed again."""
+    """What the backward pass recomputes to save memory: none, or everything (offload: inputs are in host memory).
+    products: all but matrix products and attention; attention: all but attention and the MLP's first product."""
 
 
 def plan(
@@ -60,16 +61,17 @@ def plan(
     memory: Annotated[str | None, arg(metavar="SIZE")] = None,
     brief: FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Compile the real training step and say how it would run: does it fit, what lies where, what is sent?
+    """Compile the real training step and print its memory, the sharding of every parameter, and its communication.
 
-    For a TPU topology no TPU is needed, but its compiler: pip install -e '.[tpu]'.
+    Planning for a TPU topology needs no TPU, only its compiler: pip install -e '.[tpu]'.
 
     Args:
         arguments: The study whose model is planned.
-        shape: A model of `hma bench`, where no study is named.
-        topology: TPU topologies such as v5e:2x4, v4:2x2x4, or v4-32 as clouds call it; `local`: the devices here.
-        memory: What one device has, such as 80GiB: for a verdict on devices whose compiler does not say it.
-        brief: Leave out the layout of every parameter and the list of what is sent.
+        shape: A model of `hma bench`, if no --preset is given.
+        topology: TPU topologies such as v5e:2x4, v4:2x2x4, or cloud names such as v4-32; `local`: this machine's
+            devices.
+        memory: Memory of one device, such as 80GiB, to compare with: needed if the compiler does not know it.
+        brief: Leave out the sharding of every parameter and the list of collectives.
     """
     limit = read_memory(memory)
     if any(name != "local" for name in topology):  # read when JAX is imported

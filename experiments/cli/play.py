@@ -32,22 +32,23 @@ def play(
     temperature: Annotated[float | None, UNSET] = None,
     tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
 ) -> None:
-    """Serve a page on which a trained model is driven with keys, gamepad or sliders.
+    """Serve a web page on which you drive a trained model with keys, gamepad or sliders.
 
-    Needs the extra `play`. Runs until it is interrupted, and ends with 130 then (SIGTERM: 143). docs/simulator.md
-    describes the page.
+    Needs the extra `play`. Runs until it is interrupted, and then ends with exit code 130 (SIGTERM: 143).
+    docs/simulator.md describes the page.
 
     Args:
-        run: Directory of a training run; without it the one in experiments/results/simulator_grown.
-        host: Address to listen at. 127.0.0.1 is this computer alone; 0.0.0.0 lets everybody in who can reach it.
-        port: Of the address; 0 takes a free one.
-        visitors: Who can drive at once, in one batch.
-        window: Past the model's window of frames, exact computes it again for each; streaming is faster and
-            may no longer follow commands (docs/endurance_small.md). Without it as RUN/decode.json says, or exact.
-        unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says, or 2; more are
-            slower.
-        temperature: Of drawing tokens, instead of what RUN/decode.json says, or 0, which takes the likeliest.
-        tokenizer: That the model was trained with, if it is not beside the run.
+        run: Directory of a training run.
+        host: Address to listen on. 127.0.0.1: for this computer only; 0.0.0.0: for everybody who can reach it.
+        port: Port to listen on; 0 takes a free one.
+        visitors: How many people can drive at the same time, in one batch.
+        window: How to continue when the episode is longer than the model's window: exact computes the window again for
+            every frame; streaming is faster, but may stop following commands (docs/endurance_small.md). Default: as
+            in RUN/decode.json, or exact.
+        unmask_steps: Unmasking steps per frame; more are slower. Default: as in RUN/decode.json, or 2.
+        temperature: Temperature at which tokens are sampled; 0 takes the most likely ones. Default: as in
+            RUN/decode.json, or 0.
+        tokenizer: Directory of the tokenizer that the model was trained with, if it is not beside RUN.
     """
     try:
         from experiments.applications.play.server import SESSIONS, make_app, serve
@@ -61,8 +62,8 @@ def play(
 
     require(
         run != DRIVEN or run.is_dir(),
-        f"there is no model at {DRIVEN}: say which run to serve, or make one with "
-        "`hma train --preset play --out runs/play` and `hma play runs/play/model`",
+        f"there is no model at {DRIVEN}: give the directory of a run, or train one with "
+        "`hma train --preset play --out runs/play` and serve it with `hma play runs/play/model`",
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
@@ -75,8 +76,8 @@ def play(
     begins = {start.robot for start in simulator.starts}
     if missing := [name for name in simulator.robots if name not in begins]:
         say(
-            f"note: not on the page: {few(missing)}; there are no held-out frames here to start from, as of robots that "
-            "the model knew before it was given others"
+            f"note: not on the page: {few(missing)}; this directory has no held-out frames of them to start from. This is "
+            "so for robots that the model already knew when `hma adapt` added others"
         )
     if simulator.ignores_actions:
         say(f"note: {DEAF}")
@@ -108,9 +109,9 @@ def play(
         asyncio.run(serve(app, host, port, ready))
     except KeyboardInterrupt:
         if compiling.is_alive():
-            console.print("ends as soon as a program is compiled")
+            console.print("stopping, as soon as the running compilation is finished")
         raise
     except OSError as error:
-        raise ConfigError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error
+        raise ConfigError(f"cannot listen on {host}:{port}: {error.strerror}; choose another --port") from error
     finally:
         ended.set()

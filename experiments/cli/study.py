@@ -22,7 +22,8 @@ def study(
 ) -> None:
     """Run a whole scaling study: data, tokenizer, its sweeps, CSV, figures and a report page.
 
-    The sweeps are those of the preset (--set axes=...): datasets, trajectories and width, or the designs of cpu-full.
+    The preset says which sweeps: datasets, trajectories and width; in cpu-full others too. Change them with --set
+    axes=...
 
     Run the same command again after an interruption: only what is missing is done.
     """
@@ -35,24 +36,23 @@ def sweep(
     running: OmitArgPrefixes[RunningArguments],
     replacement: ReplaceOptions,
 ) -> None:
-    """Run one axis: datasets, trajectories, width; settings, conditioning; lr; or one of your own, from its file.
+    """Run one sweep: train and evaluate models along one axis.
 
-    The first three are those of `hma study`, the next two its ablations; lr is the transfer of
-    learning rates between widths. Of the others docs/sweeps.md and docs/designs.md speak. A file says what varies as
-    docs/own_axis.md shows.
-    Shares data and trials with other axes of the same --out.
+    datasets, trajectories and width are the sweeps of `hma study`; settings and conditioning are ablations; lr is the
+    transfer of learning rates between widths. docs/sweeps.md and docs/designs.md describe the others. For an axis of
+    your own give a Python file (docs/own_axis.md). Sweeps with the same --out share data and trials.
 
     Args:
         axis: What varies.
         arguments: Which study, on which data, in which directory, on which devices.
         running: How trials are run; none of it changes a result.
-        replacement: What was made with other settings or data is never replaced without being asked for.
+        replacement: Results made with other settings or data are replaced only on request.
     """
     _run(("sweep", Path(axis).absolute() if is_file(axis) else axis), arguments, running, replacement, (axis,))
 
 
 def report(study: Annotated[Positional[Path], arg(metavar="STUDY")]) -> None:
-    """Draw CSV, figures and page again from the trials that are finished.
+    """Write the CSV files, figures and report page of a study again, from its finished trials.
 
     Args:
         study: Directory of a study that has run.
@@ -72,7 +72,7 @@ def _run(
     """`axes`: () for those of the study."""
     setting = make_setting(arguments)
     axes = axes or setting.study.axes
-    require(bool(axes), "axes is empty: the study has nothing to run; name some, such as --set axes=width,datasets")
+    require(bool(axes), "axes is empty: the study has no sweep to run; set some, such as --set axes=width,datasets")
     if running.workers is not None and running.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launcher_options = LauncherOptions(running.launcher, running.workers, running.launcher_set)

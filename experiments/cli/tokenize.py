@@ -27,15 +27,15 @@ def tokenize(
 ) -> None:
     """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
 
-    Killed at any point, the same command goes on and ends with the same bytes. Started several times, on one
-    machine or on many that share the directory, it shares the work: each process takes parts that no other one
-    has, any of them may be killed, more may join. Those that join need a tokenizer that is there: --tokenizer,
-    or `hma tokenizer train` before.
+    Run the same command again after an interruption: it continues, and the result has the same bytes. To share the
+    work, start it several times, on one machine or on several that share the directory: each process takes the next
+    free part. Processes may be killed or added at any time. Those that join need an existing tokenizer: run
+    `hma tokenizer train` first, or give --tokenizer.
 
     Args:
         arguments: Study, data, output directory and settings. Several processes share the directory.
-        replacement: What was made with other settings or data is never replaced without being asked for.
-        batch: Frames encoded at a time. Changes no token.
+        replacement: Results made with other settings or data are replaced only on request.
+        batch: Frames encoded at a time. Does not change any token.
         threads: Threads that decode frames.
     """
     prepare_together(make_setting(arguments), batch, threads, replacement.replace)
@@ -70,18 +70,18 @@ def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | N
 
     study, workspace = setting.study, setting.workspace
     if replace is not None:
-        raise Busy(f"{busy}; --replace needs the directory for itself", busy.holder)
+        raise Busy(f"{busy}; with --replace no other command may use the directory", busy.holder)
     tokenizer = setting.tokenizer or workspace.tokenizer
     if not tokenizer.is_dir():
-        advice = f"Start this again when it is there, or make it before: {setting.command('tokenizer train')}"
+        advice = f"Start this again when the tokenizer exists, or train it first: {setting.command('tokenizer train')}"
         raise Busy(f"{tokenizer}: no tokenizer yet, and {busy}. {advice}", busy.holder)
     require_same_windows(study, workspace, None)
     if setting.data:
         sources = find_sources(study, setting.data)
     else:
-        advice = f"Start this again when they are, or make them before: {setting.command('data suite')}"
+        advice = f"Start this again when they exist, or make them first: {setting.command('data suite')}"
         sources = find_suite(study, workspace, advice)
-    console.print(f"taking part: {busy.who} prepares {short(workspace.root)}", soft_wrap=True)
+    console.print(f"sharing the work with {busy.who}, which prepares {short(workspace.root)}", soft_wrap=True)
     make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)
     _freeze(setting)
 
@@ -104,7 +104,7 @@ def _freeze(setting: Setting) -> None:
             if windows_are_frozen(study, workspace):
                 return
             if not announced:
-                waiting = f"all tokens are there; waiting for the windows, or the end, of {busy.who}"
+                waiting = f"all tokens are made; waiting until {busy.who} has frozen the windows or ends"
                 console.print(waiting, soft_wrap=True)
                 announced = True
         time.sleep(pause)

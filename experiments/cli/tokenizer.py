@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 tokenizer_app = SubcommandApp()
 
-HELP = "The image tokenizer: trained here, made of published weights, or none."
+HELP = "Train an image tokenizer, import published weights, or make one of pixel patches."
 
 
 @tokenizer_app.command(name="train")
@@ -36,17 +36,17 @@ def import_(
     patch: int = 2,
     dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
-    """Make a tokenizer of published weights: magvit2.ckpt, or the VAE of Stable Video Diffusion.
+    """Make a tokenizer from published weights: magvit2.ckpt, or the VAE of Stable Video Diffusion.
 
-    Every tensor must be there, with the shape that the configuration asks for; those of a training run
+    Every tensor must be present, with the shape that the configuration requires; those needed only for training
     (loss.*, model_ema.*) are left out. No code of a file is run. Give --tokenizer OUT to other commands.
 
     Args:
         source: magvit2.ckpt or a safetensors file of it, or a directory of the diffusers library.
         out: Directory to write.
         image_size: Side of the square images in pixels: a multiple of 16.
-        patch: Of the VAE: cells along the side of one token; 2 is what released models take.
-        dtype: What the network computes in; bfloat16 is faster on accelerators and what the release used.
+        patch: VAE only: latent cells along the side of one token; released models take 2.
+        dtype: Number format of the computation; bfloat16 is faster on accelerators, and the release used it.
     """
     from hma_jax.convert import find_reader, read_svd_vae, require_free
 
@@ -62,7 +62,7 @@ def import_(
 
 @tokenizer_app.command(name="pixels")
 def pixels(out: Path, image_size: Annotated[int, arg(name="image-size")] = 64, patch: int = 8) -> None:
-    """Make the tokenizer that is none: a token is a patch of pixels. For -continuous presets.
+    """Make a tokenizer without a network: a token is a patch of pixels. For -continuous presets.
 
     Args:
         out: Directory to write.
@@ -106,4 +106,4 @@ def _write(tokenizer: BaseTokenizer, out: Path) -> None:
     )
     preset = "cpu-continuous" if tokenizer.channels else "cpu"
     wrote(out, then=command("tokenize", "--preset", preset, "--tokenizer", out))
-    console.print("that takes the simulated suite; with --data DIR ... your own, with --preset another study")
+    console.print("this command uses the simulated suite; add --data DIR for your own data, --preset for another study")

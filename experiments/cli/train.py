@@ -45,20 +45,21 @@ def train(
     initial: Annotated[Path | None, arg(name="from", metavar="RUN"), UNSET] = None,
     dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False,
 ) -> None:
-    """Train one model: the study's reference trial, on all trajectories unless told otherwise.
+    """Train one model: the study's reference trial, on all trajectories unless --trajectories is given.
 
-    Change it with --set. Says what it trains on, and resumes a run that was interrupted.
+    Change its settings with --set. Prints what it trains on. Run the same command again after an interruption: it
+    continues from the last checkpoint.
 
     Args:
         arguments: Study, data, output directory and settings.
-        model: How this model is trained; no sweep reads it.
-        options: How the run is saved and watched; each start may say it anew.
-        replacement: What was made with other settings or data is never replaced without being asked for.
+        model: How this model is trained; sweeps do not use this.
+        options: How the run is saved and validated; may differ each time the run is continued.
+        replacement: Results made with other settings or data are replaced only on request.
         hosts: Several processes that train together, on one host or on many.
-        initial: A trained or converted model that knows the study's robots. The new run begins with its weights, or
-            with their average where it keeps one, and has its architecture and tokenizer. Its other robots stay as they
-            are.
-        dry_run: Print parameters, FLOPs and expected time on the devices that it would use here, and stop.
+        initial: Fine-tune this run: a trained or converted model that knows the study's robots. The new run takes its
+            architecture, tokenizer and weights (the averaged weights, if it keeps an average). Robots that the study
+            does not have stay unchanged.
+        dry_run: Print parameters, FLOPs and expected time on the devices that it would use, and stop.
     """
     if not dry_run:
         hosts.join()
@@ -86,19 +87,19 @@ def adapt(
 ) -> None:
     """Add new robots to a trained model and train them on the study's datasets.
 
-    The model gets a stem, conditioning and head for every dataset it does not know. What it says of
-    the robots it knows stays the same, bit for bit, unless everything is trained. Of a run that keeps an
-    average of its weights it is that average, as when it is evaluated.
+    The model gets a stem, conditioning and head for every dataset that it does not know. Its predictions for the robots
+    that it knows stay the same, bit for bit, unless --everything is given. If the run keeps an average of its weights,
+    that average is taken, as in evaluation.
 
     Args:
         source: Directory of the training run that knows the other robots.
-        arguments: The study with the new datasets. Its tokenizer is the one of the trained model: give it with
-            --tokenizer if it is not beside RUN.
+        arguments: The study with the new datasets. It uses the tokenizer of the trained model: give it with --tokenizer
+            if it is not beside RUN.
         model: How the new robots are trained.
-        options: How the run is saved and watched; each start may say it anew.
-        replacement: What was made with other settings or data is never replaced without being asked for.
+        options: How the run is saved and validated; may differ each time the run is continued.
+        replacement: Results made with other settings or data are replaced only on request.
         hosts: Several processes that train together, on one host or on many.
-        everything: Train the whole model, not the new robots' own parameters alone.
+        everything: Train the whole model, not only the new robots' own parameters.
     """
     hosts.join()
     adapt_model(

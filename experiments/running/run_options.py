@@ -22,25 +22,25 @@ VALIDATIONS = 20
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is saved and watched; nothing here changes its result, and each start may say it anew."""
+    """How a run is saved and validated. Nothing here changes its result; it may differ each time a run is continued."""
 
     checkpoint_every: Annotated[
         int | None, arg(name="checkpoint-every", metavar="STEPS", help_behavior_hint="(default: a fifth of all)")
     ] = None
-    """Steps from one checkpoint to the next; 0: none by steps. There is always one at the end and when
-    interrupted."""
+    """Steps between checkpoints; 0: no checkpoints by steps.
+    The run is always saved at its end and when interrupted."""
     checkpoint_minutes: Annotated[float, arg(name="checkpoint-minutes", metavar="MINUTES")] = 10.0
-    """Minutes from one checkpoint to the next, besides those by steps; 0: none by time."""
+    """Minutes between checkpoints, in addition to those by steps; 0: no checkpoints by time."""
     keep_checkpoints: Annotated[int, arg(name="keep-checkpoints", metavar="N")] = 2
-    """How many checkpoints are kept, the newest ones."""
+    """Number of newest checkpoints that are kept."""
     skip_damaged: Annotated[FlagCreatePairsOff[bool], arg(name="skip-damaged"), UNSET] = False
-    """Go on from the newest checkpoint that is whole.
-    Damaged ones after it are moved to RUN/damaged."""
+    """Continue from the newest undamaged checkpoint.
+    Damaged checkpoints after it are moved to RUN/damaged."""
     validate_every: Annotated[
         int | None, arg(name="validate-every", metavar="STEPS", help_behavior_hint="(default: a twentieth of all)")
     ] = None
-    """Steps from one measurement of the loss on held-out windows to the next, written to
-    RUN/validation.jsonl; 0: none."""
+    """Steps between evaluations of the loss on held-out windows; 0: none.
+    They are written to RUN/validation.jsonl."""
 
     def check(self) -> None:
         """Raises ConfigError, in the words of the command line."""

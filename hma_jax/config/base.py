@@ -37,7 +37,7 @@ def require_seed(seed: int, where: str) -> None:
 def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
     """Raises ConfigError, which begins with `where`, unless `value` is one of `choices`."""
     known = ", ".join(map(str, choices))
-    require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
+    require(value in choices, f"{where}: {value!r} is not allowed; choose one of {known}")
 
 
 def check_fields(config: Any, infinite_allowed: tuple[str, ...] = ()) -> None:

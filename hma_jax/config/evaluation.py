@@ -24,14 +24,14 @@ class SamplerConfig:
     implies.
     """
 
-    kind: SamplerKind = "ddpm"  # how clean vectors are drawn
-    steps: int = 100  # evaluations of the denoiser; 10 to 12 will do for dpm++
-    temperature: float = 1.0  # multiplies noise
-    # Of dpm++: how much fresh noise its steps draw, from 0 (none) to 1 (as much as ancestral ones). 0 suits
+    kind: SamplerKind = "ddpm"  # sampler of the diffusion heads
+    steps: int = 100  # sampler steps (evaluations of the denoiser); 10 to 12 are enough for dpm++
+    temperature: float = 1.0  # factor on the noise; 0: no noise
+    # dpm++: how much new noise each step adds, from 0 (none) to 1 (as much as ancestral sampling). 0 suits
     # an exact network best; a trained one errs, and noise corrects it (docs/performance.md).
     eta: float = 0.5
-    # DIFFERS: the release multiplies the noise of the steps only, so that at "temperature 0" its
-    # samples still depend on the random numbers they start from; False: as released.
+    # Multiply the initial noise by the temperature too; false: only the noise of the steps, as released. DIFFERS: at
+    # "temperature 0" the release's samples still depend on the random numbers they start from.
     scale_initial_noise: bool = True
 
     def __post_init__(self):
@@ -41,8 +41,8 @@ class SamplerConfig:
         require(0.0 <= self.eta <= 1.0, f"sampler.eta must lie in [0, 1], got {self.eta}")
         require(
             self._stochastic or self.scale_initial_noise or self.temperature == 1,
-            f"sampler.temperature has no effect on {self.kind} without scale_initial_noise; "
-            "set scale_initial_noise or leave the temperature at 1",
+            f"sampler.temperature has no effect on {self.kind} without scale_initial_noise; set "
+            "scale_initial_noise=true or temperature=1",
         )
 
     @property
@@ -64,14 +64,14 @@ class DecodeConfig:
     (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
     """
 
-    unmask_steps: int = 2  # M: passes over a frame until all its tokens are filled
-    temperature: float = 0.0  # divides logits; 0: the likeliest entry
-    top_k: int = 0  # draw from the k likeliest entries of each factor; 0: from all
-    order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked
+    unmask_steps: int = 2  # M: unmasking steps per frame
+    temperature: float = 0.0  # sampling temperature of ids; 0: the most likely ones
+    top_k: int = 0  # sample only from the k most likely entries of each factor; 0: from all
+    order: Literal["random", "confidence"] = "random"  # order in which tokens are unmasked
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
-    resample: bool = False  # continuous: predict every patch again in each step, as released
-    # What happens past the window of T frames: `exact` computes the window again for every frame;
-    # `streaming` keeps what was computed when its frames stood elsewhere, an approximation.
+    resample: bool = False  # models on latents: predict every patch again in each unmasking step, as released
+    # How to continue after the window of T frames: `exact` computes the window again for every frame;
+    # `streaming` reuses keys and values from when the frames had other positions, an approximation.
     slide: Literal["exact", "streaming"] = "exact"
 
     def __post_init__(self):
@@ -85,21 +85,22 @@ class DecodeConfig:
 class EvalConfig:
     """The evaluation protocol (paper section 4, Metrics)."""
 
-    windows_per_dataset: int = 500  # held-out ones that are judged, at most
-    # What a predicted frame follows: frames the model made, from a prompt on, or (`recorded`, as the
-    # release judges) in every case the recorded ones.
+    windows_per_dataset: int = 500  # largest number of held-out windows per dataset that are evaluated
+    # The frames before a predicted frame: after the prompt, frames that the model generated; or (`recorded`, as in the
+    # release's evaluation) always the recorded ones.
     context: Literal["generated", "recorded"] = "generated"
-    prompt_frames: int = 4  # recorded ones that a window begins with
+    prompt_frames: int = 4  # recorded frames at the beginning of a window
     # Continuous tokens: the mean of each diffusion step, not a draw.
     decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
-    random_actions: int = 5  # draws for delta PSNR
-    other_actions: int = (
-        15  # sequences of other episodes, compared with the true one; 0: neither action-nats nor retrieval
-    )
-    batch: int = 32  # windows at a time
-    perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
-    lpips: bool = False  # also by LPIPS over AlexNet, whose weights are the extra `lpips`; images of 31 pixels or more
-    seed: int = 0  # of the choice of windows and of all draws
+    random_actions: int = 5  # random action sequences for delta PSNR
+    # Action sequences of other episodes that the true actions are compared with; 0: no action-nats and no retrieval.
+    other_actions: int = 15
+    batch: int = 32  # windows per batch
+    # Perplexity is exp(mean loss) of groups of this many windows, as in the official evaluation.
+    perplexity_group: int = 4
+    # Compute LPIPS too (AlexNet; its weights are the extra `lpips`); needs images of at least 31 x 31 pixels.
+    lpips: bool = False
+    seed: int = 0  # random seed of the choice of windows and of all samples
 
     def __post_init__(self):
         check_fields(self)
@@ -133,10 +134,14 @@ def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:
             f"decode.top_k {decode.top_k} exceeds the {model.factor_vocab} entries of a factor",
         )
         return
-    require(decode.order == "random", "decode.order 'confidence' needs probabilities: continuous tokens have none")
-    require(decode.top_k == 0, "decode.top_k draws among the entries of a factor: continuous tokens have none")
+    require(
+        decode.order == "random",
+        "decode.order 'confidence' needs probabilities, which models on latents do not predict; use 'random'",
+    )
+    require(decode.top_k == 0, "decode.top_k works only for models on ids: latents have no vocabulary; set it to 0")
     steps, most = decode.sampler.steps, model.diffusion.steps
     require(
         steps <= most,
-        f"decode.sampler.steps {steps} exceeds the model.diffusion.steps {most} of the process; set one of the two",
+        f"decode.sampler.steps {steps} is more than model.diffusion.steps {most}, the steps of the noising process; "
+        "change one of the two",
     )

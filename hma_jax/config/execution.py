@@ -35,10 +35,10 @@ before runs are compared."""
 class MeshConfig:
     """Devices along each mesh axis; -1 on one axis takes all that are left."""
 
-    data: int = -1  # the batch is split over them
-    fsdp: int = 1  # batch and parameters are split over them
-    tensor: int = 1  # heads and MLP are split over them
-    min_shard_size: int = 2**14  # smaller parameters stay whole on every device
+    data: int = -1  # devices for data parallelism: the batch is split over them
+    fsdp: int = 1  # devices for fsdp: batch and parameters are split over them
+    tensor: int = 1  # devices for tensor parallelism: heads and MLP are split over them
+    min_shard_size: int = 2**14  # parameters with fewer values are not split
 
     def __post_init__(self):
         check_fields(self)
@@ -57,13 +57,13 @@ class MeshConfig:
 class ExecutionConfig:
     """Number format, memory, kernels and devices of a program."""
 
-    dtype: Dtype = "float32"  # of activations and of weights where they are used; parameters are float32
-    # The least memory, so that what fits at all fits without a choice. Where there is four times as much for
-    # activations, "products" is a seventh faster on CPU (twelve layers; docs/performance.md).
+    dtype: Dtype = "float32"  # number format of the computation; parameters are stored in float32
+    # What the backward pass recomputes to save memory. The default takes the least memory. Where there is four times
+    # as much for activations, "products" is a seventh faster on CPU (twelve layers; docs/performance.md).
     remat: Remat = "everything"
-    attention: Attention = "auto"  # what computes it; auto: what suits platform and shapes
+    attention: Attention = "auto"  # implementation of attention; auto: chosen by platform and shapes
     accumulate: int = 1  # micro-batches per optimiser step
-    # Of an evaluation batch, per device, that are in memory at a time; each is continued under
+    # Evaluation: windows per device that are in memory at the same time. Each is continued under
     # 1 + eval.random_actions action sequences, and the caches of those are most of the memory.
     windows_at_once: int = 4
     mesh: MeshConfig = field(default_factory=MeshConfig)

@@ -79,9 +79,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
         require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
         whole = hint is float and isinstance(value, int)
-        require(
-            not whole or abs(value) <= sys.float_info.max, f"{where}: a number of that size has no place in a float"
-        )
+        require(not whole or abs(value) <= sys.float_info.max, f"{where}: the number is too large for a float")
         return hint(value)
     return value
 

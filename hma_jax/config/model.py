@@ -19,10 +19,10 @@ class MupConfig:
     that each is needed.
     """
 
-    enabled: bool = True  # whether anything scales with the width
-    base_width: int = 256  # where the multipliers are 1
-    attention_scale: float = 8.0  # attention logits scale with this over the width of a head
-    without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()  # ingredients taken away
+    enabled: bool = True  # use muP: scale learning rates, initial values and logits with the width
+    base_width: int = 256  # width at which all muP multipliers are 1
+    attention_scale: float = 8.0  # attention logits are scaled by this, divided by the width of a head
+    without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()  # parts of muP to switch off
 
     def __post_init__(self):
         check_fields(self)
@@ -38,18 +38,18 @@ class DiffusionConfig:
     `patch` x `patch` latent cells of `channels` values, flattened to C = patch^2 x channels.
     """
 
-    channels: int = 4  # values of a latent cell
-    patch: int = 2  # latent cells along a side of a token
-    width: int = 1024  # of the denoising network
-    depth: int = 4  # its residual blocks
-    steps: int = 1000  # of the noising process
+    channels: int = 4  # values per latent cell
+    patch: int = 2  # side of a token in latent cells
+    width: int = 1024  # width of the denoising network
+    depth: int = 4  # residual blocks of the denoising network
+    steps: int = 1000  # steps of the noising process
     clip: float = 10.0  # predicted clean values are kept in +-clip while sampling
     repeats: int = 1  # noised copies of each token per training step
-    # In training the squared error of the noise counts, as released, the same at every step (0), or is weighed by noise
-    # over signal up to this, which makes it the squared error of the clean vector: mostly of what noise hides.
+    # Weight of a noising step in the training loss: 0, all steps count alike, as released (squared error of the noise);
+    # above 0, noise over signal, at most this (squared error of the clean vector, so noisy steps count most).
     weight_cap: float = 0.0
-    # In training steps are drawn evenly, as released (1), or shifted towards noise: of the way from the cleanest to the
-    # noisiest a share u becomes k u / (1 + (k - 1) u) (Esser et al. 2024).
+    # Shift k of the noising steps that are sampled in training: 1, uniform, as released; larger, towards noise (a
+    # uniform position u becomes k u / (1 + (k - 1) u); Esser et al. 2024).
     time_shift: float = 1.0
 
     def __post_init__(self):
@@ -87,33 +87,33 @@ class ModelConfig:
     and `factor_vocab` mean nothing.
     """
 
-    width: int = 256  # D: values of a token inside the trunk
-    layers: int = 32  # N: blocks
-    heads: int = 8  # H: attention heads of a block
-    frames: int = 12  # T: of a window
-    tokens: int = 256  # S: of a frame
-    action_tokens: int = 64  # K: of a frame's actions, where conditioning has concat
-    factors: int = 2  # Q: of a token's id
-    factor_vocab: int = 512  # V: entries of a factor
-    diffusion: DiffusionConfig | None = None  # of models on latents; null: on ids
-    conditioning: Conditioning = "concat+modulate"  # how actions reach the trunk
-    # Which chunk conditions frame t: the one executed after it (`released`; the chunk that led
-    # to it then arrives through temporal attention) or the one that led to it (`causal`).
+    width: int = 256  # D: width of the trunk, values per token
+    layers: int = 32  # N: number of blocks
+    heads: int = 8  # H: attention heads per block
+    frames: int = 12  # T: frames per window
+    tokens: int = 256  # S: tokens per frame
+    action_tokens: int = 64  # K: action tokens per frame, if conditioning contains concat
+    factors: int = 2  # Q: factors that a token's id is split into
+    factor_vocab: int = 512  # V: vocabulary size of each factor
+    diffusion: DiffusionConfig | None = None  # diffusion heads, for models on latents; null: a model on ids
+    conditioning: Conditioning = "concat+modulate"  # how the trunk is conditioned on actions
+    # Which action chunk conditions frame t: the one executed after it (`released`; the chunk that led
+    # to it is then seen through temporal attention) or the one that led to it (`causal`).
     action_alignment: Literal["released", "causal"] = "released"
-    action_heads: bool = True  # what predicts actions; forward dynamics does without
-    # Masked tokens are embedded as one learned vector and, with `recall`, the embedding of the same token a frame
-    # earlier as well. DIFFERS: the release has the vector alone.
+    action_heads: bool = True  # whether the model has heads that predict actions; forward dynamics needs none
+    # Add to the embedding of a masked token that of the token at its place in the frame before, so that the first block
+    # already sees what is to move. DIFFERS: at masked tokens the release has one learned vector alone.
     recall: bool = False
-    # A token's factors are drawn one after the other, each given those before it. DIFFERS: the release draws them as if
+    # Predict a token's factors one after the other, each given those before it. DIFFERS: the release draws them as if
     # independent, so that where two tokens are likely it may show a third, made of a piece of each.
     chain_factors: bool = False
-    mlp_ratio: float = 4.0  # width of a block's MLP over that of the trunk
-    qkv_bias: bool = False  # of queries, keys and values
-    proj_bias: bool = True  # of the projection that leaves attention
-    mlp_bias: bool = True  # of both layers of the MLP
-    qk_norm: bool = False  # norms of queries and keys
-    trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
-    stem_gain: float = 0.01  # Xavier gain of the action stems
+    mlp_ratio: float = 4.0  # width of a block's MLP, as a multiple of the trunk's
+    qkv_bias: bool = False  # biases of queries, keys and values
+    proj_bias: bool = True  # biases of attention's output projection
+    mlp_bias: bool = True  # biases of both layers of the MLP
+    qk_norm: bool = False  # normalise queries and keys
+    trunk_gain: float = 0.1  # Xavier gain of the initial values of trunk and modulation (reference section 1.10)
+    stem_gain: float = 0.01  # Xavier gain of the initial values of the action stems
     mup: MupConfig = field(default_factory=MupConfig)
 
     def __post_init__(self):
@@ -126,19 +126,19 @@ class ModelConfig:
         )
         require(
             self.width * self.mlp_ratio >= 1,
-            f"model.mlp_ratio {self.mlp_ratio} of model.width {self.width} leaves the MLP no width",
+            f"model.mlp_ratio {self.mlp_ratio} makes the MLP of model.width {self.width} less than 1 wide; increase it",
         )
         for name in ("trunk_gain", "stem_gain"):  # of matrices that are all zero no gradient leads away
             require(getattr(self, name) > 0, f"model.{name} must be positive, got {getattr(self, name)}")
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
         require(
             self.diffusion is not None or self.factors * math.log2(self.factor_vocab) <= 31,
-            f"model.factors {self.factors} of model.factor_vocab {self.factor_vocab} entries make more ids than the {2**31} "
-            "that an int32 tells apart",
+            f"model.factors {self.factors} with model.factor_vocab {self.factor_vocab} give more than {2**31} ids, "
+            "the most that fit in an int32",
         )
         require(
             not self.chain_factors or (self.factors > 1 and self.diffusion is None),
-            "model.chain_factors needs ids of several factors: model.factors of at least 2 and no model.diffusion",
+            "model.chain_factors needs model.factors of at least 2 and model.diffusion=null: ids with several factors",
         )
 
     @property

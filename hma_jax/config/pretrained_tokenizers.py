@@ -44,7 +44,10 @@ class TokenGrid:
     def grid(self) -> int:
         """Tokens along one side of a square image. Raises ConfigError for images that are not square."""
         rows, columns = self.grid_shape
-        require(rows == columns, f"tokens on a grid of {rows} x {columns} have no one side; use grid_shape")
+        require(
+            rows == columns,
+            f"the grid of {rows} x {columns} tokens is not square, so it has no single side; use grid_shape",
+        )
         return rows
 
     @property
@@ -129,7 +132,7 @@ class Magvit2Config(Ids):
         require(self.res_blocks >= 1, f"magvit2.res_blocks must be at least 1, got {self.res_blocks}")
         require(
             self.factors >= 1 and self.bits >= 1 and self.bits % self.factors == 0,
-            f"magvit2.bits {self.bits} do not split into {self.factors} equal factors",
+            f"magvit2.bits {self.bits} cannot be split into {self.factors} equal factors",
         )
         require(self.bits <= 24, f"magvit2.bits must be at most 24, got {self.bits}")
         self._check_size("magvit2")
@@ -209,5 +212,5 @@ def _check_levels(name: str, widths: list[int] | tuple[int, ...], groups: int) -
     for width in widths:
         require(
             width >= 1 and width % groups == 0,
-            f"{name}: a level of {width} channels does not split into {groups} groups",
+            f"{name}: a level of {width} channels cannot be split into {groups} groups",
         )

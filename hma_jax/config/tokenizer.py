@@ -17,19 +17,19 @@ class TokenizerConfig:
     channels; `factors`, the entropy and the commitment then mean nothing.
     """
 
-    image_size: int = 32  # pixels along a side
-    downsample: int = 8  # pixels along a side of a token
-    quantise: bool = True  # tokens are ids; false: latents
-    bits: int = 16  # channels per token: C of the continuous variant
-    factors: int = 2  # that an id splits into
-    channels: int = 256  # inside encoder and decoder
-    encoder_blocks: int = 1  # of the encoder
-    decoder_blocks: int = 2  # of the decoder
-    entropy_weight: float = 0.0  # of the loss that spreads codes
-    entropy_temperature: float = 1.0  # of the soft code assignment that the entropy is taken of
-    commitment_weight: float = 0.0  # of the distance of values from their codes
-    # Without quantisation: noise on the latents while training, its standard deviation in the
-    # range -1..1 of the encoder. It makes the decoder bear the errors of a generative model: on
+    image_size: int = 32  # side of an image in pixels
+    downsample: int = 8  # side of a token in pixels
+    quantise: bool = True  # true: tokens are ids; false: latents
+    bits: int = 16  # bits per id; without quantisation, channels per latent
+    factors: int = 2  # factors that an id is split into
+    channels: int = 256  # channels inside encoder and decoder
+    encoder_blocks: int = 1  # residual blocks of the encoder
+    decoder_blocks: int = 2  # residual blocks of the decoder
+    entropy_weight: float = 0.0  # weight of the entropy loss, which makes the tokenizer use all codes
+    entropy_temperature: float = 1.0  # temperature of the soft code assignment in the entropy loss
+    commitment_weight: float = 0.0  # weight of the commitment loss: the distance of values from their codes
+    # Without quantisation: standard deviation of the noise that training adds to the latents, which lie in
+    # -1..1. It makes the decoder bear the errors of a generative model: on
     # the suite 0.1 costs 0.6 dB without errors and gains 1.7 dB where they are 0.2 (of latents
     # scaled to 1); 0.2 costs 1.3 dB and is better only from errors of 0.3 on.
     latent_noise: float = 0.1
@@ -54,7 +54,7 @@ class TokenizerConfig:
     def _check_factors(self) -> None:
         require(
             self.factors >= 1 and self.bits % self.factors == 0,
-            f"tokenizer.bits {self.bits} do not split into {self.factors} equal factors",
+            f"tokenizer.bits {self.bits} cannot be split into {self.factors} equal factors",
         )
         require(self.bits <= 24, f"tokenizer.bits must be at most 24, got {self.bits}")
         require(
@@ -98,14 +98,14 @@ class TokenizerConfig:
 class TokenizerTrainConfig:
     """How a tokenizer is trained. `batch` counts images per step."""
 
-    steps: int = 2000  # of the optimiser
+    steps: int = 2000  # number of optimiser steps
     batch: int = 64  # images per step
-    learning_rate: float = 3e-3  # after the warmup; falls as a cosine
-    warmup_steps: int = 50  # over which the learning rate rises from 0
-    final_fraction: float = 0.01  # of the learning rate, at the end of the cosine
-    weight_decay: float = 1e-4  # AdamW's, of matrices and kernels
-    clip_norm: float = 1.0  # largest norm of a gradient
-    seed: int = 0  # of initial values and order of frames
+    learning_rate: float = 3e-3  # peak learning rate, after the warm-up; then a cosine schedule
+    warmup_steps: int = 50  # steps in which the learning rate rises from 0
+    final_fraction: float = 0.01  # learning rate at the end, as a fraction of the peak
+    weight_decay: float = 1e-4  # AdamW's weight decay, of matrices and convolution kernels
+    clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
+    seed: int = 0  # random seed of initial values and order of frames
 
     def __post_init__(self):
         check_fields(self, infinite_allowed=("clip_norm",))

@@ -31,42 +31,44 @@ ActionScale = Literal["deviation", "quantiles"]
 class MaskingConfig:
     """Training-time masking and corruption (reference sections 1.9 and 2.3, paper section 3.5)."""
 
-    setting: Setting = "forward"  # what is hidden in training, and so predicted
-    action_loss_weight: float = 0.5  # beside the loss of frames, where both are predicted
-    non_mlm_ratio: float = 0.2  # probability that prompt frames stay clean
-    prompt_frames: int = 4  # the first of a window
-    # A frame's mask rate is cos(pi/2 u) with u uniform from here to 1. DIFFERS: the release calls
+    setting: Setting = "forward"  # what is masked in training, and so predicted (docs/models.md)
+    action_loss_weight: float = 0.5  # weight of the action loss, if frames are predicted too; theirs has weight 1
+    non_mlm_ratio: float = 0.2  # probability that the prompt frames of a window are not masked
+    prompt_frames: int = 4  # number of prompt frames, the first of a window
+    # Mask rate of a frame: cos(pi/2 u), with u uniform between this value and 1. DIFFERS: the release calls
     # it the minimum mask ratio, but a larger value lowers the largest rate.
     mask_angle_min: float = 0.0
-    # The schedule of paper section 3.5, which the release lacks: the least mask rate of a frame, and how
-    # far it rises over the window; at 1 the last frame is wholly masked.
+    # Lowest mask rate of a frame, in the schedule of paper section 3.5, which the release lacks; horizon_gain
+    # raises it over the window. At 1 the last frame is fully masked.
     min_ratio: float = 0.0
-    horizon_gain: float = 0.0  # how far the least mask rate rises over the window
-    # Continuous variant: mask whole patches. DIFFERS: the release masks single cells, so that
+    horizon_gain: float = 0.0  # by how much min_ratio rises from the first to the last frame of a window
+    # Continuous variant: mask whole patches or single latent cells. DIFFERS: the release masks single cells, so that
     # patches are partly masked in training and never at inference; `cell` is as released.
     mask_unit: Literal["patch", "cell"] = "patch"
-    # Masked frames are predicted from the true frames before them, as in generation. DIFFERS: the release
+    # Predict masked frames from the true frames before them, as in generation. DIFFERS: the release
     # masks all frames of a window in one pass, so that each is predicted from masked ones. A step passes over every
     # frame twice; docs/models.md shows when that pays.
     teacher_forcing: bool = False
-    # With teacher forcing, of discrete tokens: past frames that the model drew itself, up to this share of them
-    # (`objective.own_past`). DIFFERS: the release corrupts the past with random tokens alone (`max_corrupt_rate`, which
-    # does so here too).
+    # With teacher forcing and discrete tokens: replace past frames, up to this share of them, by frames that the model
+    # generated itself (scheduled sampling; `objective.own_past`). DIFFERS: the release corrupts the past with random
+    # tokens alone (`max_corrupt_rate`, which does so here too).
     own_past: float = 0.0
-    # Rounds in which own_past is drawn, each after what the one before drew; a step passes over every frame once more
-    # for each.
+    # Rounds in which own_past generates frames, each from the frames of the round before; each round costs one more
+    # pass over every frame per training step.
     own_past_rounds: int = 1
-    # With teacher forcing: the probability of each of a few rectangles of the past that show what stands elsewhere, for
+    # With teacher forcing: probability that a rectangle of the past frames shows the contents of another place, for
     # some frames (`objective.displaced`). DIFFERS: the release has nothing like it.
     displaced_past: float = 0.0
-    # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one
-    # that stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
+    # Weight in the loss of discrete tokens that differ from the token at the same place one frame earlier; tokens that
+    # do not change, most of a video, have weight 1. DIFFERS: the release counts all alike. Effect: docs/models.md.
     change_weight: float = 1.0
-    max_corrupt_rate: float = 0.2  # largest share of tokens that random ones replace; of ids alone, as the next two
-    clean_rate_min: float = 0.2  # least share of tokens kept in the first frame after a clean prompt
-    label_smoothing: float = 0.01  # share of the target that is spread evenly over all entries
-    # DIFFERS: the release shows hidden actions to the blocks (`conditioning`, discrete variant)
-    # or everywhere (`all`, continuous variant), so that the objective gives them away.
+    max_corrupt_rate: float = 0.2  # models on ids: largest share of tokens replaced by random ones
+    # Models on ids: smallest share of tokens kept in the first frame after an unmasked prompt.
+    clean_rate_min: float = 0.2
+    label_smoothing: float = 0.01  # models on ids: share of the target that is spread evenly over all entries
+    # Where masked actions are visible to the model: nowhere, in the blocks or everywhere. DIFFERS: the release shows
+    # them to the blocks (`conditioning`, discrete variant) or everywhere (`all`, continuous variant), so that the
+    # objective gives them away.
     action_leak: ActionLeak = "none"
 
     def __post_init__(self):
@@ -75,39 +77,47 @@ class MaskingConfig:
         for name in (*shares, "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
-        require(self.label_smoothing < 1, "masking.label_smoothing 1 leaves nothing of the labels to learn from")
+        require(
+            self.label_smoothing < 1,
+            "masking.label_smoothing must be below 1: at 1 the targets contain nothing of the labels",
+        )
         require(
             self.mask_angle_min < 1 or self.min_ratio > 0 or self.horizon_gain > 0,
-            "masking.mask_angle_min 1 masks no token, so that nothing is learned; set it below 1, or masking.min_ratio",
+            "masking.mask_angle_min 1 masks no token, so nothing is learned; set it below 1, or masking.min_ratio "
+            "above 0",
         )
         # The first frame is never masked: nothing comes before it.
         require(self.prompt_frames >= 1, f"masking.prompt_frames must be at least 1, got {self.prompt_frames}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
         require(
             self.action_loss_weight > 0 or self.predicts_frames,
-            f"masking.action_loss_weight is 0, and {self.setting!r} predicts actions alone: nothing would be learned",
+            f"masking.action_loss_weight is 0, and {self.setting!r} predicts only actions, so nothing would be "
+            "learned; set it above 0",
         )
         require(self.own_past_rounds >= 1, f"masking.own_past_rounds must be at least 1, got {self.own_past_rounds}")
         require(self.change_weight > 0, f"masking.change_weight must be positive, got {self.change_weight}")
         require(
             self.change_weight == 1 or self.predicts_frames,
-            f"masking.change_weight is of tokens that are predicted, and {self.setting!r} predicts none",
+            f"masking.change_weight is the weight of predicted tokens, but setting {self.setting!r} predicts no "
+            "frames; leave it at 1",
         )
         require(
             not (self.teacher_forcing and self.predicts_actions),
-            f"masking.teacher_forcing is of settings that predict frames alone, and {self.setting!r} predicts actions",
+            f"masking.teacher_forcing works only with settings that predict no actions, but {self.setting!r} predicts "
+            "actions",
         )
         require(
             self.teacher_forcing or not self.own_past,
-            "masking.own_past replaces frames of the past that masking.teacher_forcing shows: set that too",
+            "masking.own_past needs masking.teacher_forcing=true, whose past frames it replaces",
         )
         require(
             self.teacher_forcing or not self.displaced_past,
-            "masking.displaced_past changes frames of the past that masking.teacher_forcing shows: set that too",
+            "masking.displaced_past needs masking.teacher_forcing=true, whose past frames it changes",
         )
         require(
             self.own_past > 0 or self.own_past_rounds == 1,
-            f"masking.own_past_rounds {self.own_past_rounds} draws what masking.own_past asks for, which is 0: set that too",
+            f"masking.own_past_rounds {self.own_past_rounds} has no effect while masking.own_past is 0; set "
+            "masking.own_past above 0",
         )
 
     @property
@@ -129,20 +139,21 @@ class MaskingConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    # At the muP base width. DIFFERS: the release multiplies the configured rate by batch / 64, between 1 and 8; here
-    # it is used as configured.
+    # Peak learning rate, at the muP base width. DIFFERS: the release multiplies the configured rate by batch / 64,
+    # between 1 and 8; here it is used as configured.
     learning_rate: float = 1e-4
-    schedule: Literal["constant", "cosine", "wsd"] = "constant"  # of the learning rate, after the warmup
-    warmup_steps: int = 500  # over which the learning rate rises from 0
-    final_fraction: float = 0.1  # of the learning rate, which cosine and wsd come to right after the last step
-    decay_fraction: float = 0.2  # of all steps, the decay phase of wsd
-    beta1: float = 0.9  # AdamW's decay of the first moment
-    beta2: float = 0.95  # and of the second
-    epsilon: float = 1e-8  # AdamW's, in the denominator
-    weight_decay: float = 0.05  # of everything but biases, as released: of gains, positions and token tables too
-    clip_norm: float = 1.0  # largest norm of a gradient
-    # How matrices between two widths of the trunk are moved: as everything else is, or along their momentum made
-    # orthogonal (Muon; Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
+    schedule: Literal["constant", "cosine", "wsd"] = "constant"  # learning-rate schedule after the warm-up
+    warmup_steps: int = 500  # steps in which the learning rate rises from 0
+    final_fraction: float = 0.1  # cosine and wsd: learning rate right after the last step, as a fraction of the peak
+    decay_fraction: float = 0.2  # wsd: length of the decay phase, as a fraction of all steps
+    beta1: float = 0.9  # AdamW: decay rate of the first moment
+    beta2: float = 0.95  # AdamW: decay rate of the second moment
+    epsilon: float = 1e-8  # AdamW: term added to the denominator
+    # Weight decay of all parameters but biases, as released: also of gains, position and token embeddings.
+    weight_decay: float = 0.05
+    clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
+    # Optimiser of the trunk's hidden matrices: AdamW, as for all other parameters, or Muon, which orthogonalises their
+    # momentum (Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
     matrices: Literal["adamw", "muon"] = "adamw"
 
     def __post_init__(self):
@@ -156,7 +167,8 @@ class OptimizerConfig:
             require(0 <= getattr(self, name) <= 1, f"optimizer.{name} must lie in [0, 1], got {getattr(self, name)}")
         require(
             self.schedule != "wsd" or self.decay_fraction > 0,
-            "optimizer.decay_fraction is 0, so that schedule wsd never decays; set it, or optimizer.schedule=constant",
+            "optimizer.decay_fraction is 0, so schedule wsd never decays; set it above 0, or set "
+            "optimizer.schedule=constant",
         )
         require(self.epsilon > 0, f"optimizer.epsilon must be positive, got {self.epsilon}")
         require(self.weight_decay >= 0, f"optimizer.weight_decay must not be negative, got {self.weight_decay}")
@@ -166,14 +178,14 @@ class OptimizerConfig:
 class TrainConfig:
     """One training run. `batch` counts windows per optimiser step, over all devices."""
 
-    steps: int = 60_000  # of the optimiser
+    steps: int = 60_000  # number of optimiser steps
     batch: int = 64  # windows per step, over all devices
-    seed: int = 0  # of initial values, masks and order of data
+    seed: int = 0  # random seed of initial values, masks and order of data
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
-    only: tuple[str, ...] = ()  # train these robots' own parameters and nothing else; (): everything
-    ema_decay: float = 0.0  # of a moving average of the weights, kept beside them; 0: none
-    action_scale: ActionScale = "deviation"  # of robots new to the model
+    only: tuple[str, ...] = ()  # train only these robots' own parameters; []: train everything
+    ema_decay: float = 0.0  # decay of a moving average of the weights, which is kept too; 0: none
+    action_scale: ActionScale = "deviation"  # how actions of new robots are normalised
 
     def __post_init__(self):
         check_fields(self)
@@ -191,30 +203,30 @@ def check_objective(model: ModelConfig, masking: MaskingConfig) -> None:
     setting = masking.setting
     require(
         model.action_heads or not masking.predicts_actions,
-        f"train.masking.setting {setting!r} predicts actions, but the model has nothing to predict "
-        "them with; set model.action_heads=true",
+        f"train.masking.setting {setting!r} predicts actions, but the model has no action heads; set "
+        "model.action_heads=true",
     )
     require(
         model.concat or not masking.predicts_actions,
-        f"train.masking.setting {setting!r} predicts actions from action tokens, of which "
-        f"model.conditioning {model.conditioning!r} has none; choose one with concat",
+        f"train.masking.setting {setting!r} predicts actions from action tokens, but model.conditioning "
+        f"{model.conditioning!r} has none; choose one with concat",
     )
     require(
         model.frames > 1 or not masking.predicts_frames,
-        f"train.masking.setting {setting!r} predicts frames from earlier ones, and model.frames 1 leaves none to "
-        "predict; set model.frames to at least 2",
+        f"train.masking.setting {setting!r} predicts frames from earlier ones, so with model.frames 1 there is none "
+        "to predict; set model.frames to at least 2",
     )
     require(
         model.diffusion is None or not masking.own_past,
-        "train.masking.own_past draws ids; continuous tokens have none",
+        "train.masking.own_past works only for models on ids, not on latents; set it to 0",
     )
     require(
         model.diffusion is None or masking.change_weight == 1,
-        "train.masking.change_weight tells ids that changed; of continuous tokens all change",
+        "train.masking.change_weight works only for models on ids: latents change everywhere; set it to 1",
     )
     require(
         not masking.displaced_past or math.isqrt(model.tokens) ** 2 == model.tokens,
-        f"train.masking.displaced_past displaces rectangles of square frames, and {model.tokens} tokens are no square",
+        f"train.masking.displaced_past needs square frames, but model.tokens {model.tokens} is not a square number",
     )
 
 

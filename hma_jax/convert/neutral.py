@@ -63,15 +63,16 @@ def read_neutral(directory: Path) -> Run:
     found = set(description) if isinstance(description, dict) else set()
     require(
         found == fields and description["format"] == FORMAT,
-        f"{path}: not a description of this project: its fields are {', '.join(sorted(found)) or 'none'}, "
-        f"expected {', '.join(sorted(fields))}",
+        f"{path}: not a model description of this project: its fields are {', '.join(sorted(found)) or 'none'}, but "
+        f"{', '.join(sorted(fields))} were expected",
     )
     require(
         description["version"] == VERSION,
-        f"{path}: version {description['version']}, this program reads {VERSION}; convert it with its own",
+        f"{path}: version {description['version']}, but this program reads version {VERSION}; read the file with the "
+        "version of this project that wrote it",
     )
     step = description["step"]
-    require(type(step) is int and step >= 0, f"{path}: step: expected a number of steps, got {step!r}")
+    require(type(step) is int and step >= 0, f"{path}: step must be a number of steps, got {step!r}")
     for name in ("tensors", "provenance"):
         kind = type(description[name]).__name__
         require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
@@ -86,7 +87,7 @@ def read_neutral(directory: Path) -> Run:
     ]
     require(
         not wrong,
-        f"{path}: tensors that are not described as its model has them: {', '.join(sorted(wrong)[:10])}",
+        f"{path}: tensors whose description does not match the model: {', '.join(sorted(wrong)[:10])}",
     )
     require((directory / WEIGHTS).is_file(), f"{directory} has no {WEIGHTS}")
     tensors = read_safetensors(directory / WEIGHTS)

@@ -72,7 +72,8 @@ def read_official(directory: Path) -> Run:
     where = str(directory / CONFIG)
     require(
         is_continuous(config) == any(name.startswith("diffloss.") for name in tensors),
-        f"{directory}: {CONFIG} describes the {_variant(config)} variant, the tensors are the other's",
+        f"{directory}: {CONFIG} describes the {_variant(config)} variant, but the tensors are those of the other "
+        "variant",
     )
     with _naming_file(where):
         model, masking = read_model(config, where), read_masking(config)
@@ -152,8 +153,9 @@ def write_official(run: Run, directory: Path) -> list[str]:
     tensors, remarks = official_tensors(run)
     if not loads_in_release(config):
         remarks.append(
-            "it goes back as it came, which the release itself does not load: its muP stops at continuous "
-            "models of another width than 256. Once trained on here, it is written with muP folded in"
+            "the checkpoint is written unchanged; the release cannot load it, since its muP supports continuous "
+            "models of width 256 only. After further training here, it is written with muP folded into the weights, "
+            "which the release loads"
         )
     with atomic_directory(directory) as temporary:
         (temporary / CONFIG).write_text(json.dumps(config, indent=2, sort_keys=True))
@@ -185,7 +187,7 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     arrays = flat(run.params)
     if not run.model.action_heads:
         arrays |= {path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays}
-        remarks.append("the release has action heads, this model has none: they are written as zeros")
+        remarks.append("the release's models have action heads, this model has none: they are written as zeros")
     if not _unchanged_since_import(run):
         arrays |= _without_constant_actions(arrays, run.table)
     arrays = folded(arrays, leaves, run.model, form)
@@ -249,9 +251,9 @@ def _remarks(model: ModelConfig, form: ModelConfig) -> list[str]:
             else "continuous models of width 256 only"
         )
         remarks.append(
-            f"muP is folded into the weights and off in {CONFIG}, because the release has it for {why}: "
-            f"queries are multiplied by {queries:g}, {what} multiplied by {reads:g}. It computes the same; "
-            "trained on, it has the learning rates of a model without muP"
+            f"muP is folded into the weights and switched off in {CONFIG}, because the release supports it for {why}: "
+            f"queries are multiplied by {queries:g}, {what} multiplied by {reads:g}. The model computes the same, but "
+            "further training uses the learning rates of a model without muP"
         )
     elif reads != 1:
         remarks.append(

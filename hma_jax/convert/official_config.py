@@ -158,7 +158,7 @@ def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
     if is_continuous(config):
         fields["diffusion"] = {field: full[official] for official, field in DIFFUSION_FIELDS.items()}
         cells = full["patch_size"] ** 2
-        require(size % cells == 0, f"{where}: S {size} latent cells do not make whole patches of {cells}")
+        require(size % cells == 0, f"{where}: S {size} latent cells cannot be divided into patches of {cells}")
         fields["tokens"] = size // cells
     else:
         fields["tokens"] = size
@@ -176,7 +176,7 @@ def _root(vocab: int | None, factors: int, where: str) -> int:
     root = round(vocab ** (1 / factors))
     require(
         root**factors == vocab,
-        f"{where}: image_vocab_size {vocab} is no product of {factors} equal factors (num_factored_vocabs)",
+        f"{where}: image_vocab_size {vocab} cannot be split into {factors} equal factors (num_factored_vocabs)",
     )
     return root
 
@@ -203,7 +203,7 @@ def read_table(
     names, chunks = full["action_domains"], full["d_actions"]
     require(
         len(names) == len(chunks) >= 1,
-        f"{where}: {len(names)} action_domains but {len(chunks)} d_actions; there must be one for each",
+        f"{where}: {len(names)} action_domains but {len(chunks)} d_actions; each domain needs one",
     )
     entries = []
     for name, chunk in zip(names, chunks, strict=True):
@@ -211,7 +211,7 @@ def read_table(
         dim = mean.size
         require(
             dim > 0 and chunk % dim == 0,
-            f"{where}: d_actions {chunk} of {name} is no multiple of its {dim} action dimensions",
+            f"{where}: d_actions {chunk} of {name} is not a multiple of its {dim} action dimensions",
         )
         entries.append(Embodiment(name, dim, chunk // dim, tuple(mean.tolist()), tuple(std.tolist())))
     return EmbodimentTable(tuple(entries))

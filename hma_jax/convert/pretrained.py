@@ -59,7 +59,7 @@ class Source:
         require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
         for name, good in self.fixed.items():
             value = official.get(name, good[0])
-            require(value in good, f"{where}: {name} is {value!r}, supported is {good[0]!r}")
+            require(value in good, f"{where}: {name} is {value!r}, but only {good[0]!r} is supported")
         known = {field: official[name] for name, field in self.fields.items() if name in official}
         return from_dict(self.tokenizer.config_class, known | given, where)
 
@@ -205,7 +205,7 @@ def find_reader(path: Path) -> Callable[..., BaseTokenizer]:
         return read_svd_vae
     require(
         name is None and "ch_mult" in config,
-        f"{path / 'config.json'} describes {name or 'no tokenizer'}; supported are the "
+        f"{path / 'config.json'} describes {name or 'no tokenizer'}, which is not supported; supported are the "
         "AutoencoderKLTemporalDecoder of diffusers and the MAGVIT2 tokenizer (ch_mult, z_channels, ...)",
     )
     return read_magvit2

@@ -41,25 +41,29 @@ def require_official(model: ModelConfig, table: EmbodimentTable, setting: Settin
     """Raises ConfigError for a model, trained for `setting`, that the release cannot compute."""
     reasons = []
     if setting == "passive":
-        reasons.append("train.masking.setting is 'passive': the model is shown no action, the release shows all")
+        reasons.append(
+            "train.masking.setting is 'passive': the model sees no actions, but the release's models see all"
+        )
     if setting == "inverse":
-        reasons.append("train.masking.setting is 'inverse': its attention looks ahead, the release's looks back only")
+        reasons.append("train.masking.setting is 'inverse': its attention is not causal, but the release's is")
     if model.action_alignment != "released":
-        reasons.append(f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only")
+        reasons.append(
+            f"model.action_alignment is {model.action_alignment!r}, but the release supports only 'released'"
+        )
     if model.conditioning == "cross_attention":
-        reasons.append("model.conditioning is 'cross_attention', which the release computes otherwise")
+        reasons.append("model.conditioning is 'cross_attention', which the release computes differently")
     if model.recall:
-        reasons.append("model.recall is true, the release's masked tokens hold one learned vector")
+        reasons.append("model.recall is true, but masked tokens of the release hold only one learned vector")
     if model.chain_factors:
-        reasons.append("model.chain_factors is true, the release draws a token's factors independently")
+        reasons.append("model.chain_factors is true, but the release samples a token's factors independently")
     if math.isqrt(model.tokens) ** 2 != model.tokens:
-        reasons.append(f"model.tokens {model.tokens} do not make a square, the release's frames are square")
+        reasons.append(f"model.tokens {model.tokens} is not a square number, but the release's frames are square")
     if model.diffusion and model.diffusion.steps != 1000:
-        reasons.append(f"model.diffusion.steps is {model.diffusion.steps}, the release has 1000 only")
+        reasons.append(f"model.diffusion.steps is {model.diffusion.steps}, but the release supports only 1000")
     for entry in table.entries:
         if "." in entry.name or not entry.name:
-            reasons.append(f"the robot's name {entry.name!r} has a dot, with which torch separates modules")
+            reasons.append(f"the robot's name {entry.name!r} contains a dot, which torch uses to separate module names")
         if entry.chunk == 0:
-            reasons.append(f"{entry.name} has no actions, the release's robots all have some")
+            reasons.append(f"{entry.name} has no actions, but all robots of the release need some")
     if reasons:
         raise ConfigError("the official format cannot hold this model: " + "; ".join(reasons))

@@ -51,7 +51,8 @@ class ProgramConfig:
         require(self.batch >= 1, f"batch must be at least 1, got {self.batch}")
         require(
             1 <= self.prompt < self.frames,
-            f"frames must exceed prompt, and prompt be at least 1: got {self.frames} and {self.prompt}",
+            f"frames must be more than prompt, and prompt at least 1, got frames {self.frames} and prompt "
+            f"{self.prompt}",
         )
         unknown = set(self.platforms) - set(PLATFORMS)
         require(

@@ -220,7 +220,7 @@ def check_names(want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[i
     wrong = {
         "missing": [f"{n} {want[n]}" for n in want if n not in found],
         "not expected": [f"{n} {found[n]}" for n in found if n not in want],
-        "of another shape": [
+        "with another shape": [
             f"{n}: expected {want[n]}, found {found[n]}" for n in want if n in found and found[n] != want[n]
         ],
     }
@@ -231,7 +231,7 @@ def check_names(want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[i
         if names
     ]
     if lines:
-        raise ConfigError(f"{where}: the tensors are not those that the description asks for:" + "".join(lines))
+        raise ConfigError(f"{where}: the tensors differ from those that the description requires:" + "".join(lines))
 
 
 def flat(params: Params) -> dict[str, np.ndarray]:

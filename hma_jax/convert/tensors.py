@@ -43,8 +43,8 @@ def read_finite(tensors: Mapping[str, Stored], name: str, where: str) -> np.ndar
     values = tensors[name].read()
     require(
         bool(np.isfinite(values).all()),
-        f"{where}: {name} holds values that are not finite: it is damaged, or was saved after its training had diverged; "
-        "fetch it again, or take an earlier one",
+        f"{where}: {name} contains values that are not finite: the file is damaged, or was saved after training had "
+        "diverged; download it again, or use an earlier checkpoint",
     )
     return values
 
@@ -63,7 +63,7 @@ def read_safetensors(path: Path) -> dict[str, Stored]:
         file = safe_open(path, framework="np")
         return {name: stored(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
     except SafetensorError as error:
-        raise ConfigError(f"{path}: no readable safetensors file ({error}); fetch it again") from error
+        raise ConfigError(f"{path}: not a readable safetensors file ({error}); download it again") from error
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray]) -> None:

@@ -102,8 +102,8 @@ class _Reader(pickle.Unpickler):
         if self.whole and known:
             return _Ignored
         raise _Refused(
-            f"{self.path} asks for {module}.{name}, which a plain state dict of tensors does not need; it is "
-            "not read. Save the tensors alone, best as model.safetensors"
+            f"{self.path} needs {module}.{name}, which a plain state dict of tensors does not; for safety it is not "
+            "read. Save only the tensors, best as model.safetensors"
         )
 
     def persistent_load(self, pid: Any) -> _Storage:
@@ -131,7 +131,7 @@ class _Reader(pickle.Unpickler):
                 with zipfile.ZipFile(self.path) as archive:
                     elements = np.frombuffer(archive.read(entry), storage.dtype)[offset:]
             except UNREADABLE as error:
-                raise ConfigError(f"{self.path}: {entry} is damaged ({error}); fetch the file again") from error
+                raise ConfigError(f"{self.path}: {entry} is damaged ({error}); download the file again") from error
             strides = [s * size for s in stride]
             return np.lib.stride_tricks.as_strided(elements, shape, strides, writeable=False).copy()
 
@@ -150,12 +150,15 @@ def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
             require(len(pickles) == 1, f"{path} is a zip file without a torch state dict{advice}")
             root = pickles[0].removesuffix("data.pkl")
             if f"{root}byteorder" in archive.namelist():
-                require(archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little")
+                require(
+                    archive.read(f"{root}byteorder") == b"little",
+                    f"{path}: its byte order is not little-endian-endian-endian",
+                )
             state = _Reader(path, archive, root, whole=within is not None).load()
     except _Refused:
         raise
     except zipfile.BadZipFile as error:
-        raise ConfigError(f"{path}: no zip file, damaged or saved by torch before 1.6{advice}") from error
+        raise ConfigError(f"{path}: not a zip file; it is damaged or was saved by torch before 1.6{advice}") from error
     except (*UNREADABLE, pickle.UnpicklingError, AttributeError) as error:
         if isinstance(error, ConfigError):
             raise
@@ -165,5 +168,5 @@ def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
     plain = isinstance(state, dict) and all(
         isinstance(name, str) and isinstance(tensor, Stored) for name, tensor in state.items()
     )
-    require(plain, f"{path} holds something else than names and tensors{advice}")
+    require(plain, f"{path} contains something other than names and tensors{advice}")
     return dict(state)

@@ -196,5 +196,5 @@ def check_coordinates(rows: Sequence[Size], grow: float = 0.2, fade: float = 0.4
         if slope.size > grow:
             findings.append(f"{quantity}: grows as width^{slope.size:.2f}")
         if slope.change > grow or slope.change < -fade:
-            findings.append(f"{quantity}: its change by training goes as width^{slope.change:.2f}")
+            findings.append(f"{quantity}: its change in training grows as width^{slope.change:.2f}")
     return findings

@@ -123,7 +123,7 @@ def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode
     Raises ConfigError for fewer than MIN_EPISODES episodes, too few for a standard error.
     """
     there = len(set(episode))
-    require(there >= MIN_EPISODES, f"{there} episodes; what actions do is told from at least {MIN_EPISODES}")
+    require(there >= MIN_EPISODES, f"{there} episodes; measuring the effect of actions needs at least {MIN_EPISODES}")
     count, losses = actions.shape[-1], loss_of(actions)
     found: dict[int, tuple[Change, Difference]] = {}
     while len(found) < count:

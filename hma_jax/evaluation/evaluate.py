@@ -154,8 +154,8 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
     row = int(np.argmin(real))
     require(
         real[row] > config.first_predicted,
-        f"a window of {batch['dataset'][row]} has {real[row]} frames, of which eval.prompt_frames "
-        f"{config.prompt_frames} leaves none to predict; freeze windows for this prompt, or use a shorter one",
+        f"a window of {batch['dataset'][row]} has {real[row]} frames, so with eval.prompt_frames "
+        f"{config.prompt_frames} there is none to predict; freeze windows for this prompt, or use a shorter one",
     )
 
 

@@ -64,8 +64,8 @@ def image_metrics(
     decoded = decoded.reshape(*tokens.shape[:2], *decoded.shape[1:])
     require(
         decoded.shape[2:] == images.shape[2:],
-        f"the tokenizer decodes images of {decoded.shape[2:]}, recorded are {images.shape[2:]}; "
-        "evaluate with the tokenizer that the token store was made with",
+        f"the tokenizer decodes images of shape {decoded.shape[2:]}, but the recorded ones have {images.shape[2:]}; "
+        "evaluate with the tokenizer that made the token store",
     )
     shown, random_last, other = jnp.split(decoded, (made, made + draws), axis=1)
     first = config.first_predicted

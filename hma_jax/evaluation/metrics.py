@@ -86,7 +86,7 @@ def ssim(a: Any, b: Any) -> Any:
 def _whole_numbers(a: Any, b: Any) -> tuple[Any, Any, Any]:
     """(array library, a, b) with both images as int32."""
     require(a.shape == b.shape, f"images to compare differ in shape: {a.shape} and {b.shape}")
-    require(a.ndim >= 3, f"images to compare have height, width and channels, got {a.shape}")
+    require(a.ndim >= 3, f"images to compare must have height, width and channels, got {a.shape}")
     require(a.dtype == b.dtype == np.uint8, f"images to compare must be uint8, got {a.dtype} and {b.dtype}")
     xp = jnp if isinstance(a, jax.Array) or isinstance(b, jax.Array) else np
     return xp, xp.asarray(a, np.int32), xp.asarray(b, np.int32)

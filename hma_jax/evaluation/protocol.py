@@ -114,11 +114,13 @@ def make_predictor(
     """
     require(
         config.first_predicted < model.frames,
-        f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of {model.frames} frames",
+        f"eval.prompt_frames {config.prompt_frames} leaves no frame to predict in a window of {model.frames} frames; "
+        "use fewer",
     )
     require(
         config.prompt_frames <= model.frames or not predicts_actions(model, setting),
-        f"eval.prompt_frames {config.prompt_frames} leaves no action to judge in a window of {model.frames} frames",
+        f"eval.prompt_frames {config.prompt_frames} leaves no action to evaluate in a window of {model.frames} "
+        "frames; use fewer",
     )
     declared = declare_model(model, table, execution)
 
@@ -173,7 +175,7 @@ def _frame_metrics(
     if config.context == "recorded":
         require(
             tokens.shape[1] == model.frames,
-            f"with eval.context 'recorded' windows have the model's {model.frames} frames, got {tokens.shape[1]}",
+            f"with eval.context 'recorded' windows must have the model's {model.frames} frames, got {tokens.shape[1]}",
         )
         out, predicted = _after_recorded(hma, window, sequences, decoding, config, hidden, real)
     else:

@@ -98,12 +98,12 @@ class WindowTable:
         own, wanted = self.names, other.names
         at = {name: i for i, name in enumerate(own)}
         for names in (own, wanted):
-            require(len(set(names)) == len(names), f"a window stands twice in an evaluation: {_first_twice(names)}")
+            require(len(set(names)) == len(names), f"an evaluation contains a window twice: {_first_twice(names)}")
         unmatched = sorted(set(own) ^ set(wanted))
         require(
             not unmatched,
-            f"only one of two evaluations has window {unmatched and unmatched[0]} (and {len(unmatched) - 1} others); "
-            "compare evaluations on one frozen set of windows",
+            f"only one of the two evaluations has window {unmatched and unmatched[0]} (and {len(unmatched) - 1} "
+            "others); compare evaluations on one frozen set of windows",
         )
         return self.rows(np.asarray([at[name] for name in wanted], np.int64))
 
@@ -143,12 +143,12 @@ class WindowTable:
         codes = codes[np.argsort(firsts)]
         names, blocks = [metrics[code] for code in codes], [np.flatnonzero(metric == code) for code in codes]
         if not blocks or len({trials[code] for code in np.unique(trial)}) != 1:
-            raise ValueError("it holds no trial, or several")
+            raise ValueError("it contains no trial, or several")
         columns = {"robot": robot} | {n: table[n].to_numpy() for n in ("episode", "window", "frames", "value")}
         first = {name: column[blocks[0]] for name, column in columns.items()}
         for name, block in zip(names, blocks, strict=True):
             if any(not np.array_equal(columns[c][block], first[c]) for c in ("robot", "episode", "window", "frames")):
-                raise ValueError(f"{name} is of other windows than {names[0]}")
+                raise ValueError(f"{name} has other windows than {names[0]}")
         whole = (np.asarray(first[name], np.int64) for name in ("episode", "window", "frames"))
         values = {n: columns["value"][block].astype(np.float64) for n, block in zip(names, blocks, strict=True)}
         return cls(np.asarray(robots, str)[first["robot"]], *whole, values)
@@ -170,8 +170,8 @@ class WindowTable:
             return cls.from_arrow(read_arrow(path))
         except (OSError, ValueError, KeyError, pa.ArrowException) as error:
             legacy = Path(path).with_name(LEGACY_FILE)
-            reason = f"{legacy.name} beside it is of an earlier version" if legacy.exists() else error
-            raise ConfigError(f"{path}: no table of windows can be read ({reason}). Evaluate again.") from error
+            reason = f"{legacy.name} beside it was written by an earlier version" if legacy.exists() else error
+            raise ConfigError(f"{path}: the table of windows cannot be read ({reason}). Evaluate again.") from error
 
 
 def read_arrow(path: str | Path) -> pa.Table:
@@ -190,7 +190,7 @@ def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
     whole = coded.unify_dictionaries().combine_chunks()
     names = whole.dictionary.to_pylist()
     if whole.null_count or len(set(names)) < len(names):
-        raise ValueError("a name is missing, or stands twice in the list of names")
+        raise ValueError("a name is missing, or is twice in the list of names")
     return names, whole.indices.to_numpy()
 
 
@@ -201,7 +201,7 @@ def _first_twice(names: Sequence[tuple[str, int, int]]) -> tuple[str, int, int] 
 
 def join(tables: Sequence[WindowTable]) -> WindowTable:
     """One table after the other. Raises ConfigError if there is none."""
-    require(len(tables) > 0, "the evaluation has no windows; freeze a manifest over other datasets")
+    require(len(tables) > 0, "the evaluation has no windows; freeze windows of other datasets")
     columns = (np.concatenate([getattr(t, name) for t in tables]) for name in ("dataset", "episode", "start", "frames"))
     metrics = {m: np.concatenate([t.metrics[m] for t in tables]) for m in tables[0].metrics}
     return WindowTable(*columns, metrics)

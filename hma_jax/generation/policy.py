@@ -82,7 +82,8 @@ def read_actions(
     head."""
     require(
         model.action_head is not None and out.actions is not None,
-        "the model predicts no actions; train one with model.action_heads=true and a conditioning with concat",
+        "the model predicts no actions; train one with model.action_heads=true and a model.conditioning that "
+        "contains concat",
     )
     if model.config.diffusion:
         normalised = _sample_actions(model, out.actions, embodiment_B, key_B, decode)

@@ -190,8 +190,8 @@ def _require_shapes(
     fits = frames[1:] == token and len(sequences) == 3 and sequences[2] == model.table.action_width
     require(
         fits and {(batch,)} == {(examples,), jnp.shape(embodiment_B), jnp.shape(key_B)[:1]},
-        f"a rollout takes a prompt [B, T', {', '.join(map(str, token))}], actions [B, R, T, {model.table.action_width}] "
-        "(whole chunks of a frame, filled up with zeros), B robots and B keys; got "
+        f"a rollout takes a prompt [B, T', {', '.join(map(str, token))}], actions [B, R, T, "
+        f"{model.table.action_width}] (all chunks of a frame, padded with zeros), B robots and B keys; got "
         + ", ".join(str(jnp.shape(x)) for x in (prompt, actions_BRTU, embodiment_B, key_B)),
     )
     if hidden_BT is not None:
@@ -205,8 +205,9 @@ def _recent(
     count, frames = prompt.shape[1], actions_BRTU.shape[2]
     require(
         1 <= count < frames,
-        f"a rollout needs 1 prompt frame or more, got {count}, and chunks for more frames than these, got {frames}",
+        f"a rollout needs at least 1 prompt frame, got {count}, and action chunks for more frames than the prompt "
+        f"has, got {frames}",
     )
-    require(model.config.frames > 1, "a model of one frame cannot continue anything")
+    require(model.config.frames > 1, "a model with model.frames 1 cannot generate frames: it needs at least 2")
     old = max(count - (model.config.frames - 1), 0)
     return prompt[:, old:], actions_BRTU[:, :, old:], None if hidden_BT is None else hidden_BT[:, old:]

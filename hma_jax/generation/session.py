@@ -48,8 +48,8 @@ def start(
     model or each other.
     """
     capacity, count = model.config.frames - 1, prompt.shape[1]
-    require(capacity >= 1, "a model of one frame cannot continue anything")
-    require(count >= 1, "a session starts from 1 prompt frame or more, got 0")
+    require(capacity >= 1, "a model with model.frames 1 cannot generate frames: it needs at least 2")
+    require(count >= 1, "a session needs at least 1 prompt frame, got 0")
     between = (len(prompt), count - 1)
     hidden = jnp.zeros(between, bool) if hidden_BT is None else hidden_BT
     require_shapes(

@@ -60,7 +60,7 @@ def find_backend(name: str) -> Backend:
     require(name in BACKENDS, f"execution.attention {name!r} is unknown; known: auto, {', '.join(BACKENDS)}")
     require(
         name == suits or name not in ONLY_ON,
-        f"execution.attention {name!r} runs on {ONLY_ON.get(name)} alone, and the device here is a {platform.upper()}; "
-        "choose auto, which takes what suits the device",
+        f"execution.attention {name!r} runs only on {ONLY_ON.get(name)}, but the device is a {platform.upper()}; use "
+        "auto, which chooses by the device",
     )
     return BACKENDS[name]

@@ -58,12 +58,13 @@ class Embodiment:
         require(min(self.std, default=0.0) >= 0, f"embodiment {self.name!r}: std must not be negative, got {self.std}")
         require(
             (len(self.low), len(self.high)) in ((0, 0), (self.action_dim, self.action_dim)),
-            f"embodiment {self.name!r}: low and high must both have {self.action_dim} entries, or none",
+            f"embodiment {self.name!r}: low and high must both have {self.action_dim} entries, or both none",
         )
         require(
             bool(np.isfinite((*self.low, *self.high)).all())
             and all(b > a or std <= DEAD_STD for a, b, std in zip(self.low, self.high, self.std, strict=False)),
-            f"embodiment {self.name!r}: low must lie below high where actions vary, got {self.low} and {self.high}",
+            f"embodiment {self.name!r}: low must be below high for every action value that varies, got {self.low} and "
+            f"{self.high}",
         )
 
     @property

@@ -158,7 +158,7 @@ def sample_with_key(
     """
     require(
         key.shape == shape[: key.ndim],
-        f"keys of shape {key.shape} do not lie along the first axes of samples of shape {shape}",
+        f"keys of shape {key.shape} do not match the first axes of samples of shape {shape}",
     )
 
     def draw(index: jax.Array | int) -> jax.Array:

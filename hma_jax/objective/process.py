@@ -82,8 +82,8 @@ def make_process(steps: int) -> Process:
 def _require_count(process: Process, count: int) -> None:
     require(
         2 <= count <= process.steps,
-        f"cannot visit {count} steps of a noising process of {process.steps}; "
-        f"set sampler.steps between 2 and {process.steps}",
+        f"a sampler cannot take {count} of the {process.steps} steps of the noising process; set sampler.steps "
+        f"between 2 and {process.steps}",
     )
 
 

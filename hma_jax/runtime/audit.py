@@ -91,9 +91,9 @@ def audit_sharding(
     if share > limit:
         worst = sorted(whole, key=lambda d: -d.spec.size)[:5]
         raise ConfigError(
-            f"{share:.1%} of the parameters would be replicated on every device (limit {limit:.0%}): "
+            f"{share:.1%} of the parameters would be replicated on every device (allowed: {limit:.0%}): "
             + ", ".join(f"{d.name} {d.spec.shape}" for d in worst)
-            + "; no mesh axis divides them: choose sizes of fsdp and tensor that do"
+            + "; no mesh axis divides their sizes: choose sizes of fsdp and tensor that do"
         )
 
 

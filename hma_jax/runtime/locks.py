@@ -97,7 +97,10 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
     fd, locked = _open(path, lease)
     try:
         if not locked and not lease:
-            log.warning("%s cannot be locked there; see that no other process works beside it", path)
+            log.warning(
+                "the file system of %s supports no locks; make sure that no other process uses it at the same time",
+                path,
+            )
         since = time.strftime("%Y-%m-%d %H:%M:%S")
         lock = Lock(path, Holder(os.getpid(), socket.gethostname(), since, machine(), secrets.token_hex(8), locked))
         os.ftruncate(fd, 0)

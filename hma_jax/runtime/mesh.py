@@ -53,7 +53,7 @@ def arrange(sizes: Sequence[int], devices: Sequence[jax.Device]) -> np.ndarray:
     try:
         return mesh_utils.create_hybrid_device_mesh(inner, outer, devices, allow_split_physical_axes=True)
     except ValueError as error:
-        raise ConfigError(f"the {len(devices)} devices of {slices} slices make no mesh: {error}") from error
+        raise ConfigError(f"no mesh can be made of the {len(devices)} devices of {slices} slices: {error}") from error
 
 
 def split_over_slices(sizes: Sequence[int], slices: int) -> list[int]:
@@ -76,7 +76,7 @@ def check_sizes(sizes: Sequence[int], model: ModelConfig, batch: int, accumulate
     parts = f" in {accumulate} micro-batches" if accumulate > 1 else ""
     require(
         batch % (data * fsdp * accumulate) == 0,
-        f"a batch of {batch}{parts} does not divide over data={data} x fsdp={fsdp} devices; make it a multiple of "
+        f"a batch of {batch}{parts} cannot be divided over data={data} x fsdp={fsdp} devices; make it a multiple of "
         f"{data * fsdp * accumulate}, or change the mesh",
     )
     for name, size in (("heads", model.heads), ("mlp_width", model.mlp_width)):

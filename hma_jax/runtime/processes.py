@@ -87,9 +87,8 @@ class Processes:
         given = (found.coordinator, found.processes, found.process)
         require(
             found.detect or None not in given or given == (None, None, None),
-            "several processes need --coordinator HOST:PORT, --processes N and --process I (or "
-            f"{COORDINATOR}, {PROCESSES}, {PROCESS}), or --distributed where Slurm, Kubernetes, a TPU pod or MPI "
-            "started them",
+            f"several processes need --coordinator HOST:PORT, --processes N and --process I (or {COORDINATOR}, "
+            f"{PROCESSES}, {PROCESS}), or --distributed if Slurm, Kubernetes, a TPU pod or MPI started them",
         )
         return found
 
@@ -128,9 +127,9 @@ def start(asked: Processes) -> None:
         joining.start()
         joining.join(asked.start_timeout)
     except KeyboardInterrupt as request:
-        _exit_now("stopped while it waited for the other processes", exit_of_interrupt(request))
+        _exit_now("stopped while waiting for the other processes", exit_of_interrupt(request))
     if joining.is_alive():
-        _exit_now(f"error: {_join_failure(asked, 'not all are there')}", Exit.REFUSED)
+        _exit_now(f"error: {_join_failure(asked, 'not all have started')}", Exit.REFUSED)
     if failed:
         reason = " ".join(str(failed[0]).split())[:300]
         raise ConfigError(_join_failure(asked, reason)) from failed[0]
@@ -140,8 +139,8 @@ def start(asked: Processes) -> None:
 
 def _join_failure(asked: Processes, reason: str) -> str:
     return (
-        f"the processes did not come together within {asked.start_timeout:.0f} s at "
-        f"{asked.coordinator or 'the address that was detected'} ({reason}); see that all were started with the "
+        f"the processes could not connect within {asked.start_timeout:.0f} s at "
+        f"{asked.coordinator or 'the address that was detected'} ({reason}); check that all were started with the "
         "same address and that process 0 can be reached there"
     )
 

@@ -25,7 +25,7 @@ def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:
     ways = mesh.shape["data"] * mesh.shape["fsdp"]
     require(
         batch % ways == 0,
-        f"loader.batch {batch} does not split over the {ways} devices of mesh.data x mesh.fsdp; change one of them",
+        f"loader.batch {batch} cannot be divided over the {ways} devices of mesh.data x mesh.fsdp; change one of them",
     )
     parts = batch_sharding(mesh).addressable_devices_indices_map((batch,)).values()
     return np.unique(np.concatenate([np.arange(batch)[index] for index in parts]))

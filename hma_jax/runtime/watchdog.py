@@ -72,7 +72,7 @@ class Heartbeats:
     def failure(self) -> str | None:
         """Why this process must end; None: it need not."""
         now, others = self.clock(), {p: x for p, x in self.last.items() if p != self.process}
-        again = "start all processes again: they go on from the last checkpoint"
+        again = "start all processes again: they continue from the last checkpoint"
         for p, (heartbeat, when) in others.items():
             if heartbeat[:1] == [FAILED] and now - when > GRACE:
                 return f"{self._name_of(p)} ended with an error: {heartbeat[1]}"
@@ -133,7 +133,7 @@ def send_heartbeat(host: str, port: int, token: str, process: int, heartbeat: He
         connection.sendall(json.dumps([token, process, heartbeat]).encode() + b"\n")
         answer = answers.readline()
     if not answer.endswith(b"\n"):
-        raise ConnectionResetError("it broke off")
+        raise ConnectionResetError("the connection broke")
     return {int(p): heartbeat for p, heartbeat in json.loads(answer)}
 
 
@@ -159,7 +159,7 @@ class Watchdog:
         try:
             self._exchange(self.heartbeats.process, heartbeat)
         except OSError as error:
-            print(f"note: the other processes could not be told ({error})", file=sys.stderr)
+            print(f"note: the other processes could not be notified ({error})", file=sys.stderr)
 
     def _beat(self) -> None:
         count = 0

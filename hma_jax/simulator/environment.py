@@ -60,30 +60,35 @@ class _Task:
         options: dict[str, Any],
     ):
         require((run is None) != (simulator is None), "an environment needs either `run` or `simulator`")
-        require("max_steps" not in options, "max_steps: the length of an episode is Gymnasium's max_episode_steps")
+        require(
+            "max_steps" not in options,
+            "max_steps is not an option: set the length of an episode with Gymnasium's max_episode_steps",
+        )
         told = ", ".join(options)
-        require(run is not None or not options, f"{told}: options of loading a `run`; a given simulator is as it is")
+        require(
+            run is not None or not options, f"{told}: only for loading a `run`; a given `simulator` is used unchanged"
+        )
         if simulator is None:
             _Task.loaded_in = _Task.loaded_in or os.getpid()
             require(
                 _Task.loaded_in == os.getpid(),
-                "this process was forked from one that had loaded a run, and JAX does not go on in it: leave "
-                "vectorization_mode out (make_vec then steps all episodes in one batch), or spawn processes",
+                "this process was forked from one that had loaded a run, and JAX does not work in forked processes: "
+                "leave out vectorization_mode (make_vec then steps all episodes in one batch), or spawn processes",
             )
             simulator = Simulator.load(run, episodes=episodes, **options)
         require(
             getattr(simulator, "rate", "model") == "model",
-            "an environment's steps, which `max_episode_steps` and judges count, are frames of the model, not native "
-            "actions: a simulator of rate='model' is needed",
+            "an environment needs a simulator of rate='model': its steps, which `max_episode_steps` counts, are "
+            "frames of the model, not native actions",
         )
-        require(len(simulator) == episodes, f"a simulator of {episodes} episodes is needed, not of {len(simulator)}")
+        require(len(simulator) == episodes, f"the simulator must have {episodes} episodes, but has {len(simulator)}")
         if starts is None:
             starts = getattr(simulator, "starts", ())
         names = [name for name in simulator.robots if any(s.robot == name for s in starts)]
         require(
             bool(names),
-            "there is no start to begin at: give `starts`, a run that has some beside it, or a `simulator` that has found "
-            "some (docs/simulator.md)",
+            "there are no starts, so no episode can begin: give `starts`, a run with starts beside it, or a "
+            "`simulator` that has starts (docs/simulator.md)",
         )
         robot = names[0] if robot is None else robot
         self.simulator, self.judge = simulator, judge
@@ -105,7 +110,7 @@ class _Task:
             drawn = int(rng.integers(len(self.starts)))
             number = (options or {}).get("start", drawn)
             usable = isinstance(number, (int, np.integer)) and 0 <= number < len(self.starts)
-            require(usable, f"there are {len(self.starts)} starts, counted from 0, no {number!r}")
+            require(usable, f"there are {len(self.starts)} starts, counted from 0; there is no start {number!r}")
             chosen.append(self.starts[number])
             seeds.append(int(rng.integers(2**32)))
         images = self.simulator.reset(chosen, seeds=seeds, episodes=episodes)

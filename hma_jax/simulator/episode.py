@@ -52,7 +52,7 @@ def begin_episode(
     between = len(start.images) - 1
     require(
         start.actions.shape == (between * robot.stride, robot.action_dim),
-        f"a start of {robot.name}: {between + 1} frames have {between} x {robot.stride} actions of "
+        f"a start of {robot.name} with {between + 1} frames needs {between} x {robot.stride} actions of "
         f"{robot.action_dim} values between them, got {start.actions.shape}",
     )
     seen = min(between + 1, capacity)

@@ -41,14 +41,14 @@ def find_tokenizer(directory: Path, run: Run, given: Path | None) -> BaseTokeniz
     found = [place for place in places if place.is_dir()]
     require(
         bool(found),
-        f"no tokenizer at {' or '.join(map(str, places))}; put the one there that {directory} was trained with, or name "
-        "it with --tokenizer where the command has that",
+        f"no tokenizer at {' or '.join(map(str, places))}; copy the tokenizer that {directory} was trained with "
+        "there, or give its directory with --tokenizer if the command has that option",
     )
     tokenizer, wanted = load_tokenizer(found[0]), run.provenance.get("tokenizer")
     require(
         wanted in (None, tokenizer.identity),
-        f"{directory} was trained on tokens of tokenizer {wanted}, but {found[0]} is {tokenizer.identity}; put the "
-        "other one there, or name it with --tokenizer where the command has that",
+        f"{directory} was trained on tokens of tokenizer {wanted}, but {found[0]} is {tokenizer.identity}; copy the "
+        "right one there, or give its directory with --tokenizer if the command has that option",
     )
     return tokenizer
 
@@ -76,7 +76,7 @@ def load_robots(path: Path) -> tuple[Robot, ...]:
     if not path.exists():
         return ()
     rows = _read(path)
-    require(isinstance(rows, list), f"{path} is no list of robots; make it again")
+    require(isinstance(rows, list), f"{path} is not a list of robots; make it again")
     return tuple(from_dict(Robot, row, f"{path}: robot {i}") for i, row in enumerate(rows))
 
 

@@ -40,7 +40,7 @@ def whole_numbers(what: str, values: Sequence[int]) -> list[int]:
     try:
         return [operator.index(value) for value in values]
     except TypeError as error:
-        raise ConfigError(f"{what}: whole numbers are needed, got {values!r}") from error
+        raise ConfigError(f"{what} must be whole numbers, got {values!r}") from error
 
 
 def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
@@ -58,7 +58,7 @@ def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
     """One for each of `count` episodes, where one is given for all. Raises ConfigError for what is none."""
     each = list(starts) if isinstance(starts, Sequence) and not isinstance(starts, str) else [starts] * count
     others = [start for start in each if not isinstance(start, Start)]
-    require(not others, f"an episode begins at a Start (the simulator's `starts` has some), not at {others[:1]}")
+    require(not others, f"an episode begins at a Start (see the simulator's `starts`), not at {others[:1]}")
     return each
 
 

@@ -47,12 +47,12 @@ class Robot:
         require(self.stride >= 1, f"robot {self.name!r}: stride must be at least 1, got {self.stride}")
         require(
             len(self.low) == len(self.high) == len(self.rest),
-            f"robot {self.name!r}: low, high and rest must be of one length",
+            f"robot {self.name!r}: low, high and rest must have the same length",
         )
         require(
             bool(np.isfinite([*self.low, *self.high, *self.rest]).all())
             and all(a <= b for a, b in zip(self.low, self.high, strict=True)),
-            f"robot {self.name!r}: the range of every action dimension must be finite, low to high",
+            f"robot {self.name!r}: the range low to high of every action dimension must be finite",
         )
         if not self.dimensions:
             object.__setattr__(self, "dimensions", tuple(f"action {i}" for i in range(self.action_dim)))
@@ -66,7 +66,7 @@ class Robot:
         )
         require(
             len(self.dimensions) == self.action_dim,
-            f"robot {self.name!r}: {self.action_dim} action values but {len(self.dimensions)} names of them",
+            f"robot {self.name!r}: {self.action_dim} action values but {len(self.dimensions)} names of dimensions",
         )
 
     @property
@@ -97,7 +97,8 @@ class Robot:
         shapes = (self.action_dim,), (self.stride, self.action_dim)
         require(
             action.shape in shapes,
-            f"{self.name}: an action is of shape {shapes[0]}, a frame's chunk of {shapes[1]}; got {action.shape}",
+            f"{self.name}: an action must have shape {shapes[0]}, or a frame's chunk of actions {shapes[1]}; got "
+            f"{action.shape}",
         )
         require(bool(np.isfinite(action).all()), f"{self.name}: the action is not finite: {action.tolist()}")
         return np.broadcast_to(action, shapes[1])
@@ -109,17 +110,18 @@ class Robot:
         beyond = ((actions < low) | (actions > high)).reshape(-1, self.action_dim).any(0)
         if outside == "refuse" and beyond.any():
             raise ConfigError(
-                f"{self.name}: {self.describe(beyond, actions)}; give actions in range, or have them clipped"
+                f"{self.name}: {self.describe(beyond, actions)}; give actions in this range, or let the simulator "
+                "clip them"
             )
         return np.clip(actions, low, high), beyond
 
     def describe(self, beyond: np.ndarray, actions: np.ndarray) -> str:
         """A message that says which of `actions` [..., A] are out of range, for dimensions `beyond` [A]."""
         values = actions.reshape(-1, self.action_dim)
-        known = "it was ever given" if self.recorded else "its statistics allow"
+        known = "it was trained on" if self.recorded else "its statistics allow"
         return "; ".join(
-            f"{self.dimensions[d]} of {values[:, d].min():g} to {values[:, d].max():g} is outside what {known}, "
-            f"{self.low[d]:g} to {self.high[d]:g}"
+            f"{self.dimensions[d]} of {values[:, d].min():g} to {values[:, d].max():g} is outside the range that "
+            f"{known}, {self.low[d]:g} to {self.high[d]:g}"
             for d in np.flatnonzero(beyond)
         )
 

@@ -65,14 +65,17 @@ class Simulator:
         config = model.config
         require_frames(model.run, "show")
         [episodes], [history] = whole_numbers("episodes", [episodes]), whole_numbers("history", [history])
-        require(episodes >= 1, f"a simulator has at least 1 episode, got {episodes}")
-        require(history >= 0, f"episodes keep 0 frames or more to be taken back by, got history={history}")
+        require(episodes >= 1, f"a simulator needs at least 1 episode, got {episodes}")
+        require(history >= 0, f"history, the number of frames that can be rewound, must not be negative, got {history}")
         require_choice(outside, get_args(Outside), "outside")
         require_choice(rate, get_args(Rate), "rate")
-        require(config.frames >= 3, f"a simulator needs a model of at least 3 frames, this one sees {config.frames}")
+        require(
+            config.frames >= 3,
+            f"a simulator needs a model with model.frames of at least 3, this one has {config.frames}",
+        )
         taken = config.tokens, config.diffusion.token_channels if config.diffusion else 0
         made = tokenizer.tokens, tokenizer.channels
-        require(taken == made, f"the model takes (tokens, channels) {taken} per frame, the tokenizer makes {made}")
+        require(taken == made, f"the model needs (tokens, channels) {taken} per frame, but the tokenizer makes {made}")
         self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
         self.update_robots(robots)
@@ -135,14 +138,14 @@ class Simulator:
             known = self.robot(robot.name)
             require(
                 (robot.action_dim, robot.stride) == (known.action_dim, known.stride),
-                f"{robot.name} is described with {robot.action_dim} action values and {robot.stride} actions per frame; "
-                f"the model knows it with {known.action_dim} and {known.stride}",
+                f"{robot.name} is described with {robot.action_dim} action values and {robot.stride} actions per "
+                f"frame, but the model was trained with {known.action_dim} and {known.stride}",
             )
         self.robots = {**self.robots, **{robot.name: robot for robot in robots}}
 
     def robot(self, name: str) -> Robot:
         """Raises ConfigError for one that the model does not know or that has no actions."""
-        require(name in self.robots, f"no robot {name!r} to drive; this model has {', '.join(self.robots)}")
+        require(name in self.robots, f"the model has no robot {name!r}; it has {', '.join(self.robots)}")
         return self.robots[name]
 
     # --- Beginning ---------------------------------------------------------------------------------
@@ -217,7 +220,10 @@ class Simulator:
                 continue
             robot = self._running_episode(b).robot
             native = self.rate == "native"
-            require(not native or np.ndim(action) == 1, f"at the native rate an action is [A], got {np.shape(action)}")
+            require(
+                not native or np.ndim(action) == 1,
+                f"at the native rate an action must have shape [A], got {np.shape(action)}",
+            )
             asked[b], beyond = robot.clip_to_range(robot.chunk(action), self.outside)
             if beyond.any():
                 clipped[b] = tuple(np.array(robot.dimensions)[beyond].tolist())
@@ -240,7 +246,9 @@ class Simulator:
     def _warn_once(self, robot: Robot, beyond: np.ndarray, actions: np.ndarray) -> None:
         if robot.name not in self._warned:
             self._warned.add(robot.name)
-            log.warning("%s: %s; clipped, here and from now on", robot.name, robot.describe(beyond, actions))
+            log.warning(
+                "%s: %s; such actions are clipped (this is said once)", robot.name, robot.describe(beyond, actions)
+            )
 
     def _advance(self, chunks: Mapping[int, np.ndarray]) -> np.ndarray:
         rows = padded(list(chunks), len(self))
@@ -275,7 +283,9 @@ class Simulator:
     def compile(self, together: int) -> None:
         """Compiles the program that advances so many episodes at once, ahead of its first use. From any thread: no
         episode changes."""
-        require(1 <= together <= len(self), f"1 to {len(self)} episodes advance at once, not {together}")
+        require(
+            1 <= together <= len(self), f"between 1 and {len(self)} episodes can be stepped together, got {together}"
+        )
         rows = np.array(padded(list(range(together)), len(self)), np.int32)
         chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
         blank = self._programs.empty(), rows, chunk_nU, np.zeros(len(rows), np.uint32)
@@ -302,7 +312,7 @@ class Simulator:
         """Episode b becomes a copy of episode sources[b], seed included: later differences are due to actions alone."""
         copied = whole_numbers("sources", sources)
         fits = len(copied) == len(self) and all(0 <= s < len(self) for s in copied)
-        require(fits, f"branches need {len(self)} episodes below {len(self)} to copy, got {copied}")
+        require(fits, f"branch needs {len(self)} numbers of episodes to copy, each below {len(self)}, got {copied}")
         rows = np.asarray(copied, np.int32)
         self._state, self._images = self._programs.take(self._state, rows), self._images[rows]
         self._episodes = [copy.deepcopy(self._episodes[s]) for s in copied]
@@ -315,7 +325,7 @@ class Simulator:
         with "streaming" the window is computed anew, which is nearer to exact than what had been there.
         """
         [frames] = whole_numbers("frames", [frames])
-        require(frames >= 0, f"an episode is taken back by 0 frames or more, got {frames}")
+        require(frames >= 0, f"the number of frames to rewind must not be negative, got {frames}")
         which = chosen_episodes(episodes, len(self))
         if not which:
             return self.images
@@ -323,7 +333,7 @@ class Simulator:
         new: dict[int, Episode] = {}
         for b in which:
             max_rewind = self.max_rewind(b)
-            require(frames <= max_rewind, f"episode {b} can be taken back by {max_rewind} frames, not by {frames}")
+            require(frames <= max_rewind, f"in episode {b} at most {max_rewind} frames can be rewound, got {frames}")
             new[b] = self._running_episode(b).rewound(frames)
         for i, b in enumerate(at.rows.tolist()):
             at.set_episode(i, new[b], np.stack(list(new[b].frames)[-min(new[b].count, self.capacity) :]))

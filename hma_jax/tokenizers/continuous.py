@@ -37,11 +37,11 @@ class ContinuousTokenizer(AutoencoderTokenizer):
 
         Raises ConfigError if `params` are not those that `config` declares, or if it is no scale.
         """
-        require(not config.quantise, "a tokenizer of latents needs tokenizer.quantise=false")
+        require(not config.quantise, "a tokenizer for latents needs tokenizer.quantise=false")
         require(
             math.isfinite(latent_std) and latent_std > 0,
-            f"the standard deviation of the latents must be positive, got {latent_std}; a tokenizer "
-            "whose latents do not vary has learnt nothing",
+            f"the standard deviation of the latents must be positive, got {latent_std}; the tokenizer's latents do "
+            "not vary, so it has learnt nothing",
         )
         self.latent_std = latent_std
         super().__init__(config, params, **placement)

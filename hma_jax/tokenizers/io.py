@@ -83,8 +83,8 @@ def load_tokenizer(
         raise ConfigError(f"{directory}: {error}; {ADVICE}") from error
     require(
         tokenizer.identity == description["identity"],
-        f"{directory / WEIGHTS} is not the file {DESCRIPTION} describes (identity "
-        f"{tokenizer.identity}, expected {description['identity']}); {ADVICE}",
+        f"{directory / WEIGHTS} is not the file that {DESCRIPTION} describes (identity {tokenizer.identity}, expected "
+        f"{description['identity']}); {ADVICE}",
     )
     return tokenizer
 
@@ -108,8 +108,8 @@ def _read_description(directory: Path) -> dict[str, Any]:
         description = json.loads(path.read_text())
     except FileNotFoundError:
         raise ConfigError(
-            f"no tokenizer at {directory} ({DESCRIPTION} is missing); train one with `hma tokenizer train` "
-            "or make one of published weights with `hma tokenizer import`"
+            f"no tokenizer at {directory} ({DESCRIPTION} is missing); train one with `hma tokenizer train` or make "
+            "one from published weights with `hma tokenizer import`"
         ) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); {ADVICE}") from error

@@ -20,7 +20,7 @@ class LfqTokenizer(AutoencoderTokenizer):
 
     def __init__(self, config: TokenizerConfig, params: Params, **placement: Any):
         """Raises ConfigError if `params` are not those that `config` declares."""
-        require(config.quantise, "a tokenizer of ids needs tokenizer.quantise=true")
+        require(config.quantise, "a tokenizer for ids needs tokenizer.quantise=true")
         super().__init__(config, params, **placement)
 
     def _from_latents(self, z: jax.Array) -> jax.Array:

@@ -60,7 +60,7 @@ class BaseTokenizer(abc.ABC):
 
         Raises ConfigError if `params` are not those that `config` declares, or for a `piece` without an image.
         """
-        require(piece is None or piece >= 1, f"a tokenizer takes pieces of at least 1 image, got {piece}")
+        require(piece is None or piece >= 1, f"a tokenizer must encode at least 1 image at a time, got {piece}")
         declared = self.declare(config)
         require_params(declared, params, "tokenizer weights do not fit their configuration")
         self.config = config
@@ -88,8 +88,8 @@ class BaseTokenizer(abc.ABC):
         height, width = self.image_shape
         require(
             height == width,
-            f"this tokenizer is for images of {height} x {width} pixels, square ones are needed here; "
-            "import it again with one image size",
+            f"this tokenizer is for images of {height} x {width} pixels, but square images are needed; import it "
+            "again with a single image size",
         )
         return height
 
@@ -174,8 +174,8 @@ class BaseTokenizer(abc.ABC):
         low, high = int(tokens.min(initial=0)), int(tokens.max(initial=0))
         require(
             low >= 0 and high < self.vocab_size,
-            f"token ids must lie in [0, {self.vocab_size}), got {low} to {high}; "
-            "is a mask id left, or were they made by another tokenizer?",
+            f"token ids must lie in [0, {self.vocab_size}), got {low} to {high}; do they contain a mask id, or were "
+            "they made by another tokenizer?",
         )
         return tokens.astype(np.int32)
 

@@ -27,7 +27,7 @@ def add_embodiments(
     the table has already.
     """
     known = [e.name for e in new if e.name in table.names]
-    require(not known, f"the model already knows {', '.join(known)}; go on training it instead of adding them")
+    require(not known, f"the model already knows {', '.join(known)}; do not add them, but train the model further")
     wider = EmbodimentTable((*table.entries, *new))
     declared = declare_model(model, wider)
 

@@ -67,7 +67,7 @@ class Checkpoints:
         try:
             json.dumps(meta)
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"what a run says of itself, its provenance too, has to be JSON: {error}") from error
+            raise ConfigError(f"the description of a run, including its provenance, must be JSON: {error}") from error
         self.directory = Path(directory).absolute()
         self.meta, self.keep, self.modernise, self.keep_steps = meta, keep, modernise, keep_steps
         try:
@@ -166,12 +166,12 @@ class Checkpoints:
         latest = self.latest_step
         reason = _reason(error)
         if latest is None:
-            again = "it starts again, there is no checkpoint yet"
+            again = "it starts from step 0, since there is no checkpoint yet"
         else:
-            again = f"it goes on from step {latest}, the last whole checkpoint"
+            again = f"it continues from step {latest}, the last complete checkpoint"
         return SaveError(
-            f"the checkpoint of step {step} could not be written to {self.directory}: {reason}. "
-            f"{self._space()}See that there is space and permission to write, then give the same command again: {again}"
+            f"the checkpoint of step {step} could not be written to {self.directory}: {reason}. {self._space()}Make "
+            f"sure that there is space and permission to write, then run the same command again: {again}"
         )
 
     def _space(self) -> str:
@@ -187,7 +187,7 @@ class Checkpoints:
             try:
                 orbax.close()
             except Exception as error:  # of the save that failed, which `wait` has raised already
-                log.debug("closing the checkpoints at %s: %s", self.directory, error)
+                log.debug("error when error when error when closing the checkpoints at %s: %s", self.directory, error)
 
     # --- Restoring ---------------------------------------------------------------------------
 
@@ -209,22 +209,22 @@ class Checkpoints:
                     self._move_damaged_away()
         step = self.agree_on_latest()
         if step is None:
-            raise CheckpointError(f"no checkpoint under {self.directory}")
+            raise CheckpointError(f"no checkpoint in {self.directory}")
         checkpoint = self.directory / str(step)
         saved = read_description(checkpoint)
         if saved.keys() != self.meta.keys():
             raise CheckpointError(
-                f"the checkpoint at {self.directory} (step {step}) is of another kind of run: it describes "
-                f"{', '.join(sorted(saved)) or 'nothing'}, not {', '.join(sorted(self.meta))}; use a new "
-                "output directory"
+                f"the checkpoint at {self.directory} (step {step}) belongs to another kind of run: it describes "
+                f"{', '.join(sorted(saved)) or 'nothing'}, not {', '.join(sorted(self.meta))}; use a new output "
+                "directory"
             )
         saved = self.modernise(saved)
         free = may_change(saved, step)
         changes = [line for line in diff(saved, self.meta) if line.split(":")[0] not in free]
         if changes:
             raise CheckpointError(
-                f"the checkpoint at {self.directory} (step {step}) was made by another "
-                "configuration; use a new output directory or restore these fields:\n  " + "\n  ".join(changes)
+                f"the checkpoint at {self.directory} (step {step}) was made with another configuration; use a new "
+                "output directory or restore these fields:\n  " + "\n  ".join(changes)
             )
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
         return step, type(shapes)(**load_items(checkpoint, wanted))
@@ -238,7 +238,7 @@ class Checkpoints:
             damaged.append((step, damage))
         else:
             raise CheckpointError(
-                f"no checkpoint under {self.directory} is whole; train again in a new output directory"
+                f"all checkpoints in {self.directory} are damaged; train again in a new output directory"
             )
         for step, damage in damaged:
             aside = self.directory.parent / "damaged" / str(step)

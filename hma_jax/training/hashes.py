@@ -57,9 +57,9 @@ def _rows(path: Path, text: str) -> Iterable[tuple[str, int, str]]:
         content: Any = json.loads(text)
         rows, stated = content["files"], content["sha256"]
     except (ValueError, KeyError, TypeError) as error:
-        raise Damaged(path, f"is no list of files ({error})") from error
+        raise Damaged(path, f"is not a list of files ({error})") from error
     if _hash_of(rows) != stated:
-        raise Damaged(path, "its contents do not match the hash that it states")
+        raise Damaged(path, "its contents do not match the hash in it")
     return rows
 
 
@@ -67,9 +67,9 @@ def _compare(path: Path, size: int, digest: str) -> None:
     try:
         found = path.stat().st_size
         if found != size:
-            raise Damaged(path, f"has {found} bytes, {size} were written")
+            raise Damaged(path, f"has {found} bytes, but {size} were written")
         if _sha256(path) != digest:
-            raise Damaged(path, "its contents are not those that were written (SHA-256 differs)")
+            raise Damaged(path, "its contents have changed since it was written (SHA-256 differs)")
     except OSError as error:
         raise Damaged(path, f"cannot be read ({error.strerror})") from error
 

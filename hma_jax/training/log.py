@@ -75,8 +75,8 @@ class RunLog:
         self.losses = [record["loss"] for record in kept]
         if len(kept) != start:
             raise ConfigError(
-                f"{run_dir / 'metrics.jsonl'} has {len(kept)} of the {start} steps of its "
-                "checkpoint; the run directory was edited: use a new one"
+                f"{run_dir / 'metrics.jsonl'} has only {len(kept)} of the {start} steps of the run's checkpoint, so "
+                "it was edited; train in a new run directory"
             )
         self._cut("timing.jsonl", start)
         self._cut("validation.jsonl", start)
@@ -172,8 +172,8 @@ class RunLog:
             yield
         except OSError as error:
             raise SaveError(
-                f"{self.run_dir / name} could not be written: {error.strerror}. See that there is space and "
-                "permission to write, then give the same command again: it goes on from the last checkpoint"
+                f"{self.run_dir / name} could not be written: {error.strerror}. Make sure that there is space and "
+                "permission to write, then run the same command again: it continues from the last checkpoint"
             ) from error
 
 

@@ -212,7 +212,7 @@ def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
     try:
         return next(batches)
     except StopIteration:
-        raise ConfigError(f"the batches end after step {done} of {steps}; give one for every step") from None
+        raise ConfigError(f"there are batches for only {done} of {steps} steps; give one for every step") from None
 
 
 def _report(log: RunLog | SilentLog, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
@@ -227,8 +227,8 @@ def _require_held(lock: Lock | None, run_dir: Path, step: int) -> None:
     """Raises SaveError unless `run_dir` is still the directory that this process locked."""
     if lock is not None and lock.lost():
         raise SaveError(
-            f"{run_dir} is no longer there, or another directory is in its place: nothing was saved at step {step}. "
-            "Put it back, with the checkpoints that it has, and give the same command again: it goes on from the last"
+            f"{run_dir} was removed or replaced, so nothing was saved at step {step}. Restore it with its "
+            "checkpoints, and run the same command again: it continues from the last one"
         )
 
 

@@ -79,9 +79,9 @@ def check_schedule(config: OptimizerConfig, steps: int) -> None:
     decay, share = decay_steps(config, steps), config.decay_fraction
     require(
         decay_fits(config, steps),
-        f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps}) and the "
-        f"decay of schedule wsd ({decay}: train.optimizer.decay_fraction={share:g} of all steps): "
-        "the rate would not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
+        f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps}) and "
+        f"the decay of schedule wsd ({decay}: train.optimizer.decay_fraction={share:g} of all steps): the learning "
+        "rate would not fall to final_fraction; change one of these three, or set train.optimizer.schedule=constant",
     )
 
 

@@ -47,8 +47,8 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
         listed = verify(checkpoint, lambda name: "/" not in name)
         if not listed:
             log.warning(
-                "%s has no list of its files (an earlier version wrote it, or its writer was stopped): "
-                "it is read without a check of their hashes",
+                "%s has no list of its files (it was written by an earlier version, or writing was interrupted): it "
+                "is read without checking their hashes",
                 checkpoint,
             )
         return ocp.checkpointables_metadata(checkpoint).custom_metadata or {}
@@ -102,8 +102,8 @@ def _reading(checkpoint: Path) -> Iterator[None]:
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise CheckpointError(
-            f"the checkpoint {checkpoint} cannot be read ({reason[:160]}); if its files are damaged, remove "
-            "this directory to go on from an earlier checkpoint"
+            f"the checkpoint {checkpoint} cannot be read ({reason[:160]}); if its files are damaged, remove this "
+            "directory to continue from an earlier checkpoint"
         ) from error
 
 
@@ -111,9 +111,9 @@ def _advice(checkpoint: Path) -> str:
     earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
     whole = [step for step in earlier if find_damage(checkpoint.parent / str(step)) is None]
     if not whole:
-        return "there is no whole checkpoint before it: train again in a new output directory"
+        return "there is no undamaged checkpoint before it: train again in a new output directory"
     return (
-        f"that of step {whole[-1]} is whole: to go on from there, train with --skip-damaged (in Python "
+        f"that of step {whole[-1]} is undamaged: to continue from there, train with --skip-damaged (in Python "
         "LoopOptions(skip_damaged=True)), or remove this directory"
     )
 

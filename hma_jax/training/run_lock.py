@@ -39,8 +39,8 @@ def require_plain(directory: Path) -> None:
     found = re.search(r"\[[^/]+\]", str(directory.absolute()))
     require(
         found is None,
-        f"{directory.absolute()}: no checkpoint can be kept under a path with {found and found[0]} in it, which Orbax "
-        "takes for a pattern; choose another directory",
+        f"{directory.absolute()}: a path with {found and found[0]} cannot hold checkpoints, because Orbax reads it as "
+        "a pattern; choose another directory",
     )
 
 
@@ -50,7 +50,7 @@ def locked_run(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
     Raises RunBusy naming the process that holds it already, and ConfigError if it cannot be written."""
     require(
         not is_address(run_dir),
-        f"a run directory must be one of a file system, got the address {run_dir}; mount the bucket, or choose a disk "
+        f"a run directory must be on a file system, got the address {run_dir}; mount the bucket, or choose a disk "
         "that all hosts share",
     )
     with ExitStack() as stack:

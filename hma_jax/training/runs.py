@@ -93,9 +93,9 @@ def require_frames(run: Run, deed: str) -> None:
     masking = run.train.masking
     require(
         masking.predicts_frames,
-        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are none "
-        f"to {deed}. `hma evaluate` judges its actions; for this take a model that was trained with one of "
-        f"{', '.join(PREDICT_FRAMES)}",
+        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames, so there "
+        f"are none to {deed}. Use a model that was trained with one of {', '.join(PREDICT_FRAMES)}; `hma evaluate` "
+        "can evaluate the predicted actions of this one",
     )
 
 
@@ -112,7 +112,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     steps = list_steps(directory)
     if not steps:
         found = "no finished checkpoint under" if directory.is_dir() else "no checkpoints at"
-        raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved one")
+        raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved a checkpoint")
     while True:
         try:
             return _read_run(run_dir, directory / str(steps[-1]), weights)
@@ -136,7 +136,7 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
     averaged = has_item(checkpoint, "ema")
     require(
         averaged or weights != "ema",
-        f"{run_dir} keeps no average of its weights (train.ema_decay is 0); take the last weights",
+        f"{run_dir} keeps no average of its weights (train.ema_decay is 0); use the last weights",
     )
     item = "ema" if averaged and weights != "last" else "params"
     device = jax.sharding.SingleDeviceSharding(default_device())

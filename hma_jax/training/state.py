@@ -57,7 +57,7 @@ def init_state(
     if params is None:
         params = declared.init(seed, layout and layout.params)
     else:
-        require_params(declared, params, "the parameters to start from are not those of the model")
+        require_params(declared, params, "the initial parameters do not fit the model")
         params = jax.tree.map(lambda x, like: place(np.array(x), like.sharding), params, shapes.params)
     leaves, treedef = jax.tree.flatten(shapes)
     step, opt_state = _jitted_zeros(treedef, tuple(leaves), table.size)()

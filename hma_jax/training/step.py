@@ -56,7 +56,7 @@ def make_train_step(
     trained_E = np.array([name in (config.only or table.names) for name in table.names])
     require(
         not set(config.only) - set(table.names),
-        f"train.only names {', '.join(config.only)}; the embodiments are {', '.join(table.names)}",
+        f"train.only names {', '.join(config.only)}, but the robots are {', '.join(table.names)}",
     )
     learning = [entry for entry, trained in zip(table.entries, trained_E, strict=True) if trained]
     check_targets(learning, masking)
@@ -141,8 +141,8 @@ def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
     predicted = "frames" if masking.predicts_frames else "actions"
     require(
         frames or actions,
-        f"train.masking.setting {masking.setting!r} predicts {predicted}, of which {robots[0].name} and all other robots "
-        "that are trained have none to learn from; choose another setting or other robots",
+        f"train.masking.setting {masking.setting!r} predicts {predicted}, but {robots[0].name} and all other robots "
+        "that are trained have none; choose another setting or other robots",
     )
 
 
@@ -151,9 +151,10 @@ def check_own(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
     shown = not masking.ignores_actions or masking.action_leak != "none"
     require(
         shown and any(robot.chunk for robot in robots),
-        f"train.only: nothing that {', '.join(robot.name for robot in robots)} alone has would be trained: all of it is of "
-        f"actions, and {'these robots have none' if shown else 'train.masking.setting passive shows none'}; leave train.only "
-        "out, which in hma adapt is --everything",
+        f"train.only: {', '.join(robot.name for robot in robots)} would have no parameters to train: a robot's own "
+        "parameters are all for actions, and "
+        f"{'these robots have none' if shown else 'train.masking.setting passive shows none'}; leave out train.only "
+        "(in hma adapt: add --everything)",
     )
 
 

@@ -126,7 +126,9 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
         numbers["tokens"] = "ids", model.vocab_size
     for name, (what, count) in numbers.items():
         low, high = int(np.min(batch[name])), int(np.max(batch[name]))
-        require(0 <= low and high < count, f"a batch has {what} from {low} to {high}, the model 0 to {count - 1}")
+        require(
+            0 <= low and high < count, f"a batch has {what} from {low} to {high}, but the model allows 0 to {count - 1}"
+        )
 
 
 @lru_cache(maxsize=4)

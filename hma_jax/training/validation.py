@@ -40,7 +40,7 @@ class Validation:
     batches: Callable[[], Iterable[Mapping[str, np.ndarray]]]
 
     def __post_init__(self):
-        require(self.every >= 1, f"a run is validated every step or more rarely, got {self.every}")
+        require(self.every >= 1, f"the number of steps between validations must be at least 1, got {self.every}")
 
 
 def make_validation_hook(
@@ -64,7 +64,7 @@ def make_validation_hook(
     def measure(state: TrainState) -> dict[str, float]:
         if not held:
             held.extend(_with_valid(batch) for batch in validation.batches())
-            require(bool(held), "there is no window to validate on; switch validation off")
+            require(bool(held), "there is no window to validate on; switch off validation")
         values = mean(state.params)
         if state.ema is not None:
             values |= {f"ema_{name}": value for name, value in mean(state.ema).items()}

@@ -25,7 +25,7 @@ ADVISED = [
 
 OTHERS = [
     "fewer than 4 frames in a row with both hands in them",
-    "/data/toy: the shard is missing. Fetch it again, or check the path.",
+    "/data/toy: the shard is missing. Download it again, or check the path.",
     "toy/0: 'action' is not finite at step 1: [0.0, nan].",
 ]
 

@@ -105,11 +105,11 @@ def test_one_episode_alone_is_refused_before_a_tokenizer_is_trained_on_it(tmp_pa
     monkeypatch.setattr(tokenizer_training, "train_tokenizer", lambda *_, **__: pytest.fail("it is trained"))
     rlds = write_rlds(tmp_path / "rlds", ARM, [12])
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
-    assert f"{ARM.name}: it has no val episode: of 1 none is held out, for which there must be at least two" in message
+    assert f"{ARM.name}: it has no val episode: of 1 none is held out: this needs at least two" in message
     rlds = write_rlds(tmp_path / "more", ARM, [12] * 7)
     none = ("--set", "store.val_fraction=0.01", "--set", "store.min_val=0")
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *none)
-    assert "of 7 none is held out" in message and "val_fraction=0.01, min_val=0 and max_val=200 say how many" in message
+    assert "of 7 none is held out" in message and "val_fraction=0.01, min_val=0 and max_val=200 set how many" in message
 
 
 # --- Data ------------------------------------------------------------------------------------
@@ -155,11 +155,11 @@ def empty(directory: Path) -> None:
 
 
 DAMAGE = {
-    "truncated shard": (truncate, ["{shard}", "corrupt record at byte", "truncated", "Fetch the file again"]),
+    "truncated shard": (truncate, ["{shard}", "corrupt record at byte", "truncated", "Download the file again"]),
     "bit of a length": (flip(3), ["{shard}", "byte 0", "checksum", "corrupt='skip'"]),
     "bit of a record": (flip(300), ["{shard}", "byte 0", "checksum of the record's data", "corrupt='skip'"]),
-    "missing shard": (lose_shard, ["00001-of-00002", "the shard is missing", "Fetch it again"]),
-    "empty shard": (empty_shard, ["{shard}", "0 records", "says 3", "Fetch the shard again"]),
+    "missing shard": (lose_shard, ["00001-of-00002", "the shard is missing", "Download it again"]),
+    "empty shard": (empty_shard, ["{shard}", "0 records", "says 3", "Download the shard again"]),
     "missing schema": (lose_schema, ["{dir}", "features.json", "Restore"]),
     "damaged metadata": (garble_info, ["{dir}", "dataset_info.json", "Restore"]),
     "empty directory": (empty, ["{dir}", "it holds nothing", "Give the directory that tfds wrote"]),
@@ -216,9 +216,9 @@ def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
     rlds = write_rlds(tmp_path, ARM, [12] * 40, change=spoil)
     skip = ("--set", "store.corrupt=skip", "--set", "store.min_val=8")  # some of those held out are whole
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
-    assert "17 episodes are unusable, more than max_skipped=16" in message
+    assert "17 episodes cannot be used, more than max_skipped=16" in message
     assert f"episode {bad[16]}" in message and "corrupt=" not in message
-    assert "If the rest is worth it, raise the limit: --set store.max_skipped=N." in message
+    assert "To use the others, raise the limit: --set store.max_skipped=N." in message
     allowed = ("--set", "store.max_skipped=22")
     arguments = map(str, ("tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip, *allowed))
     assert main(list(arguments)) == 0
@@ -268,7 +268,7 @@ def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
     assert main(["tokenize", *SMOKE, "--out", str(out), *data]) == 0
     said = capsys.readouterr().out
     assert f"{BASE.name}: 3 of 3 training episodes are too short for any window" in said
-    assert "it is not evaluated: 3 frames, the least there may be, need 6 native frames" in said
+    assert "it is not evaluated: a window has at least 3 frames, which at stride 2 need 6 native frames" in said
     assert f"1 of 2 datasets can be trained on; {BASE.name} has no training window" in said
     facts = json.loads((out / "data.json").read_text())
     assert facts[BASE.name] == {
@@ -292,14 +292,17 @@ def test_no_window_at_all(arm, tmp_path, refused):
     long = ("--set", "model.frames=8", "--set", "eval.prompt_frames=7")
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, *long)
     assert "no val episode is long enough for a window" in message and ARM.name in message
-    assert "8 frames, the least there may be, need 24 native frames" in message and "a shorter prompt" in message
+    assert (
+        "a window has at least 8 frames, which at stride 3 need 24 native frames" in message
+        and "a shorter prompt" in message
+    )
 
 
 def test_a_judged_dataset_without_windows_stops_the_study(study, refused):
     """Each point would say of two datasets what was made with one."""
     out, data = study
     message = refused(2, "study", *SMOKE, "--out", out, *data)
-    assert f"{BASE.name} is judged and has no held-out window: 3 frames, the least" in message
+    assert f"{BASE.name} is judged and has no held-out window: a window has at least 3 frames" in message
     assert f"{BASE.name} has no training window" in message and "Leave it out of the study" in message
     assert not list(out.glob("trials/*/result.json"))
 
@@ -472,7 +475,7 @@ def test_evaluation_with_a_prompt_that_fills_the_window(study, refused):
     out, data = study
     settings = ("--set", "model.frames=5", "--set", "eval.prompt_frames=4")
     message = refused(2, "evaluate", out / "model", *SMOKE, "--out", out, *data, *settings, "--replace")
-    assert "eval.prompt_frames 4 leaves nothing to predict in a window of 4 frames" in message
+    assert "eval.prompt_frames 4 leaves no frame to predict in a window of 4 frames" in message
 
 
 CHECKPOINT_FILES = ("_CHECKPOINT_METADATA", "_METADATA", "manifest.ocdbt", "array_metadatas/process_0")
@@ -488,7 +491,7 @@ def test_damaged_checkpoint(command, name, study, tmp_path, refused):
     run_argument = (run,) if command == "evaluate" else ("--run", run)
     message = refused(2, command, *run_argument, *SMOKE, "--out", out, *data)
     assert f"{run / 'checkpoints' / '3'} is damaged: " in message and name in message
-    assert "that of step 2 is whole: to go on from there, train with --skip-damaged" in message
+    assert "that of step 2 is undamaged: to continue from there, train with --skip-damaged" in message
 
 
 def test_training_goes_on_before_the_damage_when_told_to(study, tmp_path, refused):
@@ -546,7 +549,7 @@ def test_background_readers_of_a_damaged_checkpoint_stay_silent(study, tmp_path)
         file.write_bytes(file.read_bytes()[:-30])
     code, said = hma("evaluate", run, *SMOKE, "--out", out, *data)
     remark, error = said.splitlines()
-    assert code == 2 and error.startswith("error: the checkpoint") and "without a check of their hashes" in remark
+    assert code == 2 and error.startswith("error: the checkpoint") and "without checking their hashes" in remark
 
 
 def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch):

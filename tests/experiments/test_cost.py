@@ -152,7 +152,7 @@ def test_a_mesh_that_a_trial_does_not_divide_over_is_refused_before_it_is_priced
     monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", ("0", "1", "2")))
     for command in ("train", "study"):
         assert main([command, "--preset", "smoke", "--dry-run"]) == 2
-        assert "a batch of 4 does not divide over data=3 x fsdp=1 devices" in capsys.readouterr().err
+        assert "a batch of 4 cannot be divided over data=3 x fsdp=1 devices" in capsys.readouterr().err
         assert main([command, "--preset", "smoke", "--dry-run", "--mesh", "1", "1", "3"]) == 2
         assert "tensor=3 does not divide the model's heads of 2" in capsys.readouterr().err
 
@@ -184,7 +184,7 @@ def test_robots_without_actions_that_are_to_be_trained_alone_are_refused_before_
     video, one = "gripper_sky", ["--set", "designs.shots_after=1", "--set", "designs.judged=1"]
     fewshot = ["sweep", "fewshot", *one, "--set", f"unseen={video},omni_mint"]
     only = ["--set", f"datasets={video},picker_sand,arm_sky", "--set", f"train.only={video}"]
-    nothing = f"train.only: nothing that {video} alone has would be trained"
+    nothing = f"train.only: {video} would have no parameters to train"
     for command, words in (
         (fewshot, f"{video}: no model can be adapted to robots without actions"),
         (["study", *only], nothing),

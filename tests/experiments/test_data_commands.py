@@ -77,7 +77,7 @@ def test_pictures_that_are_no_cameras_are_told(tmp_path, capsys):
     info["features"]["observation.images.ir"] = {"dtype": "image", "shape": [8, 8, 1]}
     (root / "meta/info.json").write_text(json.dumps(info))
     assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0
-    assert "left out: observation/ir; docs/own_data.md says what is a camera" in said(capsys)
+    assert "not used as cameras: observation/ir; docs/own_data.md says what is a camera" in said(capsys)
 
 
 def test_who_meets_a_damaged_file_is_told_what_this_command_has(tmp_path, capsys):
@@ -87,22 +87,22 @@ def test_who_meets_a_damaged_file_is_told_what_this_command_has(tmp_path, capsys
     command = ["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]
     assert main(command) == 1
     error = capsys.readouterr().err
-    assert f"error: {video}: no readable video" in error and "--set" not in error and "corrupt=" not in error
-    assert error.endswith(". Fetch the file again, or add --skip-damaged to leave it out.\n")
+    assert f"error: {video}: not a readable video" in error and "--set" not in error and "corrupt=" not in error
+    assert error.endswith(". Download the file again, or add --skip-damaged to leave it out.\n")
     assert main([*command, "--skip-damaged"]) == 0
     out = said(capsys)
-    assert f"left out 1 x: {video}: no readable video" in out and "--skip-damaged" not in out
+    assert f"left out 1 x: {video}: not a readable video" in out and "--skip-damaged" not in out
     next(root.rglob("episode_000000.mp4")).write_bytes(b"no video")
     assert main([*command, "--skip-damaged", "--name", "none"]) == 1
     error = capsys.readouterr().err
-    assert "error: LeRobot dataset arm (v2.1), 10 Hz: no episode can be made of it: 1 x " in error
+    assert "error: LeRobot dataset arm (v2.1), 10 Hz: no episode can be made from it: 1 x " in error
     assert error.endswith(").\n") and ".;" not in error and ".:" not in error
 
 
 @pytest.mark.parametrize(
     "arguments, code, message",
     [
-        (["convert", "robomimic", "{there}/no.hdf5", "--out", "{there}"], 1, "no readable HDF5 file"),
+        (["convert", "robomimic", "{there}/no.hdf5", "--out", "{there}"], 1, "not a readable HDF5 file"),
         (["convert", "lerobot", "{there}", "--out", "{there}"], 1, "give the root of a LeRobot dataset"),
         (
             ["convert", "ego4d", "{there}/a.json", "--videos", "{there}", "--out", "{there}"],

@@ -31,9 +31,9 @@ def test_lerobot_and_robomimic_go_from_inspection_and_view_to_tokens(tmp_path, c
     entries.write_text(text.replace("hz = 20.0", "hz = 4.0"))
     page = tmp_path / "page.html"
     assert main(["data", "view", *data, "--registry", str(entries), "--out", str(page)]) == 0 and page.is_file()
-    assert "robomimic_lift: another rate: its files say 20 Hz; 4 Hz are taken" in capsys.readouterr().out
+    assert "robomimic_lift: another rate: its files say 20 Hz, but 4 Hz are used" in capsys.readouterr().out
     assert main(["data", "inspect", data[1], "--registry", str(entries), *sheets]) == 0
-    assert "rate 4 Hz (registry), though its files say 20: stride 2" in capsys.readouterr().out
+    assert "rate 4 Hz (registry), although its files say 20: stride 2" in capsys.readouterr().out
     common = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--registry", str(entries), "--data", *data]
     assert main(["tokenize", *common, "--set", "model.frames=4"]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]

@@ -39,7 +39,7 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("model.diffusion.width=4", "model.diffusion is null in this study"),
         ("trajectory_counts=8,4", "must increase"),
         ("train.optimizer.schedule=linear", "train.optimizer.schedule: 'linear'.*constant, cosine, wsd"),
-        ("store.max_skipped=1.5", "store.max_skipped must be a whole number of episodes or, below 1, a share"),
+        ("store.max_skipped=1.5", "store.max_skipped must be a whole number of episodes or, below 1, a fraction"),
         ("train.action_scale=best", "train.action_scale: 'best'.*deviation, quantiles"),
         ("store.corrupt=ignore", "store.corrupt: 'ignore'.*raise, skip"),
         ("model.frames=null", "model.frames: expected int, got None"),
@@ -58,7 +58,7 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("designs.rate_factors=2,1", "designs.rate_factors must increase and be positive"),
         ("widths=a,b", "not a number"),
         # What training would refuse, once data and tokenizer are made.
-        ("train.masking.setting=full", "has nothing to predict them with; set model.action_heads=true"),
+        ("train.masking.setting=full", "has no action heads; set model.action_heads=true"),
         ("execution.accumulate=3", "train.batch 4 is not a multiple of execution.accumulate 3"),
     ],
 )

@@ -102,7 +102,7 @@ def test_inspection_of_episodes_without_a_window_leads_to_every_frame(robot, tmp
     said = " ".join(capsys.readouterr().out.split())
     assert "about 0 windows" in said and "hma tokenize" not in said
     assert f"next: hma data view {robot} --stride 1 --registry {tmp_path}/my.toml" in said
-    assert "no episode that was read has the 40 steps that the shortest window takes at stride 20" in said
+    assert "the shortest window at stride 20 needs 40 steps, the longest episode that was read has" in said
 
 
 def test_inspection_says_that_nothing_is_a_camera_and_not_that_the_rate_is_missing(robot, tmp_path, capsys):
@@ -129,7 +129,7 @@ def test_a_single_episode_does_not_lead_to_a_command_that_refuses_it(tmp_path, c
     viewed = ["data", "view", str(one), "--registry", entries, "--out", str(tmp_path / "view.html")]
     assert main(viewed) == 0
     for said in (inspected, capsys.readouterr().out):
-        assert said.splitlines()[-1].startswith("next: name another dataset beside it")
+        assert said.splitlines()[-1].startswith("next: add another dataset")
 
 
 def test_inspection_of_short_episodes_suggests_a_prompt_that_leaves_a_frame_to_judge(robot, tmp_path, capsys):
@@ -137,7 +137,7 @@ def test_inspection_of_short_episodes_suggests_a_prompt_that_leaves_a_frame_to_j
     arguments = ["--hz", "10", "--entry", str(tmp_path / "my.toml"), "--out", str(tmp_path)]
     assert main(["data", "inspect", str(robot), *arguments]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "a whole window of 12 frames takes 60 steps, the shortest 10" in said
+    assert "a full window of 12 frames needs 60 steps, the shortest window 10" in said
     assert "next: hma tokenize" in said and said.endswith("--set eval.prompt_frames=2")
 
 
@@ -146,7 +146,7 @@ def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsy
     arguments = [str(REAL_DATA), "--out", str(tmp_path), "--json", str(json_file)]
     assert main(["data", "inspect", *arguments]) == 0
     said = capsys.readouterr().out
-    assert "rate 5 Hz (registry): stride 3" in said and "as its contents suggest" in said
+    assert "rate 5 Hz (registry): stride 3" in said and "this agrees with its contents" in said
     facts = json.loads(json_file.read_text())
     assert facts["episodes"] == 3 and len(facts["actions"][0]["dimensions"]) == 7
 
@@ -180,7 +180,7 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
         (["{robot}", "--hz", "nan"], 2, "--hz must be positive and finite, got nan"),
         (["{robot}", "--frames", "0"], 2, "--frames must be at least 2, got 0"),
         (["{robot}", "--episodes", "0"], 2, "--episodes must be at least 1, got 0"),
-        (["{robot}", "--split", "test"], 2, "splits there: train. Choose with --split"),
+        (["{robot}", "--split", "test"], 2, "it has train. Choose one with --split"),
         (["{robot}/none"], 1, "no such directory"),
         (["{robot}", "--registry", "none.toml"], 2, "none.toml: the registry file cannot be read"),
     ],
@@ -200,7 +200,7 @@ def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path, capsys
     text = file.read_text()
     assert text.count('["my_robot"]') == 1 and "hz = 5.0" in text and "hz = 4" not in text
     assert text.startswith("# what the lab has\n")
-    assert "in place of the entry of my_robot that was there; changed: hz: 4.0 -> 5.0\n" in capsys.readouterr().out
+    assert "this replaced the file's entry of my_robot (old -> new): hz: 4.0 -> 5.0\n" in capsys.readouterr().out
 
 
 def test_entries_written_at_the_same_moment_are_both_kept(tmp_path, monkeypatch):

@@ -60,4 +60,4 @@ def test_a_group_that_there_is_not_is_an_error(capsys):
     assert main(["study", "--preset", "smoke", "--set", "modle.help"]) == 2
     assert "--set modle.help: no such setting; a study has name, model.*" in capsys.readouterr().err
     assert main(["study", "--preset", "smoke", "--set", "hlep"]) == 2
-    assert "--set help shows what there is" in capsys.readouterr().err
+    assert "--set help lists all settings" in capsys.readouterr().err

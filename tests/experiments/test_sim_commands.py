@@ -49,12 +49,12 @@ def test_what_is_there_is_not_replaced(tmp_path, monkeypatch, capsys):
     assert "pusht/1.0.0: episodes: 3 -> 4; size: 16 -> 64; seed: 0 -> 1. Nothing was changed" in said
     monkeypatch.setattr(generate, "GENERATOR_VERSION", generate.GENERATOR_VERSION + 1)
     assert sim() == 0
-    assert "pusht in" in (said := capsys.readouterr().out) and "made by other versions of simulators" in said
+    assert "pusht in" in (said := capsys.readouterr().out) and "made by other versions of the simulators" in said
     assert not workers.made and shards == {p: p.read_bytes() for p in shards}
 
     (tmp_path / "pusht" / "1.0.0" / "metadata.json").unlink()
     assert sim() == 2
-    assert "it says nothing of what it was made from" in " ".join(capsys.readouterr().err.split())
+    assert "it does not say how it was made" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

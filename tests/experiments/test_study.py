@@ -115,7 +115,7 @@ def test_model_that_takes_other_tokens_is_told_what_to_set(preset, setting, mess
     [
         ("smoke", "eval.decode.top_k=99", "decode.top_k 99 exceeds the"),
         ("smoke-continuous", "eval.decode.order=confidence", "needs probabilities"),
-        ("smoke-continuous", "model.diffusion.steps=2", "decode.sampler.steps 3 exceeds the model.diffusion.steps 2"),
+        ("smoke-continuous", "model.diffusion.steps=2", "decode.sampler.steps 3 is more than model.diffusion.steps 2"),
     ],
 )
 def test_a_decoding_that_every_trained_trial_would_fail_at_is_refused(preset, setting, message):

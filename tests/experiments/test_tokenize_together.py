@@ -93,7 +93,7 @@ def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does
         holder.close()
         assert joined.result(60) == 0
     assert made(tmp_path) == whole
-    assert "taking part: process" in capsys.readouterr().out
+    assert "sharing the work with process" in capsys.readouterr().out
 
 
 def test_who_joins_leaves_the_windows_to_a_living_holder_that_has_frozen_them(data, tokenizer, tmp_path):
@@ -113,7 +113,7 @@ def test_who_joins_needs_a_tokenizer_and_replaces_nothing(data, tokenizer, tmp_p
         assert "no tokenizer yet, and another command is at work" in message
         assert f"hma tokenizer train --preset smoke --out {tmp_path} --data {data[1]} {data[2]}" in message
         assert main([*arguments, *tokenizer, "--replace", "tokens"]) == 2
-        assert "--replace needs the directory for itself" in capsys.readouterr().err
+        assert "with --replace no other command may use the directory" in capsys.readouterr().err
     assert not (tmp_path / "tokens").exists()
 
 
@@ -153,7 +153,7 @@ def test_store_of_an_older_format_is_made_again_when_asked_for(data, tmp_path, c
     capsys.readouterr()
     assert main(arguments) == 2
     said = capsys.readouterr().err
-    assert "manifest format 1; this reads 2" in said and "--replace tokens" in said
+    assert "manifest format 1, but only 2 can be read" in said and "--replace tokens" in said
     assert main([*arguments, "--replace", "tokens"]) == 0
     assert contents(tmp_path / "tokens") == before
 
@@ -178,7 +178,7 @@ def test_of_many_losses_some_are_named(tmp_path, capsys):
     assert len(told) == MAX_LISTED + 1 and told[-1].startswith(f"lost {ARM.name}: 18 more, see ")
     assert main(["data", "inspect", str(rlds), "--hz", "5", "--out", str(tmp_path / "sheet")]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("damaged ")]
-    assert len(told) == 7 and told[-1] == "damaged 18 more episode(s): --json FILE names all"
+    assert len(told) == 7 and told[-1] == "damaged 18 more episode(s): --json FILE lists all"
 
 
 def test_time_left_does_not_count_what_was_there_before():

@@ -93,7 +93,7 @@ def test_page_is_one_file_with_clips_curves_and_statistics(toy, tmp_path, capsys
     for heading in ("histogram", "mean", "deviation", "1%", "5%", "50%", "95%", "99%", "min", "max"):
         assert f"<th>{heading}</th>" in text or f"<th class=text>{heading}</th>" in text
     assert 'name="viewport"' in text and "overflow-x: auto" in text
-    assert "toy: nothing stands out" in said and f"wrote {out}" in said
+    assert "toy: no issues found" in said and f"wrote {out}" in said
     (command,) = re.findall(r"next: (hma tokenize .*)", said)
     assert "--set model.frames=4" in command and "--registry" in command and str(directory) in command
 
@@ -103,10 +103,11 @@ def test_a_dataset_without_windows_gets_a_command_that_finds_some(toy, tmp_path,
     arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]
     assert main([*arguments, "--stride", "16"]) == 0
     said = capsys.readouterr().out
-    assert "toy: no window: the shortest window at stride 16 takes 32 steps; the longest of 4 episodes has 31" in said
+    assert "toy: no window: the shortest window at stride 16 needs 32 steps; the longest of 4 episodes has 31" in said
     assert "hma tokenize" not in said
     assert re.search(
-        r"next for toy: hma data view \S+ --stride 1 --registry \S+  \(no episode .* has the 32 steps", said
+        r"next for toy: hma data view \S+ --stride 1 --registry \S+  \(the shortest window at stride 16 needs 32 steps",
+        said,
     )
     assert main([*arguments, "--stride", "1"]) == 0
     (command,) = re.findall(r"next: (hma tokenize .*)", capsys.readouterr().out)
@@ -121,7 +122,7 @@ def test_a_rate_of_its_own_is_not_overruled(toy, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "next: hma tokenize" in said and "rate=" not in said
     assert main([*arguments, "--stride", "2"]) == 0
-    assert "its entry has a rate of its own, 1 Hz: a study takes it at stride 4" in capsys.readouterr().out
+    assert "its entry sets rate = 1 Hz, so a study reads it at stride 4" in capsys.readouterr().out
 
 
 def test_several_datasets_share_a_page_and_only_those_with_windows_go_on(toy, tmp_path, capsys):
@@ -188,7 +189,7 @@ def test_what_was_not_read_is_not_said_to_be_free_of_duplicates(toy, tmp_path, c
         assert main(["data", "view", str(directory), *options]) == 0
         said[episodes] = capsys.readouterr().out, out.read_text()
     terminal, page = said["3"]
-    assert "toy: 3 of 4 episodes were read (--episodes); recordings that occur twice are found among these" in terminal
+    assert "toy: 3 of 4 episodes were read (--episodes); duplicate recordings are searched only among these" in terminal
     assert "Recordings that occur twice are found among the episodes that were read alone." in page
     assert not any("occur twice" in text for text in said["4"])
 

@@ -108,9 +108,9 @@ def test_a_run_goes_on_from_before_the_damage_when_told_to_and_ends_as_if_nothin
 def test_a_run_without_a_whole_checkpoint_is_not_started_again_in_silence(run_dir: Path):
     for step in ("4", "6"):
         flip(run_dir / "checkpoints" / step / "step" / "_METADATA")
-    with pytest.raises(CheckpointError, match="no whole checkpoint before it: train again in a new output"):
+    with pytest.raises(CheckpointError, match="no undamaged checkpoint before it: train again in a new output"):
         fit_toy(run_dir, 8)
-    with pytest.raises(CheckpointError, match="no checkpoint under .* is whole"):
+    with pytest.raises(CheckpointError, match="all checkpoints in .* are damaged"):
         fit_toy(run_dir, 8, options=SKIP)
     assert list_steps(run_dir / "checkpoints") == [4, 6]
 
@@ -120,7 +120,7 @@ def test_a_checkpoint_without_a_list_is_read_with_a_remark(run_dir: Path, caplog
     (run_dir / "checkpoints" / "6" / NAME).unlink()
     with caplog.at_level(logging.WARNING):
         assert fit_toy(run_dir, 8).resumed_from == 6
-    assert "without a check of their hashes" in caplog.text
+    assert "without checking their hashes" in caplog.text
 
 
 def test_the_list_is_whole_or_absent(tmp_path: Path):
@@ -168,13 +168,13 @@ def test_a_save_that_fails_in_the_background_is_one_message_and_keeps_the_last(t
             checkpoints.save(2, toy_state())
             while checkpoints._pending is not None:
                 checkpoints.raise_failure()  # noticed while training goes on, not at the next save only
-    assert "give the same command again: it goes on from step" in str(refused.value)
+    assert "run the same command again: it continues from step" in str(refused.value)
     assert list_steps(tmp_path)[0] == 1
 
 
 def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path):
     """Runs in such directories ended well, and no checkpoint of theirs could be read."""
-    with pytest.raises(ConfigError, match=r"no checkpoint can be kept under a path with \[2\] in it.*choose another"):
+    with pytest.raises(ConfigError, match=r"a path with \[2\] cannot hold checkpoints.*choose another"):
         fit_toy(tmp_path / "a [2]" / "run", 4, options=EVERY_TWO)
     assert not (tmp_path / "a [2]" / "run" / "checkpoints").exists()
     fit_toy(tmp_path / "what? a[*b" / "run", 4, options=EVERY_TWO)

@@ -62,11 +62,11 @@ def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monke
     [
         (None, DecodeConfig(top_k=9), "decode.top_k 9 exceeds the 8 entries"),
         (DIFFUSION, DecodeConfig(order="confidence"), "'confidence' needs probabilities"),
-        (DIFFUSION, DecodeConfig(top_k=3), "top_k draws among the entries of a factor"),
+        (DIFFUSION, DecodeConfig(top_k=3), "top_k works only for models on ids"),
         (
             DIFFUSION,
             DecodeConfig(sampler=SamplerConfig(steps=21)),
-            "sampler.steps 21 exceeds the model.diffusion.steps 20",
+            "sampler.steps 21 is more than model.diffusion.steps 20",
         ),
     ],
 )

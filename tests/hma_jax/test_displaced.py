@@ -76,7 +76,7 @@ def test_the_past_alone_is_displaced(monkeypatch):
 
 
 def test_it_needs_a_past_that_is_shown_and_square_frames():
-    with pytest.raises(ConfigError, match="displaced_past changes frames of the past .*teacher_forcing"):
+    with pytest.raises(ConfigError, match="displaced_past needs masking.teacher_forcing=true"):
         MaskingConfig(displaced_past=0.5)
-    with pytest.raises(ConfigError, match="displaced_past .* 8 tokens are no square"):
+    with pytest.raises(ConfigError, match="displaced_past .* 8 is not a square number"):
         check_objective(shallow_config(tokens=8), DISPLACED)

@@ -366,8 +366,8 @@ def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignmen
 @pytest.mark.parametrize(
     ("prompt", "actions", "robots", "message"),
     [
-        ((1, 2), (1, 1, 2), 1, "chunks for more frames than these, got 2"),
-        ((1, 0), (1, 1, 4), 1, "needs 1 prompt frame or more, got 0"),
+        ((1, 2), (1, 1, 2), 1, "action chunks for more frames than the prompt has, got 2"),
+        ((1, 0), (1, 1, 4), 1, "needs at least 1 prompt frame, got 0"),
         ((1, 2), (1, 4), 1, r"a prompt \[B, T', 9\], actions \[B, R, T, 14\] .*; got \(1, 2, 9\), \(1, 4, 14\), "),
         ((1, 2), (1, 1, 4), 2, r"takes a prompt .*; got \(1, 2, 9\), \(1, 1, 4, 14\), \(2,\), \(1,\)$"),
     ],

@@ -41,7 +41,7 @@ def test_a_death_inside_a_save_falls_back_to_the_checkpoint_before(options, tmp_
     whole = fit_toy(tmp_path / "whole", 8, options=options)
     run, checkpoints = tmp_path / "run", tmp_path / "run" / "checkpoints"
     dies_in_save(6)
-    with pytest.raises(SaveError, match="step 6 could not be written .* it goes on from step 4, the last whole"):
+    with pytest.raises(SaveError, match="step 6 could not be written .* it continues from step 4, the last complete"):
         fit_toy(run, 8, options=options)
     assert list_steps(checkpoints)[-1] == 4 and find_damage(checkpoints / "4") is None
     assert [p.name for p in checkpoints.iterdir() if not p.name.isdigit()], "nothing was left half-written"
@@ -83,7 +83,7 @@ def test_a_directory_that_vanishes_keeps_what_it_had_and_is_not_made_anew(tmp_pa
             time.sleep(0.2)  # that file's directory is synchronised after it
             run.rename(elsewhere)
 
-    with pytest.raises(SaveError, match=f"{run} is no longer there, .* nothing was saved at step 4. Put it back"):
+    with pytest.raises(SaveError, match=f"{run} was removed or replaced, so nothing was saved at step 4. Restore it"):
         fit_toy(run, 8, options=EVERY_TWO, progress=vanish)
     assert not run.exists() and list_steps(elsewhere / "checkpoints") == [2]
     shutil.move(elsewhere, run)

@@ -156,7 +156,7 @@ class SlowToCompile:
 
 
 def test_batches_that_end_too_soon_and_options_that_cannot_work_are_told_in_words(tmp_path: Path):
-    with pytest.raises(ConfigError, match="the batches end after step 3 of 6; give one for every step"):
+    with pytest.raises(ConfigError, match="there are batches for only 3 of 6 steps; give one for every step"):
         fit_toy(tmp_path, 6, make=lambda start: itertools.islice(toy_batches(start), 3))
     for name in ("log_every", "keep_checkpoints"):
         with pytest.raises(ConfigError, match=rf"LoopOptions\.{name} must be at least 1, got 0"):

@@ -169,13 +169,13 @@ def test_tokens_that_change_may_count_more():
     np.testing.assert_allclose(found(3.0), 3 * np.array(moving) + standing, rtol=1e-5)
     with pytest.raises(ConfigError, match="masking.change_weight must be positive, got 0"):
         MaskingConfig(change_weight=0)
-    with pytest.raises(ConfigError, match="tokens that are predicted, and 'policy' predicts none"):
+    with pytest.raises(ConfigError, match="predicted tokens, but setting 'policy' predicts no frames"):
         MaskingConfig(setting="policy", change_weight=2.0)
 
 
 def test_weights_of_change_are_of_ids():
     config, train = shallow_config(diffusion=DIFFUSION), train_config(masking=MaskingConfig(change_weight=2.0))
-    with pytest.raises(ConfigError, match="change_weight tells ids that changed; of continuous tokens all change"):
+    with pytest.raises(ConfigError, match="change_weight works only for models on ids: latents change everywhere"):
         make_train_step(declare_model(config, TABLE), TABLE, config, train)
 
 
@@ -183,7 +183,7 @@ def test_weights_of_change_are_of_ids():
 def test_a_window_of_one_frame_has_none_to_predict(setting: str):
     config, declared = shallow_config(frames=1), declare_model(shallow_config(frames=1), TABLE)
     with pytest.raises(
-        ConfigError, match=f"'{setting}' predicts frames from earlier ones, and model.frames 1 leaves none"
+        ConfigError, match=f"'{setting}' predicts frames from earlier ones, so with model.frames 1 there is none"
     ):
         make_train_step(declared, TABLE, config, train_config(masking=MaskingConfig(setting=setting)))
     make_train_step(declared, TABLE, config, train_config(masking=MaskingConfig(setting="policy")))
@@ -312,7 +312,7 @@ def test_robots_that_have_nothing_to_train_alone_are_refused(setting: str, only:
     """Training ended well, and had moved no parameter."""
     config, masking = shallow_config(), MaskingConfig(setting=setting)
     declared = declare_model(config, MIXED)
-    with pytest.raises(ConfigError, match=f"nothing that {only} alone has would be trained: .*{why}"):
+    with pytest.raises(ConfigError, match=f"train.only: {only} would have no parameters to train: .*{why}"):
         make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only,)))
     make_train_step(declared, MIXED, config, train_config(masking=masking))
     if setting == "forward":

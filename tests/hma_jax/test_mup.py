@@ -153,8 +153,8 @@ def test_findings_name_what_grows_fades_and_overflows():
     assert slopes(rows)["growing"] == pytest.approx((1, 1))
     assert check_coordinates(rows) == [
         "growing: grows as width^1.00",
-        "growing: its change by training goes as width^1.00",
-        "fading: its change by training goes as width^-0.50",
+        "growing: its change in training grows as width^1.00",
+        "fading: its change in training grows as width^-0.50",
         "overflowing: zero or not finite at some width",
     ]
     with pytest.raises(ConfigError, match="at least two widths"):

@@ -93,11 +93,11 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
 
 
 def test_it_needs_a_past_that_is_shown():
-    with pytest.raises(ConfigError, match="own_past replaces frames of the past .*teacher_forcing"):
+    with pytest.raises(ConfigError, match="own_past needs masking.teacher_forcing=true"):
         MaskingConfig(own_past=0.5)
     with pytest.raises(ConfigError, match="own_past_rounds must be at least 1, got 0"):
         MaskingConfig(own_past_rounds=0)
-    with pytest.raises(ConfigError, match="own_past_rounds 3 draws what masking.own_past asks for, which is 0"):
+    with pytest.raises(ConfigError, match="own_past_rounds 3 has no effect while masking.own_past is 0"):
         MaskingConfig(teacher_forcing=True, own_past_rounds=3)
 
 

@@ -125,8 +125,8 @@ def test_a_configuration_of_any_kind_comes_back_from_json():
         (lambda: replace(MAGVIT2_SMALL, image_size=17), "magvit2.image_size 17 is not a multiple of 2"),
         (lambda: replace(MAGVIT2_SMALL, image_size=(16, 17)), r"image_size \(16, 17\) is not a multiple of 2"),
         (lambda: replace(VAE_SMALL, image_size=18), "svd-vae.image_size 18 is not a multiple of 4"),
-        (lambda: replace(MAGVIT2_SMALL, groups=3), "4 channels does not split into 3 groups"),
-        (lambda: replace(MAGVIT2_SMALL, bits=5), "bits 5 do not split into 2"),
+        (lambda: replace(MAGVIT2_SMALL, groups=3), "4 channels cannot be split into 3 groups"),
+        (lambda: replace(MAGVIT2_SMALL, bits=5), "bits 5 cannot be split into 2"),
         (lambda: replace(VAE_SMALL, scale=0.0), "scale must be positive"),
         (lambda: replace(PIXELS_SMALL, std=-1.0), "std must be positive"),
     ],
@@ -165,7 +165,7 @@ def test_images_need_not_be_square(kind, tmp_path):
     with pytest.raises(ConfigError, match="12, 20, 3"):
         tokenizer.encode(images.swapaxes(1, 2))
     for side in ("image_size", "grid"):
-        with pytest.raises(ConfigError, match="12 x 20 pixels, square ones|grid of . x .*no one side"):
+        with pytest.raises(ConfigError, match="12 x 20 pixels, but square images|grid of . x .*no single side"):
             getattr(tokenizer, side)
 
 

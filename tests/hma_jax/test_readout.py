@@ -116,5 +116,7 @@ def test_what_stands_in_all_factors_at_once_costs_a_chain_once(kind: type, nats:
 
 @pytest.mark.parametrize("changes", [{"factors": 1}, {"diffusion": DIFFUSION}], ids=["one factor", "latents"])
 def test_there_must_be_several_factors_to_chain(changes: dict):
-    with pytest.raises(ConfigError, match="model.chain_factors needs ids of several factors"):
+    with pytest.raises(
+        ConfigError, match="model.chain_factors needs model.factors of at least 2 and model.diffusion=null"
+    ):
         model_config(chain_factors=True, **changes)

@@ -130,7 +130,7 @@ def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Pat
     assert load_run(old_run, "auto").weights == "last"
     with pytest.raises(ConfigError, match="keeps no average of its weights"):
         load_run(old_run, "ema")
-    with pytest.raises(ConfigError, match="weights: 'newest' is not a choice; choose one of auto, last, ema"):
+    with pytest.raises(ConfigError, match="weights: 'newest' is not allowed; choose one of auto, last, ema"):
         load_run(run_dir, "newest")  # gave the average
 
 
@@ -214,8 +214,11 @@ ROWS = next(batches(MODEL, 4)(0))
     [
         (next(batches(MODEL, 2)(0)), r"has tokens \(4, 3, 4\), got \(2, 3, 4\); actions \(4, 3, 14\), got \(2, "),
         ({"tokens": ROWS["tokens"]}, r"a batch of this run has actions \(4, 3, 14\), got None; embodiment"),
-        (ROWS | {"tokens": ROWS["tokens"] + MODEL.vocab_size}, "a batch has ids from 16 to 31, the model 0 to 15"),
-        (ROWS | {"embodiment": ROWS["embodiment"] - 1}, "a batch has robots from -1 to 1, the model 0 to 2"),
+        (
+            ROWS | {"tokens": ROWS["tokens"] + MODEL.vocab_size},
+            "a batch has ids from 16 to 31, but the model allows 0 to 15",
+        ),
+        (ROWS | {"embodiment": ROWS["embodiment"] - 1}, "a batch has robots from -1 to 1, but the model allows 0 to 2"),
     ],
     ids=["fewer rows", "no actions", "ids", "robots"],
 )
@@ -228,7 +231,7 @@ def test_batches_of_another_model_are_refused(batch, message, tmp_path: Path):
 def test_parameters_of_another_model_and_words_that_are_not_json_are_refused(tmp_path: Path):
     other = declare_model(replace(MODEL, recall=True), TABLE).init(0)
     given = dict(run_dir=tmp_path, provenance={})
-    with pytest.raises(ConfigError, match=r"not those of the model: recall/gain should be absent but is \(8,\)"):
+    with pytest.raises(ConfigError, match=r"do not fit the model: recall/gain should be absent but is \(8,\)"):
         train_model(MODEL, TABLE, AVERAGED, batches(MODEL, 4), initial=other, **given)
-    with pytest.raises(ConfigError, match="its provenance too, has to be JSON: Object of type float32 is not"):
+    with pytest.raises(ConfigError, match="including its provenance, must be JSON: Object of type float32 is not"):
         train_model(MODEL, TABLE, AVERAGED, batches(MODEL, 4), **given | {"provenance": {"hz": np.float32(2)}})

@@ -108,5 +108,5 @@ def test_in_one_pass_over_masked_frames_only_what_is_shown_is_recalled():
 
 @pytest.mark.parametrize("setting", ["full", "policy", "inverse"])
 def test_settings_that_predict_actions_are_refused(setting):
-    with pytest.raises(ConfigError, match=f"teacher_forcing is of settings .* '{setting}' predicts actions"):
+    with pytest.raises(ConfigError, match=f"teacher_forcing works only with settings .* '{setting}' predicts actions"):
         MaskingConfig(setting=setting, teacher_forcing=True)

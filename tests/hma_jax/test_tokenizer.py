@@ -215,7 +215,7 @@ def test_what_cannot_be_encoded_is_refused(tokenizer):
             tokenizer.encode(wrong)
     with pytest.raises(ConfigError, match="empty batch"):
         tokenizer.encode(images[:0])
-    with pytest.raises(ConfigError, match="pieces of at least 1 image, got 0"):
+    with pytest.raises(ConfigError, match="encode at least 1 image at a time, got 0"):
         LfqTokenizer(CONFIG, {}, piece=0)
 
 

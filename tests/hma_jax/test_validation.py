@@ -120,5 +120,5 @@ def test_a_validation_without_windows_is_refused_by_words(tmp_path: Path):
     )
     with pytest.raises(ConfigError, match="no window to validate on"):
         watch.measure(None)
-    with pytest.raises(ConfigError, match="every step or more rarely, got 0"):
+    with pytest.raises(ConfigError, match="between validations must be at least 1, got 0"):
         Validation(0, list)

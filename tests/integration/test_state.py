@@ -41,8 +41,8 @@ def test_a_disk_that_takes_no_more_is_one_message_and_the_last_checkpoint_is_kep
     assert failed.returncode == 1
     assert failed.stderr.count("\n") == 1, failed.stderr[-3000:]
     assert failed.stderr.startswith(f"error: the checkpoint of step 4 could not be written to {tmp_path}/checkpoints: ")
-    assert re.search(rf": {reason}.* See that there is space and permission", failed.stderr), failed.stderr
-    assert failed.stderr.endswith("the same command again: it goes on from step 2, the last whole checkpoint\n")
+    assert re.search(rf": {reason}.* Make sure that there is space and permission", failed.stderr), failed.stderr
+    assert failed.stderr.endswith("the same command again: it continues from step 2, the last complete checkpoint\n")
     assert list_steps(tmp_path / "checkpoints") == [2]
     assert find_damage(tmp_path / "checkpoints" / "2") is None
     (tmp_path / "checkpoints").chmod(0o755)

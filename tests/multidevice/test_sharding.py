@@ -91,9 +91,9 @@ def test_a_mesh_that_does_not_fit_the_devices_is_refused():
 def test_a_mesh_that_does_not_fit_the_batch_or_the_model_is_refused_with_what_would():
     config = model_config(heads=4)
     check_mesh(fake_mesh(2, 2, 2), config, batch=8)
-    with pytest.raises(ConfigError, match="batch of 6 does not divide over data=2 x fsdp=2.*multiple of 4"):
+    with pytest.raises(ConfigError, match="batch of 6 cannot be divided over data=2 x fsdp=2.*multiple of 4"):
         check_mesh(fake_mesh(2, 2, 2), config, batch=6)
-    with pytest.raises(ConfigError, match="batch of 8 in 4 micro-batches does not divide.*multiple of 16"):
+    with pytest.raises(ConfigError, match="batch of 8 in 4 micro-batches cannot be divided.*multiple of 16"):
         check_mesh(fake_mesh(2, 2, 2), config, batch=8, accumulate=4)
     with pytest.raises(ConfigError, match="tensor=8 does not divide the model's heads of 4"):
         check_mesh(fake_mesh(1, 1, 8), config, batch=8)

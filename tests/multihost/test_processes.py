@@ -61,8 +61,8 @@ class Left(Exception):
 @pytest.mark.parametrize(
     ("meanwhile", "code", "message"),
     [
-        (lambda: None, 2, "error: .* did not come together within 1 s at a:1 .not all are there"),
-        (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, "stopped while it waited"),
+        (lambda: None, 2, "error: .* could not connect within 1 s at a:1 .not all have started"),
+        (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, "stopped while waiting"),
     ],
 )
 def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, message, monkeypatch):

@@ -17,13 +17,13 @@ import numpy as np
 
 from data_pipelines.sources.convertible import UnitError
 
-ADVICE = "Fetch the file again, or leave it out with --skip-damaged."
+ADVICE = "Download the file again, or leave it out with --skip-damaged."
 LEFT, RIGHT = 0, 1
 
 
 class _Refusing(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> NoReturn:
-        raise pickle.UnpicklingError(f"it asks for {module}.{name}, which a list of bytes does not need")
+        raise pickle.UnpicklingError(f"it needs {module}.{name}, which a list of bytes does not")
 
 
 def read_hands(path: Path, min_score: float) -> np.ndarray:
@@ -37,8 +37,8 @@ def read_hands(path: Path, min_score: float) -> np.ndarray:
     for record, message in enumerate(_messages(path)):
         if message.frame_number != record + 1:
             raise UnitError(
-                f"{path}: record {record} is of frame {message.frame_number}, not {record + 1}: frames are "
-                f"missing or out of order. {ADVICE}"
+                f"{path}: record {record} is for frame {message.frame_number}, not {record + 1}: frames are missing "
+                f"or out of order. {ADVICE}"
             )
         row = np.full(4, np.nan)
         best = {LEFT: min_score, RIGHT: min_score}
@@ -70,13 +70,13 @@ def _messages(path: Path) -> Iterator[Any]:
     ) as error:
         raise UnitError(f"{path}: not a pickled list of bytes ({error}); it was not run. {ADVICE}") from error
     if not isinstance(records, list) or not all(isinstance(r, bytes) for r in records):
-        raise UnitError(f"{path}: the pickle holds something else than a list of bytes. {ADVICE}")
+        raise UnitError(f"{path}: the pickle contains something other than a list of bytes. {ADVICE}")
     message = _detections()
     for number, record in enumerate(records):
         try:
             yield message.FromString(record)
         except DecodeError as error:
-            raise UnitError(f"{path}: record {number} is no detection message ({error}). {ADVICE}") from error
+            raise UnitError(f"{path}: record {number} is not a detection message ({error}). {ADVICE}") from error
 
 
 @functools.cache

@@ -61,17 +61,17 @@ class Ego4dSource:
         self.path, self.videos, self.settings = Path(annotations), Path(videos), settings
         data = self._read()
         if not isinstance(data, dict) or not isinstance(data.get("videos"), list):
-            raise DataError(f"{self.path}: no list 'videos' in it; give fho_main.json of the v2 annotations.")
+            raise DataError(f"{self.path}: it has no list 'videos'; give fho_main.json of the v2 annotations.")
         labels = {str(label.get("video_uid")): label for label in data["videos"] if isinstance(label, dict)}
         wrong = [uid for uid in labels if not is_dataset_name(uid)]
         if wrong:
-            raise DataError(f"{self.path}: video_uid {quote(wrong[0])} names no file. Fetch it again.")
+            raise DataError(f"{self.path}: video_uid {quote(wrong[0])} is not a file name. Download the file again.")
         self._labels = {uid: label for uid, label in labels.items() if self._video(uid).is_file()}
         self.units = list(self._labels)
         if not self.units:
             raise DataError(
-                f"{self.videos}: none of the {len(labels)} annotated videos is there as <video_uid>.mp4. "
-                "Give the folder full_scale with --videos."
+                f"{self.videos}: it contains none of the {len(labels)} annotated videos as <video_uid>.mp4. Give the "
+                "folder full_scale with --videos."
             )
         self.description = f"Ego4D, both hands as annotated (FHO), {self.hz:g} Hz."
 
@@ -154,7 +154,7 @@ class Ego4dSource:
             self._hash = hashlib.sha256(text).hexdigest()[:16]
             return json.loads(text)
         except (OSError, ValueError, RecursionError) as error:
-            raise DataError(f"{self.path} cannot be read ({error}). Fetch it again.") from error
+            raise DataError(f"{self.path} cannot be read ({error}). Download it again.") from error
 
     def _video(self, uid: str) -> Path:
         return self.videos / f"{uid}.mp4"

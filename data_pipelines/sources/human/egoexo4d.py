@@ -53,12 +53,13 @@ class EgoExo4dSource:
         root_advice = "Give the root of the dataset, with takes.json, takes and annotations."
         takes = _json(self.root / "takes.json", DataError, root_advice)
         if not isinstance(takes, list) or not all(isinstance(t, dict) for t in takes):
-            raise DataError(f"{self.root / 'takes.json'}: not a list of takes. Fetch it again.")
+            raise DataError(f"{self.root / 'takes.json'}: not a list of takes. Download it again.")
         for take in takes:
             for field in ("take_uid", "take_name"):
                 if not is_dataset_name(take.get(field)):
                     raise DataError(
-                        f"{self.root / 'takes.json'}: {field} {quote(take.get(field))} names no file. Fetch it again."
+                        f"{self.root / 'takes.json'}: {field} {quote(take.get(field))} is not a file name. Download "
+                        "the file again."
                     )
         self._takes = [t for t in takes if self._pose(t).is_file() and self._video(t) is not None]
         self.units = [str(t.get("take_name")) for t in self._takes]
@@ -86,7 +87,8 @@ class EgoExo4dSource:
                 return
             if numbers[-1] >= video.max_frames:
                 raise UnitError(
-                    f"{self._pose(take)}: frame {numbers[-1]}, but {path} has {video.max_frames} at most. {ADVICE}"
+                    f"{self._pose(take)}: it has frame {numbers[-1]}, but {path} has at most {video.max_frames} "
+                    f"frames. {ADVICE}"
                 )
             rows = np.full((int(numbers[-1]) + 1, 4), np.nan)
             rows[numbers] = positions
@@ -128,8 +130,9 @@ class EgoExo4dSource:
             return np.array([video.width, video.height], float)
         if abs(video.width / video.height - FULL_SIZE[0] / FULL_SIZE[1]) > 0.02:
             raise UnitError(
-                f"{self.camera}: a downscaled video of {video.width} x {video.height} pixels is no copy of "
-                f"one of {FULL_SIZE[0]} x {FULL_SIZE[1]}, in which poses are given. Fetch the full-scale one."
+                f"{self.camera}: the downscaled video of {video.width} x {video.height} pixels has another aspect "
+                f"ratio than {FULL_SIZE[0]} x {FULL_SIZE[1]}, the size for which poses are given. Download the "
+                "full-scale video."
             )
         return np.array(FULL_SIZE, float)
 
@@ -153,7 +156,7 @@ class EgoExo4dSource:
 
 def _frame_number(text: str) -> int:
     if not (len(text) <= 9 and text.isascii() and text.isdecimal()):
-        raise ValueError(f"{quote(text)} is no frame number")
+        raise ValueError(f"{quote(text)} is not a frame number")
     return int(text)
 
 

@@ -82,8 +82,8 @@ class EpicKitchensSource:
         surplus = folder / _frame_name(len(positions) + 1)
         if surplus.exists():
             raise UnitError(
-                f"{folder}: it has {surplus.name}, but {self._pickle(video)} ends with frame "
-                f"{len(positions)}: frames and detections are of different extractions. {ADVICE}"
+                f"{folder}: it has {surplus.name}, but {self._pickle(video)} ends with frame {len(positions)}: frames "
+                f"and detections are from different extractions. {ADVICE}"
             )
         step = int(_rate(video, len(positions)) // HZ)
         kept = np.arange(0, len(positions), step)

@@ -39,7 +39,7 @@ def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
     Raises ConfigError for a remote file, DataError for one that is missing or cannot be read.
     """
     if is_remote(path):
-        raise ConfigError(f"{path}: ArrayRecord files are read from a disk only. Copy the dataset to one.")
+        raise ConfigError(f"{path}: ArrayRecord files can be read only from a disk. Copy the dataset to a disk.")
     with open_random_access(path) as file:
         size = file.size
         ends = file.read(0, ENDS) + file.read(max(size - ENDS, 0), ENDS)
@@ -92,4 +92,4 @@ def _damage(path: Location, number: int, error: Exception) -> CorruptRecordError
     """What the library says of bytes; what the system says of a disk is raised."""
     if any(word in str(error) for word in ("Input/output error", "Stale", "timed out")):
         raise UnreachableError(f"{path}: cannot be read ({error}). Run the same command again.") from error
-    return CorruptRecordError(path, number, f"the record of this number cannot be read ({error})")
+    return CorruptRecordError(path, number, f"the record with this number cannot be read ({error})")

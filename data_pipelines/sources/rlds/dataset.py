@@ -189,8 +189,8 @@ class RldsDataset(EpisodeSource):
                 continue
             empty = "" if shard.size else ": the file is empty"
             message = (
-                f"{path}: {shard.records} records, but dataset_info.json says {count}{empty}. "
-                "Fetch the shard again, or restore the dataset_info.json it was written with."
+                f"{path}: it has {shard.records} records, but dataset_info.json says {count}{empty}. Download the "
+                "shard again, or restore the dataset_info.json it was written with."
             )
             if self.corrupt == "raise" or shard.records > count:
                 raise DataError(message)
@@ -202,7 +202,7 @@ class RldsDataset(EpisodeSource):
     def _said_empty(self) -> str:
         splits = read_info(self.directory).splits.values()
         others = listing([split.name for split in splits if sum(split.shard_lengths)])
-        return f"dataset_info.json says it has none; splits that have some: {others or 'none'}."
+        return f"by dataset_info.json it is empty; splits with episodes: {others or 'none'}."
 
     def _place(self, i: int) -> tuple[Location, int, int]:
         if not 0 <= i < len(self):

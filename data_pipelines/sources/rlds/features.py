@@ -71,7 +71,7 @@ def parse_features(schema: Any) -> dict[str, FlatFeature]:
 def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[tuple[str, FlatFeature]]:
     """Of `node`; `listed`: it lies in a list, as of the steps of an episode."""
     if depth > MAX_DEPTH:
-        raise ValueError(f"{_field(key)}: fields are nested more than {MAX_DEPTH} deep")
+        raise ValueError(f"{_field(key)}: fields are nested more than {MAX_DEPTH} levels deep")
     form, content = _content(node, key)
     if form == "featuresDict":
         children = content if "features" not in content else _mapping(content["features"], key)
@@ -125,7 +125,7 @@ def _content(node: Any, key: str) -> tuple[str, Mapping[str, Any]]:
 
 def _old_content(name: Any, content: Any, key: str) -> tuple[str, Mapping[str, Any]]:
     if not isinstance(name, str):
-        raise ValueError(f"{_field(key)}: it names no class")
+        raise ValueError(f"{_field(key)}: its class is missing")
     if isinstance(content, str):
         try:
             content = json.loads(content)
@@ -142,13 +142,13 @@ def _either(node: Mapping[str, Any], name: str) -> Any:
 
 def _mapping(value: Any, key: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{_field(key)}: {quote(value)} where a description should stand")
+        raise ValueError(f"{_field(key)}: {quote(value)} is not a description of a field")
     return value
 
 
 def _list(value: Any, key: str) -> list[Any]:
     if not isinstance(value, list):
-        raise ValueError(f"{_field(key)}: {quote(value)} where a list should stand")
+        raise ValueError(f"{_field(key)}: {quote(value)} is not a list")
     return value
 
 
@@ -162,7 +162,7 @@ def _shape(content: Mapping[str, Any], key: str) -> tuple[int | None, ...]:
         if isinstance(size, str) and len(size) <= 12 and size.isascii() and size.removeprefix("-").isdecimal():
             size = int(size)  # the JSON of a message has 64-bit numbers as strings
         if size is not None and (type(size) is not int or not -1 <= size <= MAX_NUMBERS):
-            raise ValueError(f"{_field(key)}: {quote(size)} cannot be one of its sizes")
+            raise ValueError(f"{_field(key)}: {quote(size)} is not a valid size")
         sizes.append(None if size == -1 else size)
     if len(sizes) > 8:
         raise ValueError(f"{_field(key)}: {len(sizes)} dimensions")
@@ -186,5 +186,5 @@ def _numbers(shape: tuple[int | None, ...], dtype: str, encoding: str, key: str)
         return FlatFeature(False, 0, shape, dtype if dtype in NUMBERS else "string")
     size = math.prod(shape)
     if size > MAX_NUMBERS:
-        raise ValueError(f"{_field(key)}: {list(shape)} makes {size:,} numbers in one step")
+        raise ValueError(f"{_field(key)}: shape {list(shape)} means {size:,} numbers in one step, which is too many")
     return FlatFeature(False, 0 if encoding else size, shape, dtype, encoding)

@@ -33,20 +33,20 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             _check_pixels(data, *image.size)
             if image.mode.startswith("I"):  # made RGB, nearly all of them would be white
-                raise ValueError(f"{len(data)} bytes of grey values of 16 bits, as of depths, no picture")
+                raise ValueError(f"{len(data)} bytes of 16-bit grey values, such as depths, which are not an image")
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
         what = "of a damaged PNG image" if data.startswith(PNG_MAGIC) else "that are neither JPEG nor PNG"
         raise ValueError(f"{len(data)} bytes {what}") from error
     except Image.DecompressionBombError as error:
-        raise ValueError(f"{len(data)} bytes of an image too large to be a frame ({error})") from error
+        raise ValueError(f"{len(data)} bytes of an image that is too large for a frame ({error})") from error
 
 
 def _check_pixels(data: bytes, height: int, width: int) -> None:
     if height * width > MAX_PIXELS:
         raise ValueError(
-            f"{len(data)} bytes of an image too large to be a frame "
-            f"({height * width:,} pixels, more than {MAX_PIXELS:,})"
+            f"{len(data)} bytes of an image that is too large for a frame ({height * width:,} pixels, more than "
+            f"{MAX_PIXELS:,})"
         )
 
 

@@ -214,8 +214,8 @@ def _check_places(new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Se
             continue
         if other.digest == old[shard.name].digest:
             raise DataError(
-                f"{shard} and {was}: these two shards have changed places since they were indexed, and with "
-                f"them the names of their episodes. Rename them back; if they are right as they are, remove {path}."
+                f"{shard} and {was}: these two shards have swapped names since they were indexed, so their episodes "
+                f"have swapped names too. Rename them back; if the new names are correct, remove {path}."
             )
 
 
@@ -247,8 +247,8 @@ def _write(
         write_columns(path, {"shards": [asdict(s) for s in index.shards]}, columns)
     except OSError as error:
         warnings.warn(
-            f"{path}: the index of the shards cannot be kept there ({error.strerror or error}), so that every start "
-            f"scans them again. Let {CACHE_VARIABLE} name a directory where you may write.",
+            f"{path}: the index of the shards cannot be written there ({error.strerror or error}), so every start "
+            f"scans the shards again. Set {CACHE_VARIABLE} to a directory where you may write.",
             stacklevel=2,
         )
         return index

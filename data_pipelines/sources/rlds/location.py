@@ -80,7 +80,7 @@ def locate(text: str | Path | UPath) -> Location:
             "pip install 'hma-jax[remote]', or copy the dataset to a disk."
         ) from error
     except ValueError as error:
-        message = f"{text}: no location that fsspec knows ({error}). Correct its protocol."
+        message = f"{text}: fsspec does not know this kind of location ({error}). Correct its protocol."
         raise ConfigError(message) from error
     return location
 
@@ -193,7 +193,7 @@ class DiskFile(Descriptor):
         fd = os.open(self._path, os.O_RDONLY)
         try:
             if _stamp(fd) != self._stamp:
-                message = f"{self._path}: the file was replaced while it was read. Run the same command again."
+                message = f"{self._path}: the file was replaced while it was being read. Run the same command again."
                 raise DataError(message)
             data = os.pread(fd, length, offset)
             os.dup2(fd, self._fd, inheritable=False)  # for all threads, which know the descriptor by its number
@@ -248,7 +248,7 @@ def is_io_error(error: Exception) -> bool:
 
 def missing_shard(location: Location) -> DataError:
     """The error for a shard that does not exist."""
-    return DataError(f"{location}: the shard is missing. Fetch it again, or check the path.")
+    return DataError(f"{location}: the shard is missing. Download it again, or check the path.")
 
 
 class _RemoteFile:

@@ -29,7 +29,7 @@ TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 MAX_SHARDS = 2**15
 """Shards of one split."""
 
-ADVICE = "Restore it as tfds wrote it."
+ADVICE = "Restore the file as tfds wrote it."
 
 FILE_FORMATS = ("tfrecord", "array_record")
 """How records may lie in shards, as dataset_info.json says it."""
@@ -98,9 +98,9 @@ def resolve_version(directory: str | Location) -> Location:
         return max(versions, key=lambda d: tuple(map(int, d.name.split("."))))
     entries = sorted(p.name for p in inside)
     raise DataError(
-        f"{directory}: no RLDS dataset: neither it nor a version directory such as 1.0.0 in it has a "
-        f"dataset_info.json (it holds {listing(entries[:6]) or 'nothing'}). "
-        "Give the directory that tfds wrote, <name> or <name>/<version>."
+        f"{directory} is not an RLDS dataset: neither it nor a version directory in it, such as 1.0.0, has a "
+        f"dataset_info.json (it holds {listing(entries[:6]) or 'nothing'}). Give the directory that tfds wrote, "
+        "<name> or <name>/<version>."
     )
 
 
@@ -130,8 +130,8 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
     for part in parts:
         require(
             part in info.splits,
-            f"{info.name}: no split {part!r} in {directory}; splits there: {listing(sorted(info.splits))}. Choose with "
-            "--split, or with split in the dataset's entry where a command has no such option.",
+            f"{info.name}: no split {part!r} in {directory}; it has {listing(sorted(info.splits))}. Choose one with "
+            "--split, or, if the command has no such option, with split in the dataset's registry entry.",
         )
     try:
         shards = [name for part in parts for name in info.shard_names(part)]
@@ -183,7 +183,7 @@ def read_info(directory: Location) -> DatasetInfo:
 
 def _split(values: Any) -> SplitInfo:
     if not isinstance(values, dict) or not is_dataset_name(values.get("name")):
-        raise ValueError("a split has no usable name")
+        raise ValueError("a split has no valid name")
     name = values["name"]
     template = values.get("filepathTemplate", values.get("filepath_template")) or TEMPLATE
     if not isinstance(template, str) or len(template) > 256:
@@ -197,7 +197,7 @@ def _split(values: Any) -> SplitInfo:
 
 def _list(value: Any, what: str) -> list[Any]:
     if not isinstance(value, list):
-        raise ValueError(f"{what}: {quote(value)} is no list")
+        raise ValueError(f"{what}: {quote(value)} is not a list")
     return value
 
 
@@ -206,7 +206,7 @@ def _count(value: Any, what: str) -> int:
     if isinstance(value, str) and len(value) <= 19 and value.isascii() and value.isdecimal():
         value = int(value)
     if type(value) is not int or not 0 <= value < 2**63:
-        raise ValueError(f"{what}: {quote(value)} is no count")
+        raise ValueError(f"{what}: {quote(value)} is not a count")
     return value
 
 

@@ -115,7 +115,7 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
                 break
             end = offset + HEADER + length + FOOTER
             if end > size:
-                reason = f"the file is truncated: the record needs bytes up to {end}, the file has {size}"
+                reason = f"the file is truncated: the record ends at byte {end}, but the file has {size} bytes"
                 damage = CorruptRecordError(path, offset, reason)
                 break
             view.block = block if length <= small else FOOTER + HEADER

@@ -7,8 +7,8 @@ from tyro.extras import SubcommandApp
 from experiments.cli.bench import models, others
 
 HELP = (
-    "How fast it is, here. Every command times the fast path and the naive one by turns in one process, "
-    "prints both, and writes a JSON record with commit, hardware and versions."
+    "Measure speed on this machine. Every command times the fast implementation and the naive one alternately in one "
+    "process, prints both, and writes a JSON record with commit, hardware and versions."
 )
 
 bench_app = SubcommandApp()

@@ -19,32 +19,32 @@ class Bench:
     """What is timed and how often."""
 
     model: Model = "base"
-    """base: the released size, width 256, 32 layers, 12 frames of 256 + 64 tokens; xl: width 1024; cpu:
-    the model of the cpu preset."""
+    """base: the released size, width 256, 32 layers, 12 frames of 256 + 64 tokens; xl: width 1024.
+    cpu: the model of the cpu preset."""
     batch: tuple[int, ...] = (1,)
-    """Examples at a time; several numbers give several measurements."""
+    """Batch size; several numbers give several measurements."""
     repeats: int = 30
     """Timed calls of every stage, after two untimed ones."""
     dtype: Dtype = "float32"
-    """What is computed in."""
+    """Number format of the computation."""
     robots: int = 1
-    """Embodiments of the model; a batch mixes them."""
+    """Number of robots of the model; a batch mixes them."""
     layers: Annotated[int | None, arg(metavar="N")] = None
-    """Another number of layers, for a quick try."""
+    """Number of layers, instead of the model's own."""
     width: Annotated[int | None, arg(metavar="D")] = None
-    """Another width."""
+    """Width, instead of the model's own."""
     seed: int = 0
-    """Of weights and inputs."""
+    """Random seed of weights and inputs."""
     out: Path = Path("runs/bench")
     """Directory for the record."""
 
 
 @dataclass(frozen=True)
 class Decode:
-    """How frames are filled."""
+    """How frames are generated."""
 
     unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2
-    """Passes over each frame, M."""
+    """Unmasking steps per frame."""
     sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100
     """Continuous models: steps of the diffusion sampler."""
     sampler: SamplerKind = "ddpm"

@@ -22,7 +22,7 @@ Program = Literal["step", "forward", "fill", "slide"]
 
 
 def generate(bench: OmitArgPrefixes[Bench], decode: OmitArgPrefixes[Decode]) -> None:
-    """Time the making of one frame: while the window fills, when it slides, and by recomputation."""
+    """Time the generation of one frame: while the window fills, when it slides, and by recomputation."""
     from experiments.bench.generate import ratios, time_frames
 
     subject, how = _subject(bench), _decode(decode)
@@ -41,14 +41,14 @@ def rollout(
     slide: Literal["exact", "streaming"] = "exact",
     naive: bool = True,
 ) -> None:
-    """Time whole rollouts in one compiled call, and check them against recomputation.
+    """Time whole rollouts in one compiled call, and compare them with recomputation.
 
     Args:
         bench: What is timed and how often.
-        decode: How frames are filled.
-        frames: Length of a rollout, prompt included; past the model's window it slides.
+        decode: How frames are generated.
+        frames: Length of a rollout, prompt included; if it is longer than the model's window, the window slides.
         prompt: Frames it starts from.
-        slide: What happens past the window.
+        slide: How the window slides: exact computes it again for every frame, streaming does not.
         naive: Time recomputation too, and compare the frames.
     """
     from dataclasses import replace
@@ -75,7 +75,7 @@ def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
 
     Args:
         bench: What is timed and how often.
-        remat: What a block keeps for the backward pass; the rest is computed again.
+        remat: What the backward pass recomputes to save memory, see `hma plan --help`.
     """
     from experiments.bench.train import time_training
 
@@ -86,11 +86,12 @@ def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
 
 
 def products(bench: OmitArgPrefixes[Bench], program: Program = "step") -> None:
-    """Time a program, and every matrix product in it alone: what could be gained, and where.
+    """Time a program, and each of its matrix products separately, to see what could be gained and where.
 
     Args:
         bench: What is timed and how often.
-        program: An optimiser step, a pass over the window, or a frame while the window fills or when it slides.
+        program: step: an optimiser step; forward: a pass over the window; fill: a frame while the window fills;
+            slide: a frame when it slides.
     """
     from experiments.bench.products import time_products
 
@@ -108,13 +109,13 @@ def products(bench: OmitArgPrefixes[Bench], program: Program = "step") -> None:
 def evaluate(
     bench: OmitArgPrefixes[Bench], context: Literal["recorded", "generated"] = "recorded", draws: int = 5
 ) -> None:
-    """Time the evaluation protocol against the same protocol taken literally, and compare the numbers.
+    """Time the fast implementation of the evaluation protocol and the literal one, and compare their results.
 
     Args:
         bench: What is timed and how often.
-        context: What a predicted frame follows: recorded frames, as the release evaluates, or
+        context: The frames before a predicted frame: recorded ones, as in the release's evaluation, or
             generated ones.
-        draws: Random action sequences for delta PSNR.
+        draws: Number of random action sequences for delta PSNR.
     """
     from experiments.bench.evaluate import time_evaluation
     from hma_jax.config import EvalConfig

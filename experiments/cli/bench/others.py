@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.bench.record import write
 from experiments.progress import console, step, tidy_table
-from experiments.setting import make_setting
+from experiments.setting import UNSET, make_setting
 from hma_jax.config import ConfigError, require
 from hma_jax.config.execution import Dtype
 
@@ -19,19 +19,19 @@ from hma_jax.config.execution import Dtype
 def quality(
     run: Positional[Path],
     arguments: StudyOptions,
-    frames: int | None = None,
+    frames: Annotated[int | None, UNSET] = None,
     windows: int = 12,
     repeats: int = 30,
 ) -> None:
-    """Judge a trained model's rollouts under cheaper and dearer decoding: quality beside time per frame.
+    """Measure quality and time per frame of a trained model's rollouts under cheaper and more expensive decoding.
 
-    Latents: DDPM and DDIM with fewer steps, DPM++ with few. Ids: more and fewer passes over each frame. With --frames
-    beyond the model's window: an exact slide against streaming.
+    Models on latents: DDPM, DDIM and DPM++ with fewer sampler steps. Models on ids: more and fewer unmasking steps. If
+    --frames is more than the model's window: the exact slide and streaming.
 
     Args:
         run: Directory of a trained model.
         arguments: The study whose held-out windows are used.
-        frames: Length of a rollout, prompt included; the model's window if not given.
+        frames: Length of a rollout, prompt included. Default: the model's window.
         windows: Held-out windows per dataset.
         repeats: Timed rollouts of every decoding.
     """
@@ -91,20 +91,20 @@ def quality(
 
 def tokenize(
     tokenizer: str = "magvit2",
-    piece: int | None = None,
+    piece: Annotated[int | None, UNSET] = None,
     repeats: int = 30,
     dtype: Dtype = "float32",
     seed: int = 0,
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Time a tokenizer both ways.
+    """Time the encoding and decoding of a tokenizer.
 
     Args:
-        tokenizer: magvit2 or svd-vae, with drawn weights at 256 pixels, or a tokenizer's directory.
-        piece: Images per device at a time; its own default if not given.
+        tokenizer: magvit2 or svd-vae, with random weights at 256 pixels, or a tokenizer's directory.
+        piece: Images per device at a time. Default: the tokenizer's own.
         repeats: Timed calls of every stage.
-        dtype: What magvit2 and svd-vae compute in.
-        seed: Of weights and images.
+        dtype: Number format of the computation, for magvit2 and svd-vae.
+        seed: Random seed of weights and images.
         out: Directory for the record.
     """
     from experiments.bench.tokenize import make_tokenizer, time_tokenizer
@@ -128,9 +128,9 @@ def simulate(
 
     Args:
         run: Directory of a trained model.
-        batch: Episodes that advance together; several numbers give several measurements.
-        repeats: Timed frames of each.
-        dtype: What is computed in.
+        batch: Number of episodes that are simulated together; several numbers give several measurements.
+        repeats: Timed frames of each measurement.
+        dtype: Number format of the computation.
         out: Directory for the record.
     """
     from experiments.bench.simulate import time_simulator
@@ -146,8 +146,8 @@ def simulate(
 
 
 def load(
-    store: Path | None = None,
-    data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = (),
+    store: Annotated[Path | None, UNSET] = None,
+    data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]"), UNSET] = (),
     windows: int = 20_000,
     batch: int = 32,
     frames: int = 12,
@@ -155,16 +155,16 @@ def load(
     threads: tuple[int, ...] = (1, 2),
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Time training windows from a token store, and frames from RLDS directories; watch the memory.
+    """Time the loading of training windows from a token store and of frames from RLDS directories, and their memory.
 
     Args:
-        store: A token store; one of forty datasets with random tokens is made if not given.
+        store: Directory of a token store. Default: a temporary one of forty datasets with random tokens.
         data: RLDS directories, whose frames are decoded and resized.
-        windows: Windows to draw.
-        batch: Windows per batch; four times as many frames of RLDS directories.
+        windows: Number of windows to load.
+        batch: Windows per batch; batches of frames from RLDS directories have four times as many.
         frames: Frames per window.
-        size: Pixels that frames of RLDS directories are resized to.
-        threads: Threads that read ahead; several numbers are timed one after the other.
+        size: Side in pixels to which frames of RLDS directories are resized.
+        threads: Number of threads that read ahead; several numbers give several measurements.
         out: Directory for the record.
     """
     import tempfile
@@ -197,25 +197,25 @@ def load(
 def release(
     checkout: Positional[Path],
     python: Path,
-    stages: Annotated[tuple[str, ...], arg(metavar="[STAGE ...]")] = (),
+    stages: Annotated[tuple[str, ...], arg(metavar="[STAGE ...]"), UNSET] = (),
     turns: int = 5,
     batch: int = 1,
     dtype: Dtype = "float32",
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Time the base models beside the official PyTorch release: processes that take turns, one for each stage.
+    """Time the base models and those of the official PyTorch release alternately, in one process for each stage.
 
-    On a GPU both use it.
+    If there is a GPU, both use it.
 
     Args:
         checkout: A clone of github.com/liruiw/HMA.
-        python: An interpreter with what the release imports: torch, einops, mup, transformers,
+        python: A Python interpreter with the packages that the release imports: torch, einops, mup, transformers,
             huggingface_hub, scipy.
         stages: Some of: forward, fill, slide, step, "continuous fill", "continuous slide",
-            "continuous few" (10 evaluations by dpm++ against the release's 100). All if not given.
-        turns: Timed turns of every stage, after one untimed.
-        batch: Examples at a time.
-        dtype: What both compute in; the release by torch's automatic mixed precision.
+            "continuous few" (10 evaluations by dpm++; the release needs 100). Default: all.
+        turns: Timed turns of every stage, after one untimed turn.
+        batch: Batch size.
+        dtype: Number format of the computation; in the release by torch's automatic mixed precision.
         out: Directory for the record.
     """
     from experiments.bench.against_release import RELEASE_STAGES, time_against_release
@@ -231,17 +231,17 @@ def release(
 
 
 def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
-    """Print records as Markdown tables, and draw them.
+    """Print records as Markdown tables, and plot them.
 
     Args:
-        records: Record files, or directories of them.
-        figure: PNG file for bars of every stage.
+        records: Record files, or directories that contain them.
+        figure: PNG file for a bar chart of all stages.
     """
     from experiments.bench.record import read_record
     from experiments.bench.report import markdown, plot_records
 
     files = [f for path in records for f in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
-    require(len(files) > 0, "no records there; make one with `hma bench generate`")
+    require(len(files) > 0, "no benchmark records found; make one with `hma bench generate`")
     found = [read_record(file) for file in files]
     print(markdown(found))
     if figure is not None:

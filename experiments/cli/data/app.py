@@ -10,11 +10,12 @@ from experiments.cli.data.view import view
 from experiments.setting import make_setting
 from experiments.wrote import wrote
 
-HELP = "The registry, what a directory holds, other formats, the simulated suites."
+HELP = "List, inspect, view, convert and simulate datasets."
 
 CONVERT_HELP = (
-    "Other formats into an RLDS directory, as an export: LeRobot and robomimic are read directly too. Needs the extra 'convert' "
-    "(pip install 'hma-jax[convert]'). The same command again goes on where it was interrupted."
+    "Convert other formats into an RLDS directory, for other programs: this one also reads LeRobot and robomimic "
+    "directly. Needs the extra 'convert' (pip install 'hma-jax[convert]'). Run the same command again after an "
+    "interruption: it continues."
 )
 
 

@@ -18,7 +18,7 @@ from data_pipelines.sources.settings import (
     RobomimicSettings,
 )
 from experiments.progress import say, step
-from experiments.setting import command
+from experiments.setting import UNSET, command
 from experiments.wrote import wrote
 from hma_jax.config import require
 
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Destination:
-    """Where the dataset goes."""
+    """Where the dataset is written."""
 
     out: Path
     """Directory in which NAME/1.0.0 is written."""
-    name: str | None = None
-    """Name of the dataset: lower-case letters, digits and _. Made of the source's name if not given."""
+    name: Annotated[str | None, UNSET] = None
+    """Name of the dataset: lower-case letters, digits and _. Default: made from the source's name."""
     skip_damaged: Annotated[bool, arg(name="skip-damaged")] = False
-    """Leave damaged demonstrations, episodes or videos out and count them, instead of stopping."""
+    """Leave out damaged demonstrations, episodes or videos and count them, instead of stopping."""
 
 
 def robomimic(
     source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[RobomimicSettings]
 ) -> None:
-    """Robomimic demonstrations: an HDF5 file with camera images.
+    """Convert robomimic demonstrations: an HDF5 file with camera images.
 
     Args:
         source: The HDF5 file.
-        destination: Where the dataset goes.
-        settings: What is taken of the file.
+        destination: Where the dataset is written.
+        settings: What is taken from the file.
     """
     from data_pipelines.sources.robomimic import RobomimicSource
 
@@ -58,15 +58,15 @@ def robomimic(
 def lerobot(
     source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[LeRobotSettings]
 ) -> None:
-    """A LeRobot dataset, version 2.0, 2.1 or 3.0, with videos or images.
+    """Convert a LeRobot dataset, version 2.0, 2.1 or 3.0, with videos or images.
 
-    Every frame of a video becomes a JPEG of its own, so the dataset grows: 289 MB of video became 2.6 GB;
-    --short-side and --camera make it less.
+    Every video frame becomes a JPEG, so the dataset grows: 289 MB of video became 2.6 GB. --short-side and --camera
+    reduce this.
 
     Args:
-        source: Its root, with meta, data and videos.
-        destination: Where the dataset goes.
-        settings: What is taken of the dataset.
+        source: Root of the dataset, with meta, data and videos.
+        destination: Where the dataset is written.
+        settings: What is taken from the dataset.
     """
     from data_pipelines.sources.lerobot import LeRobotSource
 
@@ -80,12 +80,12 @@ def epic_kitchens(
     destination: OmitArgPrefixes[Destination],
     settings: OmitArgPrefixes[EpicKitchensSettings],
 ) -> None:
-    """EPIC-KITCHENS-100 frames with the published hand detections: 2-D hand motion as actions, 10 Hz.
+    """Convert EPIC-KITCHENS-100 frames with the published hand detections: 2-D hand motion as actions, 10 Hz.
 
     Args:
         source: Root of the frames: <participant>/rgb_frames/<video>/frame_*.jpg.
         detections: Folder of the detections: <participant>/<video>.pkl. No code in them is run.
-        destination: Where the dataset goes.
+        destination: Where the dataset is written.
         settings: Which frames make episodes.
     """
     from data_pipelines.sources.human.epic_kitchens import NAME, EpicKitchensSource
@@ -99,12 +99,12 @@ def ego4d(
     destination: OmitArgPrefixes[Destination],
     settings: OmitArgPrefixes[Ego4dSettings],
 ) -> None:
-    """Ego4D videos with the annotated hand boxes (FHO): 2-D hand positions as actions, 2 Hz.
+    """Convert Ego4D videos with the annotated hand boxes (FHO): 2-D hand positions as actions, 2 Hz.
 
     Args:
         source: The annotations, fho_main.json.
         videos: Folder of <video_uid>.mp4.
-        destination: Where the dataset goes.
+        destination: Where the dataset is written.
         settings: Which frames make episodes.
     """
     from data_pipelines.sources.human.ego4d import NAME, Ego4dSource
@@ -115,11 +115,11 @@ def ego4d(
 def egoexo4d(
     source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[EgoExo4dSettings]
 ) -> None:
-    """Ego-Exo4D takes with automatic hand poses: 2-D wrist positions as actions, 30 Hz.
+    """Convert Ego-Exo4D takes with automatic hand poses: 2-D wrist positions as actions, 30 Hz.
 
     Args:
         source: Root of the dataset, with takes.json, takes and annotations.
-        destination: Where the dataset goes.
+        destination: Where the dataset is written.
         settings: Which takes and frames make episodes.
     """
     from data_pipelines.sources.human.egoexo4d import NAME, EgoExo4dSource
@@ -146,7 +146,7 @@ def _convert(
             )
         except UnitError as error:  # whose own advice is for those who tokenise, too
             rest = without_advice(str(error))
-            advice = "Fetch the file again, or add" if rest != str(error) else "Add"
+            advice = "Download the file again, or add" if rest != str(error) else "Add"
             raise DataError(f"{rest} {advice} --skip-damaged to leave it out.") from error
     say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
     for reason, count in done.skipped.items():
@@ -155,7 +155,7 @@ def _convert(
         say(unsupported_images_text(unsupported_images))
     inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
     say(
-        "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "
+        "to read it, a registry entry of this name is needed: add `--entry FILE.toml` to the next command, and give "
         "that file to all others with --registry; or add this to data_pipelines/registry/own.py:"
     )
     say(f"    {entry(done.spec)}")
@@ -174,27 +174,27 @@ def entry(spec: DatasetSpec) -> str:
 def import_tokens(
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER [FOLDER ...]")],
     store: Path,
-    name: str | None = None,
+    name: Annotated[str | None, UNSET] = None,
     hz: float | None = None,
     patch: int = 2,
-    frame_step: Annotated[int | None, arg(name="frame-step")] = None,
+    frame_step: Annotated[int | None, arg(name="frame-step"), UNSET] = None,
     tokenizer: Path | None = None,
 ) -> None:
     """Read token folders of the official release (video.bin, actions, segment_ids.bin) into a token store.
 
-    A dataset is a pair of folders that end in _train and _val; either of them stands for both. The
-    tokens are taken as they are. The store is for programs (data_pipelines.loading.loader.make_loader):
-    other commands make tokens of recordings themselves.
+    A dataset is a pair of folders whose names end in _train and _val; give either of them. The tokens are stored
+    unchanged. The store is for your own programs (data_pipelines.loading.loader.make_loader); other commands make
+    tokens from recordings themselves.
 
     Args:
         folders: Folders to read.
-        store: Token store to add them to.
-        name: Name of the dataset, if there is one only; the folders' own if not given.
+        store: Token store to add the datasets to.
+        name: Name of the dataset, if only one is imported. Default: the folders' name.
         hz: Native frames per second, if the registry does not know the dataset.
-        patch: Latent cells along one side of a token; of no effect on ids.
-        frame_step: Every how many native frames one is stored; the stride, for frames at 2 Hz, if not given.
-        tokenizer: Directory of the tokenizer that made the tokens. It decodes the validation frames that
-            evaluation in pixels compares with.
+        patch: Latent cells along one side of a token; no effect on ids.
+        frame_step: The stored tokens are of every N-th native frame. Default: the stride that gives 2 Hz.
+        tokenizer: Directory of the tokenizer that made the tokens. It decodes the validation frames, which evaluation
+            in pixels needs.
     """
     from data_pipelines.tokens.import_tokens import import_tokens as import_pair
     from data_pipelines.tokens.import_tokens import pair_folders
@@ -228,4 +228,4 @@ def import_tokens(
         )
         wrote(store / spec.name)
     if tokenizer is None:
-        say("note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets")
+        say("note: without --tokenizer no frames are stored, so evaluation in pixels cannot use these datasets")

@@ -45,8 +45,8 @@ def single_episode(directories: Sequence[Facts]) -> str | None:
     if sum(facts.episodes for facts in directories) != 1 or len(directories[0].splits) > 1:
         return None
     return (
-        "name another dataset beside it (hma tokenize --data DIR OTHER), or record more: of a single episode none can "
-        "be held out, so no model can be judged on it"
+        "add another dataset (hma tokenize --data DIR OTHER), or record more: of a single episode none can be held out, "
+        "so no model can be evaluated on it"
     )
 
 
@@ -54,11 +54,11 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
     """What to run instead for a dataset of which no episode has two frames at `stride`, and why."""
     longest, known = facts.lengths.longest, (("--registry", registry) if registry else ())
     if longest < 2:
-        return "leave it out: its longest episode has one step, so there is no motion to learn"
+        return "leave it out: no episode has more than one step, so there is no motion to learn"
     words = command("data view", facts.directory, "--stride", "1", *known)
     return (
-        f"{words}  (no episode that was read has the {2 * stride} steps that the shortest window takes at stride "
-        f"{stride}; the longest has {longest}: every frame is needed, or the rate is another one, --hz)"
+        f"{words}  (the shortest window at stride {stride} needs {2 * stride} steps, the longest episode that was read has "
+        f"{longest}: use every frame, or correct the rate with --hz)"
     )
 
 
@@ -71,4 +71,4 @@ def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | N
     if known is None or hz is None or known.hz == hz:
         return None
     words = command("data inspect", facts.directory, "--hz", f"{hz:g}", "--entry", registry or ENTRIES)
-    return f"{words}  (its entry says {known.hz:g} Hz, which a study takes, not {hz:g}; this writes another entry)"
+    return f"{words}  (its entry says {known.hz:g} Hz, which a study uses, not {hz:g}; this writes another entry)"

@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from data_pipelines.errors import MAX_LISTED
 from experiments.cli.data.next_command import no_window, other_rate, single_episode, tokenize_command
 from experiments.progress import console, say, step, tidy_table
-from experiments.setting import say_unmatched, use_entries
+from experiments.setting import UNSET, say_unmatched, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, to_strict_json
@@ -39,9 +39,9 @@ def data_list(
     """List the datasets that the registry knows: camera, action size, rate.
 
     Args:
-        words: Only entries with all these words in name, note, camera or group ("open-x", "franka").
-        mixture: Only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
-        registry: TOML file with entries of your own.
+        words: List only entries with all these words in name, note, camera or group ("open-x", "franka").
+        mixture: List only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
+        registry: TOML file with your own registry entries.
     """
     from data_pipelines.registry import MIXTURES, get_mixture, known_groups
 
@@ -54,11 +54,11 @@ def data_list(
         if found:
             console.print(_table_of(title, found))
     if not shown:
-        raise ConfigError(f"no entry has {' and '.join(map(repr, words))} in it; `hma data list` shows all")
+        raise ConfigError(f"no entry contains {' and '.join(map(repr, words))}; `hma data list` shows all")
     console.print(
-        f"{shown} entries. steps: of the middle episode, ~ of the mean one, ? nobody says. "
-        "* not confirmed by a public source: the entry says what. Mixtures: "
-        f"{', '.join(MIXTURES)} (--mixture). A dataset of your own is one more entry; "
+        f"{shown} entries. steps: median per episode; ~: mean; ?: unknown. "
+        "*: no public source confirms what follows. Mixtures: "
+        f"{', '.join(MIXTURES)} (--mixture). For your own dataset add an entry; "
         "`hma data inspect DIR` suggests it."
     )
 
@@ -92,26 +92,26 @@ def data_inspect(
     directory: Positional[str],
     hz: float | None = None,
     split: str = "train",
-    out: Path | None = None,
+    out: Annotated[Path | None, UNSET] = None,
     episodes: int = 32,
     frames: int = 12,
     json: Path | None = None,
     entry: Path | None = None,
     registry: Path | None = None,
 ) -> None:
-    """Show what a dataset holds, draw a contact sheet, and suggest its registry entry.
+    """Print what a dataset contains, draw a contact sheet, and suggest its registry entry.
 
     Args:
         directory: The dataset: an RLDS directory (<name> or <name>/<version>, a path or URL), the root of a
             LeRobot dataset, or a robomimic .hdf5 file.
-        hz: Native rate of its frames, where no file says it (LeRobot and robomimic do).
-        split: The split to look at.
-        out: Directory for contact_sheet.png; runs/inspect/NAME if not given.
-        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        hz: Native frames per second, if the files do not contain it (those of LeRobot and robomimic do).
+        split: The split to read.
+        out: Directory for contact_sheet.png. Default: runs/inspect/NAME.
+        episodes: Number of episodes to read, drawn at random; fewer if they have more than 2 GB in all.
         frames: Frames of the model's window, to count windows.
-        json: Write everything there as JSON.
-        entry: Add the suggested entry to this TOML file, for --registry.
-        registry: TOML file with entries of your own.
+        json: JSON file to write everything to.
+        entry: TOML file to add the suggested entry to, for --registry.
+        registry: TOML file with your own registry entries.
     """
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry, window_facts
@@ -138,7 +138,7 @@ def data_inspect(
     print_facts(facts)
     if entry is not None:
         require(suggestion is not None, f"{facts.name}: no entry to write: {NO_CAMERA}")
-        require(bool(suggestion.hz), "--entry needs the native rate, which is not in the files: add --hz")
+        require(bool(suggestion.hz), "--entry needs the native rate, which the files do not contain: add --hz")
     taken = None if entry else known  # as the dataset is read afterwards
     rate, windows = hz or (taken.hz if taken else suggested), None
     if rate:
@@ -146,12 +146,12 @@ def data_inspect(
         windows = window_facts(facts, stride, frames)
         source = "" if hz or not taken else " (registry)"
         if facts.hz not in (None, rate):
-            source += f", though its files say {facts.hz:g}"
+            source += f", although its files say {facts.hz:g}"
         console.print(
             f"[bold]rate[/] {rate:g} Hz{source}: stride {stride}, "
-            f"{rate / stride:.2f} Hz; a whole window of {frames} frames takes {windows.native} steps, the shortest "
-            f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
-            f"{windows.total:,.0f} windows in the split"
+            f"{rate / stride:.2f} Hz; a full window of {frames} frames needs {windows.native} steps, the shortest "
+            f"window {windows.needed}; {windows.long_enough} of {facts.sampled} sampled episodes are long enough for the "
+            f"shortest; about {windows.total:,.0f} windows in the split"
         )
     _print_entry(known, suggestion)
     folder = out or sheets / facts.name
@@ -178,14 +178,14 @@ def print_facts(facts: Facts) -> None:
     console.print(
         f"[bold]{escape(facts.name)}[/] {facts.version}  {escape(facts.directory)}\n"
         f"read {sampled} episodes of split {facts.split!r} ({facts.bytes_read / 1e6:,.1f} MB"
-        f"{', no more: they are large' if facts.stopped else ''})",
+        f"{', the most that is read' if facts.stopped else ''})",
         soft_wrap=True,
     )
     damaged = list(facts.damaged.items())
     for reason, count in damaged[:MAX_LISTED]:
         console.print(f"[yellow]damaged[/] {count} episode(s): {escape(reason)}", soft_wrap=True)
     if rest := sum(count for _, count in damaged[MAX_LISTED:]):
-        console.print(f"[yellow]damaged[/] {rest:,} more episode(s): --json FILE names all", soft_wrap=True)
+        console.print(f"[yellow]damaged[/] {rest:,} more episode(s): --json FILE lists all", soft_wrap=True)
     for c in facts.cameras:
         if c.undecodable:
             text = f"{c.key} in {c.undecodable} of {facts.sampled} episodes, the first: {c.reason}"
@@ -208,7 +208,7 @@ def print_facts(facts: Facts) -> None:
     cameras.add_column("remark")
     for c in facts.cameras:
         sizes = ", ".join(f"{h}x{w}" for h, w in c.sizes)
-        remark = "blank: shows one colour" if c.is_blank else "stands still" if c.still else ""
+        remark = "blank: one colour only" if c.is_blank else "image never changes" if c.still else ""
         remark = remark if c.frames else "cannot be decoded"
         cameras.add_row(escape(c.key), sizes, f"{c.frames}", f"{c.blank}", remark)
     console.print(cameras)
@@ -230,13 +230,13 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
         console.print(f"[yellow]no entry[/]: {NO_CAMERA}", soft_wrap=True)
         return
     if known is None:
-        console.print("[bold]not in the registry.[/] The entry that its contents suggest:")
+        console.print("[bold]not in the registry.[/] Suggested entry:")
     else:
         same = (known.image_key, known.action_keys, known.action_dims)
         fits = same == (suggestion.image_key, suggestion.action_keys, suggestion.action_dims)
         fits &= set(suggestion.angles) <= set(known.angles) and suggestion.hz == known.hz
         fits &= not suggestion.angles or suggestion.angle_unit == known.angle_unit
-        agrees = ", as its contents suggest" if fits else ". Its contents alone would suggest:"
+        agrees = "; this agrees with its contents" if fits else ". Its contents suggest another entry:"
         console.print(f"[bold]in the registry[/]: {escape(_in_words(known))}{agrees}", soft_wrap=True)
         if fits:
             return
@@ -244,7 +244,7 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
         console.print(f"  {escape(reason)}", soft_wrap=True)
     say(suggestion.python())
     console.print(
-        "Paste it into data_pipelines/registry/own.py, or write it with --entry FILE.toml and give that file "
+        "Copy it into data_pipelines/registry/own.py, or write it with --entry FILE.toml and give that file "
         "to other commands with --registry.",
         soft_wrap=True,
     )
@@ -266,7 +266,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
         write_file(path, put_entry(path.read_text(encoding="utf-8") if path.exists() else "", spec, str(path)))
     wrote(path)
     if lines := [line for entry in old for line in diff(entry, spec)]:
-        text = f"note: in place of the entry of {spec.name} that was there; changed: {'; '.join(lines)}"
+        text = f"note: this replaced the file's entry of {spec.name} (old -> new): {'; '.join(lines)}"
         say(text)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, say, step
-from experiments.setting import command, command_words
+from experiments.setting import UNSET, command, command_words
 from experiments.words import few
 from experiments.wrote import wrote
 
@@ -53,26 +53,26 @@ REPORT = 10
 def data_sim(
     out: Path,
     preset: SimPreset = "smoke",
-    names: Annotated[tuple[str, ...], arg(metavar="[NAME ...]")] = (),
-    episodes: int | None = None,
-    size: int | None = None,
+    names: Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET] = (),
+    episodes: Annotated[int | None, UNSET] = None,
+    size: Annotated[int | None, UNSET] = None,
     workers: int = 2,
     seed: int = 0,
 ) -> None:
     """Simulate real robots' models (MuJoCo and others) and write them as RLDS directories.
 
     Needs the extra `sim`. Run the same command again after an interruption: only what is missing
-    is made, and the bytes are the same. What is there with another number of episodes, size or seed is refused.
+    is made, and the bytes are the same. Existing datasets with another number of episodes, size or seed are refused.
 
     Args:
         out: Directory to write: one dataset per embodiment, and contact sheets.
-        preset: smoke (12 embodiments, 4 episodes, 64 pixels: minutes) or full (all of them, 20
+        preset: smoke (12 embodiments, 4 episodes, 64 pixels: minutes) or full (all embodiments, 20
             episodes, 128 pixels: hours).
-        names: Only these embodiments of the table.
-        episodes: Episodes per dataset, instead of the preset's.
-        size: Pixels of a frame's side, instead of the preset's.
-        workers: Simulators at a time, each a process with one core; no effect on the data.
-        seed: Another seed gives other episodes.
+        names: Only these embodiments. Default: the preset's.
+        episodes: Episodes per dataset. Default: the preset's.
+        size: Side of the frames in pixels. Default: the preset's.
+        workers: Simulators that run at the same time, each in a process with one core; no effect on the data.
+        seed: Random seed; another one gives other episodes.
     """
     from data_pipelines.simulators import generate_sim, select
     from data_pipelines.simulators.sheet import draw_sheet
@@ -113,8 +113,8 @@ def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
     kept = made_by_other_versions(out, specs, episodes, size, seed)
     if kept:
         say(
-            f"note: {few(kept)} in {out}: made by other versions of simulators, and still used; remove them to have them "
-            "made again"
+            f"note: {few(kept)} in {out}: made by other versions of the simulators, and still used; remove them to make "
+            "them again"
         )
     return [spec.name for spec in specs if spec.name not in kept]
 
@@ -123,7 +123,7 @@ def data_sim_table(directory: Positional[Path]) -> None:
     """Print frames per second, episode lengths and success rates of `hma data sim`, as Markdown.
 
     Args:
-        directory: What was given as --out.
+        directory: The --out of `hma data sim`.
     """
     from data_pipelines.simulators.stats import stats_table
 

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, single_episode, tokenize_command
 from experiments.progress import console, step
-from experiments.setting import command, say_unmatched, use_entries
+from experiments.setting import UNSET, command, say_unmatched, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
@@ -32,27 +32,27 @@ OTHER_SPLITS = 2
 def view(
     datasets: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET [DATASET ...]")],
     out: Path = Path("runs/view.html"),
-    split: str | None = None,
+    split: Annotated[str | None, UNSET] = None,
     hz: float | None = None,
-    stride: int | None = None,
+    stride: Annotated[int | None, UNSET] = None,
     frames: int = 12,
     episodes: int = 64,
     shown: int = 6,
     registry: Path | None = None,
 ) -> None:
-    """Write one HTML page about datasets: clips with their actions, statistics, windows, what stands out.
+    """Write one HTML page about datasets: clips with their actions, statistics, windows, possible issues.
 
     Args:
         datasets: RLDS directories (paths or URLs), LeRobot folders, robomimic files.
-        out: The page, a single file that needs nothing else.
-        split: The split to look at; the registry's, or train, if not given.
-        hz: Native rate of the frames, where neither a file nor the registry says it, or is wrong.
-        stride: Native frames per frame of the model; what comes nearest to 2 Hz if not given.
+        out: HTML file to write; it needs no other file.
+        split: The split to read. Default: the registry's, or train.
+        hz: Native frames per second, if the files and the registry do not contain it, or are wrong.
+        stride: Native frames per frame of the model. Default: the stride nearest to 2 Hz.
         frames: Frames of the model's window, to count windows.
-        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB. Recordings that occur
-            twice are found among these alone.
-        shown: Episodes to show.
-        registry: TOML file with entries of your own.
+        episodes: Number of episodes to read, drawn at random; fewer if they have more than 2 GB in all. Duplicate
+            recordings are searched only among these.
+        shown: Number of episodes to show.
+        registry: TOML file with your own registry entries.
     """
     from experiments.report.data_page import draw_page
 
@@ -121,7 +121,7 @@ def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]
         sample = inspect_dataset(directory, split, episodes=episodes, max_examples=0, frames=2, action_keys=keys)
         return sample.fingerprints
     except DataError as error:
-        console.print(f"[yellow]note[/]: split {split!r} was not searched for the same episodes: {escape(str(error))}")
+        console.print(f"[yellow]note[/]: split {split!r} was not searched for duplicates: {escape(str(error))}")
         return ()
 
 
@@ -129,15 +129,15 @@ def _say_issues(viewed: Viewed, episodes: int) -> None:
     colours = {"error": "red", "warning": "yellow"}
     name = escape(viewed.facts.name)
     if not viewed.issues:
-        console.print(f"[bold]{name}[/]: nothing stands out")
+        console.print(f"[bold]{name}[/]: no issues found")
     for issue in viewed.issues:
         title = f"[{colours[issue.severity]}]{issue.title}[/]"
         console.print(f"[bold]{name}[/]: {title}: {escape(issue.text)}", soft_wrap=True)
     f = viewed.facts
     if f.stopped or episodes < f.episodes:  # of others all that can be read were
         console.print(
-            f"note: {name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); recordings that occur twice "
-            "are found among these alone",
+            f"note: {name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); duplicate recordings are "
+            "searched only among these",
             soft_wrap=True,
         )
 
@@ -153,7 +153,7 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
     for v in viewed:
         f = v.facts
         if not f.cameras:
-            after = "leave it out, or write it with its pictures as images: it has no camera"
+            after = "leave it out, or write it again with its pictures stored as images: it has no camera"
         elif not v.registered:
             words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", file)
             after = f"{words}  (it is not in the registry; this writes its entry)"
@@ -165,8 +165,8 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
             after = no_window(f, v.stride, registry)
         elif v.stride != v.entry.stride and v.entry.rate is not None:
             after = (
-                f"nothing yet: its entry has a rate of its own, {v.entry.rate:g} Hz: a study takes it at stride "
-                f"{v.entry.stride}, whatever the study's rate"
+                f"no command: its entry sets rate = {v.entry.rate:g} Hz, so a study reads it at stride {v.entry.stride}, "
+                "whatever the study's rate"
             )
         else:
             rate = None if v.stride == v.entry.stride else v.entry.hz / v.stride

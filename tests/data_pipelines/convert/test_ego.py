@@ -115,7 +115,7 @@ def test_ego4d_files_that_are_none_are_refused(tmp_path):
     with pytest.raises(DataError, match="no list 'videos'"):
         Ego4dSource(tmp_path / "a.json", tmp_path)
     (tmp_path / "a.json").write_text('{"videos": [{"video_uid": "x"}]}')
-    with pytest.raises(DataError, match="none of the 1 annotated videos is there.*--videos"):
+    with pytest.raises(DataError, match="none of the 1 annotated videos as .*--videos"):
         Ego4dSource(tmp_path / "a.json", tmp_path)
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(DataError, match="a.json cannot be read"):
@@ -169,9 +169,9 @@ def test_what_never_shows_both_hands_is_left_out_and_counted(tmp_path):
     for place in (tmp_path / "a", tmp_path / "b"):
         place.mkdir()
     source = egoexo4d(tmp_path / "a", {str(n): pose(n, "cam03") for n in range(40)})
-    with pytest.raises(DataError, match="no episode can be made of it: 1 x no frame with both hands"):
+    with pytest.raises(DataError, match="no episode can be made from it: 1 x no frame with both hands"):
         convert(source, tmp_path, "exoego4d")
-    with pytest.raises(DataError, match="no episode can be made of it: 1 x no frame with both hands"):
+    with pytest.raises(DataError, match="no episode can be made from it: 1 x no frame with both hands"):
         convert(ego4d(tmp_path / "b", action(annotated(3, ("left_hand",)))), tmp_path, "ego4d")
 
 
@@ -195,10 +195,10 @@ def test_the_release_keeps_what_is_too_short_and_we_do_not(tmp_path):
         ({"3": [{}]}, {}, "uid-1.json: frame '3' has no usable annotation2D"),
         ({"x": pose(3)}, {}, "uid-1.json: frame 'x' has no usable annotation2D"),
         ({"3": pose(3), "-1": pose(3)}, {}, "uid-1.json: frame '-1' has no usable annotation2D"),
-        ({"3": pose(3), "4" * 9: pose(3)}, {}, "uid-1.json: frame 444444444, but .*cam01.mp4 has .* at most"),
+        ({"3": pose(3), "4" * 9: pose(3)}, {}, "uid-1.json: it has frame 444444444, but .*cam01.mp4 has at most"),
         ({"3": pose(3), "4" * 10: pose(3)}, {}, "uid-1.json: frame '4444444444' has no usable annotation2D"),
         ({"3": pose(3)}, {"fps": 25}, "cam01.mp4: 25 frames per second, not 30"),
-        ({"3": pose(3)}, {"size": (64, 64)}, "64 x 64 pixels is no copy of one of 3840 x 2160"),
+        ({"3": pose(3)}, {"size": (64, 64)}, "64 x 64 pixels has another aspect ratio than 3840 x 2160"),
     ],
 )
 def test_malformed_takes_are_named(tmp_path, poses, options, message):
@@ -212,7 +212,7 @@ def test_takes_stay_below_their_root(tmp_path, field, value):
     egoexo4d(tmp_path, {"3": pose(3)})
     takes = json.loads((tmp_path / "takes.json").read_text())
     (tmp_path / "takes.json").write_text(json.dumps([takes[0] | {field: value}]))
-    with pytest.raises(DataError, match=f"takes.json: {field} .* names no file"):
+    with pytest.raises(DataError, match=f"takes.json: {field} .* is not a file name"):
         EgoExo4dSource(tmp_path)
 
 
@@ -220,7 +220,7 @@ def test_annotated_videos_stay_below_their_folder(tmp_path):
     ego4d(tmp_path, action(annotated(3)))
     text = (tmp_path / "fho_main.json").read_text().replace(f'"{UID}"', '"../full_scale/0a1b"')
     (tmp_path / "fho_main.json").write_text(text)
-    with pytest.raises(DataError, match="fho_main.json: video_uid .* names no file"):
+    with pytest.raises(DataError, match="fho_main.json: video_uid .* is not a file name"):
         Ego4dSource(tmp_path / "fho_main.json", tmp_path / "full_scale")
 
 

@@ -97,7 +97,7 @@ def test_a_pickle_that_is_a_program_is_refused_and_not_run(tmp_path):
     frames, folder = write_epic(tmp_path, "P01_01", [moving(1)])
     path = folder / "P01" / "P01_01.pkl"
     path.write_bytes(pickle.dumps([Program()]))
-    with pytest.raises(DataError, match=r"P01_01.pkl: not a pickled list of bytes \(it asks for .*it was not run"):
+    with pytest.raises(DataError, match=r"P01_01.pkl: not a pickled list of bytes \(it needs .*it was not run"):
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
     assert not ran.exists()
 
@@ -105,13 +105,13 @@ def test_a_pickle_that_is_a_program_is_refused_and_not_run(tmp_path):
 @pytest.mark.parametrize(
     "content, message",
     [
-        (pickle.dumps({"a": b""}), "something else than a list of bytes"),
-        (pickle.dumps([b"", "text"]), "something else than a list of bytes"),
+        (pickle.dumps({"a": b""}), "something other than a list of bytes"),
+        (pickle.dumps([b"", "text"]), "something other than a list of bytes"),
         (b"not a pickle", "not a pickled list of bytes"),
-        (pickle.dumps([detections("P01_01", 1, []), b"\xff\xff"]), "record 1 is no detection message"),
+        (pickle.dumps([detections("P01_01", 1, []), b"\xff\xff"]), "record 1 is not a detection message"),
         (
             pickle.dumps([detections("P01_01", 1, []), detections("P01_01", 3, [])]),
-            "record 1 is of frame 3, not 2",
+            "record 1 is for frame 3, not 2",
         ),
     ],
 )
@@ -134,7 +134,7 @@ def test_frames_that_are_missing_damaged_or_of_another_extraction_are_named(tmp_
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
     frame.write_bytes(whole)
     frame.with_name("frame_0000000031.jpg").write_bytes(whole)
-    with pytest.raises(DataError, match="ends with frame 30: frames and detections are of different extractions"):
+    with pytest.raises(DataError, match="ends with frame 30: frames and detections are from different extractions"):
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
 
 

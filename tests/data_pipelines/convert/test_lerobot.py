@@ -92,7 +92,7 @@ def no_bytes(e, rows):
 @pytest.mark.parametrize(
     "change, camera, message",
     [
-        (late, "video", r"episode 1: timestamp 0.8000 s at row 5, where 10 frames per second make 0.5000 s"),
+        (late, "video", r"episode 1: timestamp 0.8000 s at row 5, but at 10 frames per second it should be 0.5000 s"),
         (unknown_task, "video", "episode 0: task_index 7 at row 0 is not among the tasks"),
         (listed_task, "image", "episode 0: task_index a list of 1 at row 0 is not among the tasks"),
         (worded_time, "image", "episode 0: 'timestamp' is not one array of numbers per row .*noon"),
@@ -101,7 +101,7 @@ def no_bytes(e, rows):
             "video",
             "episode 0: 'action' is not one array of numbers per row|'action' has the shape",
         ),
-        (no_bytes, "image", f"episode 0: '{CAMERA}' at row 0 holds neither bytes nor a path"),
+        (no_bytes, "image", f"episode 0: '{CAMERA}' at row 0 contains neither bytes nor a path"),
         (lambda e, rows: rows.pop("action"), "video", "no column 'action'"),
     ],
 )
@@ -129,10 +129,10 @@ def test_a_video_that_ends_too_early_or_is_none_is_named(tmp_path):
     with pytest.raises(DataError, match=r"file-000.mp4: no frame at 1.2000 s within 0.0501 s: the nearest is at 1.1"):
         convert(LeRobotSource(root), tmp_path, "arm")
     path.write_bytes(b"no video")
-    with pytest.raises(DataError, match="file-000.mp4: no readable video"):
+    with pytest.raises(DataError, match="file-000.mp4: not a readable video"):
         convert(LeRobotSource(root), tmp_path, "arm")
     done = pytest.raises(DataError, convert, LeRobotSource(root), tmp_path, "arm", skip_damaged=True)
-    assert "no episode can be made of it: 2 x" in str(done.value)
+    assert "no episode can be made from it: 2 x" in str(done.value)
 
 
 def test_length_and_rows_must_agree(tmp_path):
@@ -146,16 +146,16 @@ def test_length_and_rows_must_agree(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"codebase_version": "v1.6"}, "codebase_version is 'v1.6'; v2.0, v2.1, v3.0 can be read"),
+        ({"codebase_version": "v1.6"}, "codebase_version is 'v1.6'; only v2.0, v2.1, v3.0 can be read"),
         ({"fps": None}, "no 'fps'"),
-        ({"video_path": None}, "no 'video_path'"),
+        ({"video_path": None}, "'video_path' is missing"),
         (
             {"features": {"action": {"dtype": "float32", "shape": [2]}}},
             "no feature is a video or an image of 3 channels.$",
         ),
         (
             {"features": {"top": {"dtype": "video", "shape": [8, 8, 1]}}},
-            "3 channels .there are 'top': 8x8x1; grey ones",
+            "3 channels .it has 'top': 8x8x1; write grey images",
         ),
         (
             {
@@ -164,7 +164,7 @@ def test_length_and_rows_must_agree(tmp_path):
                     "actions": {"dtype": "float32", "shape": [2]},
                 }
             },
-            "no numeric feature 'action' among top, actions. Call what was done so, there and in the tables",
+            "no numeric feature 'action', but top, actions. Rename the feature that holds the actions to 'action', here and in the tables",
         ),
     ],
 )
@@ -215,7 +215,7 @@ def test_info_of_the_wrong_kind_is_named(tmp_path, change):
     root = write_lerobot(tmp_path / "toy", "v2.1")
     info = json.loads((root / "meta/info.json").read_text()) | change
     (root / "meta/info.json").write_text(json.dumps(info))
-    with pytest.raises(DataError, match="meta/info.json.* Fetch the dataset again"):
+    with pytest.raises(DataError, match="meta/info.json.* Download the dataset again"):
         LeRobotSource(root)
 
 

@@ -81,7 +81,7 @@ def test_a_group_in_the_place_of_an_array_is_damage(tmp_path):
         del file["data/demo_9/actions"]
         file["data/demo_9"].create_group("actions")
 
-    with pytest.raises(DataError, match="a.hdf5 is damaged .*Group.*Fetch the file again"):
+    with pytest.raises(DataError, match="a.hdf5 is damaged .*Group.*Download the file again"):
         RobomimicSource(write_robomimic(tmp_path / "a.hdf5", change=change))
 
 
@@ -113,7 +113,7 @@ def test_a_demonstration_that_does_not_say_its_success_is_not_written_as_a_failu
         del file["data/demo_10/rewards"], file["data/demo_10/dones"]
 
     source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5", change=change))
-    with pytest.raises(DataError, match="data/demo_10: it does not say whether it succeeded, though others do"):
+    with pytest.raises(DataError, match="data/demo_10: it does not say whether it succeeded, but other recordings do"):
         convert(source, tmp_path, "toy")
     assert convert(source, tmp_path, "toy", skip_damaged=True).episodes == 2
 
@@ -131,10 +131,10 @@ def shorten(file):
         (drop("data/demo_10/actions"), "data/demo_10/actions cannot be read"),
         (drop("data/demo_10/obs/agentview_image"), "data/demo_10/obs/agentview_image cannot be read"),
         (shorten, r"demo_10/obs/agentview_image is uint8 \[6, 32, 32, 3\]; 7 actions need"),
-        (env_args("{"), "env_args of 'data' is no JSON"),
-        (env_args(3), "env_args of 'data' is no JSON"),
-        (env_args('{"env_kwargs": {"control_freq": "fast"}}'), "says control_freq 'fast', which is no rate"),
-        (env_args('{"env_kwargs": {"control_freq": -20}}'), "says control_freq -20, which is no rate"),
+        (env_args("{"), "env_args of 'data' is not JSON"),
+        (env_args(3), "env_args of 'data' is not JSON"),
+        (env_args('{"env_kwargs": {"control_freq": "fast"}}'), "says control_freq 'fast', which is not a rate"),
+        (env_args('{"env_kwargs": {"control_freq": -20}}'), "says control_freq -20, which is not a rate"),
     ],
 )
 def test_malformed_files_are_named_to_the_field(tmp_path, change, message):
@@ -155,5 +155,5 @@ def test_a_mask_that_names_a_demonstration_twice_is_refused(tmp_path):
 
 def test_something_else_than_hdf5_is_refused(tmp_path):
     (tmp_path / "x.hdf5").write_text("no")
-    with pytest.raises(DataError, match="no readable HDF5 file"):
+    with pytest.raises(DataError, match="not a readable HDF5 file"):
         RobomimicSource(tmp_path / "x.hdf5")

@@ -121,7 +121,7 @@ def test_stopped_between_the_last_shard_and_the_end(tmp_path, monkeypatch):
 def test_a_second_run_does_nothing_and_another_source_is_refused(tmp_path):
     first = convert(Counting(), tmp_path, "toy")
     assert convert(Counting(stop_at=0), tmp_path, "toy") == first
-    with pytest.raises(ConfigError, match="exists already and was not made of this source"):
+    with pytest.raises(ConfigError, match="exists already and was made from another source or with other settings"):
         convert(Counting(salt=1), tmp_path, "toy")
 
 
@@ -137,14 +137,14 @@ def test_damage_stops_or_is_left_out_and_counted(tmp_path):
 def test_who_leaves_damage_out_is_not_advised_to(tmp_path, monkeypatch, advice):
     def read(self, unit):
         if unit == 4:
-            raise UnitError(f"u4.mp4: no readable video. {advice}")
+            raise UnitError(f"u4.mp4: not a readable video. {advice}")
         yield from plain(self, unit)
 
     plain = Counting.read
     monkeypatch.setattr(Counting, "read", read)
     with pytest.raises(UnitError, match="--skip-damaged"):
         convert(Counting(), tmp_path, "toy")
-    assert "u4.mp4: no readable video." in convert(Counting(), tmp_path, "toy", skip_damaged=True).skipped
+    assert "u4.mp4: not a readable video." in convert(Counting(), tmp_path, "toy", skip_damaged=True).skipped
 
 
 def spoil(part, key, value):
@@ -173,7 +173,7 @@ def test_an_episode_that_contradicts_the_layout_is_named(tmp_path, change, messa
 
 
 def test_nothing_left_is_an_error_that_says_why(tmp_path):
-    with pytest.raises(DataError, match="no episode can be made of it: 1 x nothing in it"):
+    with pytest.raises(DataError, match="no episode can be made from it: 1 x nothing in it"):
         convert(Counting(units=["u0"]), tmp_path, "toy")
     assert not any((tmp_path / "toy").iterdir())
 

@@ -256,16 +256,18 @@ def test_actions_that_are_kept_as_bytes_are_told_and_not_called_damage(tmp_path)
     kinds = {f.key: f.kind for f in facts.fields}
     assert (kinds["action"], kinds["observation/depth"], facts.damaged) == ("bytes", "bytes", {})
     suggestion = suggest_entry(facts, 4)
-    assert not suggestion.action_keys and "action is kept as bytes, which are not read" in " ".join(suggestion.reasons)
-    with pytest.raises(ConfigError, match="'action' in .*features.json is kept as bytes .encoding 'bytes'."):
+    assert not suggestion.action_keys and "action is stored as bytes, which cannot be read" in " ".join(
+        suggestion.reasons
+    )
+    with pytest.raises(ConfigError, match="'action' in .*features.json is stored as bytes .encoding 'bytes'."):
         RldsDataset(directory).check_keys("observation/image", ("action",))
 
 
 @pytest.mark.parametrize(
     "name, shape, reason",
     [
-        ("actions", (3,), "no numeric field `action`; name in action_keys what was done, of actions"),
-        ("action", (None,), "action has no fixed length, and is not read"),
+        ("actions", (3,), "no numeric field `action`; give the fields of the action in action_keys, from actions"),
+        ("action", (None,), "action has no fixed length, so it cannot be read"),
     ],
 )
 def test_actions_that_are_not_taken_are_told(tmp_path, name, shape, reason):
@@ -288,7 +290,7 @@ def test_records_that_are_no_episodes_are_told(tmp_path):
 
     directory = write_rlds(tmp_path, make_spec(), [5] * 2)
     tf.FeaturesDict({"image": tf.Image(shape=(8, 8, 3)), "label": tf.Text()}).save_config(str(directory))
-    with pytest.raises(DataError, match=r"features.json: none of its fields \(image, label\) is one of a step"):
+    with pytest.raises(DataError, match=r"features.json: none of its fields \(image, label\) is below `steps`"):
         inspect_dataset(directory)
 
 
@@ -310,7 +312,7 @@ def test_directory_without_a_usable_episode(tmp_path):
 
 
 def test_unknown_split_lists_those_there(toy):
-    with pytest.raises(ConfigError, match="no split 'val'.*splits there: train"):
+    with pytest.raises(ConfigError, match="no split 'val'.*; it has train"):
         inspect_dataset(toy, "val")
 
 

@@ -150,7 +150,9 @@ def test_the_same_recording_twice(tmp_path):
         if episode in (3, 6):
             healthy(99, features)
 
-    assert issues_of(tmp_path, change) == {"likely duplicates": "warning: 1 episodes repeat another: train 3 = train 6"}
+    assert issues_of(tmp_path, change) == {
+        "likely duplicates": "warning: 1 episodes are copies of another one: train 3 = train 6"
+    }
 
 
 @pytest.mark.parametrize("what", ["steps/action", "steps/observation/image"])
@@ -169,7 +171,7 @@ def test_pictures_decide_where_no_action_varies(tmp_path):
         healthy(episode % 4, features)
         features["steps/action"][:] = 0
 
-    assert "4 episodes repeat another" in issues_of(tmp_path, change)["likely duplicates"]
+    assert "4 episodes are copies of another one" in issues_of(tmp_path, change)["likely duplicates"]
 
 
 def test_a_recording_is_known_again_compressed_and_smaller():

@@ -171,7 +171,7 @@ def test_held_out_episodes_that_were_all_skipped_are_told_as_such(tmp_path):
     for number in held:
         next(directory.glob(f"*-{number:05d}-of-00060")).unlink()
     with pytest.raises(
-        DataError, match="the 3 of its 60 that are held out were all skipped; val_fraction=0.05, min_val=2 and"
+        DataError, match="all 3 held-out episodes of its 60 were skipped; val_fraction=0.05, min_val=2 and"
     ):
         make_frame_loader([(SPEC, directory)], 8, 4, 0, split="val", corrupt="skip")
 

@@ -271,11 +271,13 @@ def test_dataset_without_windows_is_dropped_and_reported(tmp_path):
     store = store_of(tmp_path, {"long": [20] * 6, "short": [3] * 6})
     selected = select_windows(store, LoaderConfig(frames=6, batch=4))
     assert set(selected.mixture.names) == {"long"}
-    assert "2 frames, the least there may be, need 4 native frames" in selected.mixture.dropped["short"]
+    assert "a window has at least 2 frames, which at stride 2 need 4 native frames" in selected.mixture.dropped["short"]
     table = store.embodiment_table(("short", "long"))
     (batch,) = take(store, table, 1, LoaderConfig(frames=6, batch=4))
     assert set(batch["embodiment"].tolist()) == {1}
-    with pytest.raises(DataError, match="short: 2 frames, the least .* longest of its 5 train episodes has 3"):
+    with pytest.raises(
+        DataError, match="short: a window has at least 2 frames, .* longest of its 5 train episodes has 3"
+    ):
         make_loader(store, table, LoaderConfig(frames=6, batch=4, datasets=("short",)))
 
 
@@ -296,7 +298,7 @@ def test_a_dataset_whose_drawn_trajectories_were_all_skipped_is_dropped_and_repo
         mixture = select_windows(store, LoaderConfig(frames=4, max_trajectories=1, seed=seed, weighed=weighed)).mixture
         assert mixture.names == ("whole",) if mixture.dropped else {"whole", "damaged"} == set(mixture.names)
         lost += mixture.dropped.items()
-    assert set(lost) == {("damaged", "the trajectories that were drawn of it were all skipped: raise max_trajectories")}
+    assert set(lost) == {("damaged", "all trajectories that were drawn from it were skipped: raise max_trajectories")}
 
 
 # --- order of datasets, weights, statistics, rate ---------------------------------------------------
@@ -357,9 +359,9 @@ def test_damaged_statistics_are_named(store_root, tmp_path):
     path = next((tmp_path / "store").glob("arm/*.moments.npy"))
     whole = path.read_bytes()
     for damaged, words in (
-        (whole[:50], "statistics of actions cannot be read"),
-        (whole.replace(b"'shape'", b"'shape(", 1), "statistics of actions cannot be read"),
-        (whole.replace(b"<f8", b"<i8", 1), r"int64 \[\d+, 7\] are no statistics of \d+ episodes"),
+        (whole[:50], "the action statistics cannot be read"),
+        (whole.replace(b"'shape'", b"'shape(", 1), "the action statistics cannot be read"),
+        (whole.replace(b"<f8", b"<i8", 1), r"int64 \[\d+, 7\] cannot be the action statistics of \d+ episodes"),
     ):
         path.write_bytes(damaged)
         with pytest.raises(DataError, match=f"moments.npy: {words}.* Remove the file"):
@@ -372,7 +374,9 @@ def test_the_rate_is_a_setting(tmp_path):
         config = LoaderConfig(frames=6, batch=4, rate=rate)
         (batch,) = take(store, training_table(store, config), 1, config)
         assert (np.diff(batch["tokens"][..., 0]) == stride).all() and batch["actions"].shape == (4, 6, 3 * stride)
-    with pytest.raises(ConfigError, match="toy: the model was made for frames at stride 5, here they are at stride 2"):
+    with pytest.raises(
+        ConfigError, match="toy: the model was trained with frames at stride 5, but here the stride is 2"
+    ):
         make_loader(store, store.embodiment_table(("toy",)), config)
 
 
@@ -393,13 +397,15 @@ def test_rows_need_not_lie_side_by_side(store, table):
 
 @pytest.mark.parametrize("rows", [[16], [-1], []])
 def test_rows_that_a_batch_does_not_have(store, table, rows):
-    with pytest.raises(ConfigError, match=r"a batch of 16 rows has none of \["):
+    with pytest.raises(ConfigError, match=r"are not in a batch of 16 rows"):
         make_loader(store, table, CONFIG, rows=rows)
 
 
 def test_table_of_another_action_layout(store, table):
     wrong = EmbodimentTable((replace(table.entries[0], stride=1), *table.entries[1:]))
-    with pytest.raises(ConfigError, match="arm: the model was made for frames at stride 1, here they are at stride 2"):
+    with pytest.raises(
+        ConfigError, match="arm: the model was trained with frames at stride 1, but here the stride is 2"
+    ):
         make_loader(store, wrong, CONFIG)
 
 
@@ -410,7 +416,7 @@ def test_swapped_actions_are_refused(store, tmp_path):
     swapped = replace(spec, action_keys=spec.action_keys[::-1], action_dims=spec.action_dims[::-1])
     tokenize_dataset(swapped, write_rlds(tmp_path, spec, [60] * 4), FakeTokenizer(), tmp_path / "store")
     other, config = TokenStore(tmp_path / "store"), replace(CONFIG, datasets=("hand",))
-    with pytest.raises(ConfigError, match="hand: the values of an action are others, or stand in another order"):
+    with pytest.raises(ConfigError, match="hand: the action has other values, or another order of them"):
         make_loader(other, table, config)
     unknown = EmbodimentTable((replace(table.entries[0], layout=""),))  # a model of an earlier version
     assert next(make_loader(other, unknown, config))["tokens"].shape == (16, 6, 4)
@@ -421,7 +427,7 @@ def test_datasets_of_different_tokenizers_do_not_mix(store_root, tmp_path):
         spec = make_spec(name, hz=2)
         tokenize_dataset(spec, write_rlds(tmp_path, spec, [20] * 4), tokenizer, tmp_path / "store")
     store = TokenStore(tmp_path / "store")
-    with pytest.raises(ConfigError, match="tokenised differently"):
+    with pytest.raises(ConfigError, match="tokenised with different tokenizers"):
         make_loader(store, store.embodiment_table(store.names), CONFIG)
 
 

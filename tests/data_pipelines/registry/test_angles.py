@@ -76,7 +76,7 @@ def test_stored_actions_are_as_the_entry_says_and_have_no_jump(tmp_path, rlds):
 def test_the_layout_is_part_of_what_identifies_the_data(tmp_path, rlds):
     tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     unwrapped = replace(SPEC, angles=(2,), angle_form="unwrapped")  # of the same width
-    with pytest.raises(ConfigError, match="another way.*spec.angle_form: 'as_recorded' -> 'unwrapped'"):
+    with pytest.raises(ConfigError, match="with other settings.*spec.angle_form: 'as_recorded' -> 'unwrapped'"):
         tokenize_dataset(unwrapped, rlds, FakeTokenizer(), tmp_path / "store")
 
 
@@ -107,10 +107,10 @@ def test_droid_s_roll_and_yaw_are_given_without_their_jumps():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"angles": (3,)}, "angles must be increasing numbers of its 3 action values"),
+        ({"angles": (3,)}, "angles must be increasing positions in its 3 action values"),
         ({"angles": (1, 1)}, "angles must be increasing"),
         ({"angles": (-1,)}, "angles must be increasing"),
-        ({"angle_form": "unwrapped"}, "needs to know which values are angles"),
+        ({"angle_form": "unwrapped"}, "needs the list of values that are angles"),
     ],
 )
 def test_entry_whose_angles_cannot_be_right_is_refused(change, message):
@@ -121,5 +121,5 @@ def test_entry_whose_angles_cannot_be_right_is_refused(change, message):
 def test_unknown_form_in_a_file_is_named(tmp_path):
     text = to_toml(replace(SPEC, angles=(2,), angle_form="unwrapped"))
     (tmp_path / "my.toml").write_text(text.replace('"unwrapped"', '"sincos"'))
-    with pytest.raises(ConfigError, match="my.toml: toy.angle_form: 'sincos' is not a choice; .*sine_cosine"):
+    with pytest.raises(ConfigError, match="my.toml: toy.angle_form: 'sincos' is not allowed; .*sine_cosine"):
         load_entries(tmp_path / "my.toml")

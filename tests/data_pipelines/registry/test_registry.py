@@ -53,7 +53,9 @@ def test_every_embodiment_of_the_suite_is_registered():
 
 @pytest.mark.parametrize("split", ["train", "val", "val+train"])
 def test_a_split_that_is_held_out_must_follow_another(split):
-    with pytest.raises(ConfigError, match="val_split 'val' is held out, so it must follow another in split"):
+    with pytest.raises(
+        ConfigError, match="val_split val is the held-out split, so split must name it after another one"
+    ):
         replace(get_spec("bridge_dataset"), split=split, val_split="val")
 
 
@@ -160,9 +162,11 @@ def test_stride_at_another_rate(rate, stride):
 
 def test_impossible_rates_are_refused():
     spec = DatasetSpec("x", "observation/image", ("action",), (1,), 30)
-    with pytest.raises(ConfigError, match="dataset 'x': rate, of its frames in Hz, must be positive and finite, got 0"):
+    with pytest.raises(
+        ConfigError, match="dataset 'x': rate, the frame rate in Hz, must be positive and finite, got 0"
+    ):
         replace(spec, rate=0.0)
-    with pytest.raises(ConfigError, match="rate of a window's frames must be positive"):
+    with pytest.raises(ConfigError, match="the frame rate must be positive"):
         spec.stride_at(-1.0)
 
 
@@ -198,7 +202,7 @@ def test_part_of_a_field_is_read_as_the_action(tmp_path):
     [
         ({"hz": 0}, "hz, the native rate, must be positive"),
         ({"action_dims": (7, 1)}, "same length"),
-        ({"action_keys": ("action[:6]",)}, r"'action\[:6\]' takes 6 values, action_dims says 7"),
+        ({"action_keys": ("action[:6]",)}, r"'action\[:6\]' uses 6 values, but action_dims says 7"),
         ({"action_dims": (0,)}, "at least 1"),
     ],
 )
@@ -238,14 +242,14 @@ def test_registered_entry_is_found_and_takes_the_place_of_a_known_one(registered
     ("text", "message"),
     [
         ("[robot", "not a TOML file"),
-        ("hz = 3", "hz = 3 stands outside"),
+        ("hz = 3", "hz = 3 is not in a table"),
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\n', "robot: missing field.* hz"),
         ('[robot]\nimage = "i"\n', "unknown field.* image; known"),
-        ('[robot]\nname = "arm"\nimage_key = "i"\n', "robot: leave out name = 'arm'"),
+        ('[robot]\nname = "arm"\nimage_key = "i"\n', "robot: remove name = 'arm'"),
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\nhz = -1\n', "hz, the native rate"),
         (
             '[robot]\nimage_key = "i"\naction_keys = ["action"]\naction_dims = [2]\nhz = 1\nangles = [1]\n',
-            'robot: angles say which values wrap; add angle_form = "sine_cosine"',
+            'robot: angles needs angle_form too; add angle_form = "sine_cosine"',
         ),
     ],
 )
@@ -282,7 +286,7 @@ def test_an_entry_is_put_into_a_file_and_nothing_else_changes(name, tmp_path):
     assert spec in load_entries(tmp_path / "my.toml") and "# of our lab\n" in text and "\n\n# asked in May\n" in text
     assert ('["a.rm"]  # the left one' in text) == (name != "a.rm") and put_entry(text, spec, "my.toml") == text
     assert put_entry("", spec, "my.toml") == to_toml(spec)
-    with pytest.raises(ConfigError, match="my.toml: no place for the entry of x"):
+    with pytest.raises(ConfigError, match="my.toml: the entry of x cannot be added to this file"):
         put_entry('x = {image_key = "i", action_keys = [], action_dims = [], hz = 1}', make_spec("x"), "my.toml")
 
 
@@ -296,9 +300,9 @@ def test_the_rate_that_is_advised_gives_the_stride_of_the_model(hz, stride):
     """The official release floors a ratio of rates that is rounded here: 5 Hz are stride 2 there and 3 here."""
     spec = make_spec("toy", hz=hz)
     robot = Embodiment("toy", 3, stride, (0.0,) * 3, (1.0,) * 3)
-    with pytest.raises(ConfigError, match=f"made for frames at stride {stride}, here they are at stride") as refused:
+    with pytest.raises(ConfigError, match=f"trained with frames at stride {stride}, but here the stride is") as refused:
         spec.check_like(robot)
     rate = re.search(r"`rate = ([0-9.]+)` into the entry of toy", str(refused.value))[1]
     replace(spec, rate=float(rate)).check_like(robot)
-    with pytest.raises(ConfigError, match=r"made for 2 action values, .* gives 3: action \(3\)"):
+    with pytest.raises(ConfigError, match=r"trained with 2 action values, .* has 3: action \(3\)"):
         spec.check_like(Embodiment("toy", 2, stride, (0.0,) * 2, (1.0,) * 2))

@@ -64,10 +64,10 @@ def test_a_world_that_gives_way_to_another_robot_is_closed():
 
 def test_what_cannot_be_simulated_is_said():
     assert "metaworld_sawyer" not in PHYSICS  # fifty tasks: a seed does not say which
-    with pytest.raises(ConfigError, match="no robot 'metaworld_sawyer'"):
+    with pytest.raises(ConfigError, match="robot 'metaworld_sawyer' has no true simulator"):
         PhysicsSimulator([Robot("metaworld_sawyer", 1, (0.0,), (1.0,), (0.0,))])
-    with pytest.raises(ConfigError, match="4 action values in truth, not 1"):
+    with pytest.raises(ConfigError, match="4 action values in the true simulator, not 1"):
         PhysicsSimulator([Robot("metaworld_drawer", 1, (0.0,), (1.0,), (0.0,))])
     (start,) = starts(1)
-    with pytest.raises(ConfigError, match="with which seed"):
+    with pytest.raises(ConfigError, match="has no seed for the true simulator"):
         PhysicsSimulator([DRAWER], image_size=8).reset(Start(start.robot, start.images, start.actions))

@@ -160,4 +160,4 @@ def test_actions_of_another_robot_are_refused(made):
         f"start = read_start(RldsDataset({str(made / 'pusht')!r}), 0)\nreplay('pusht', start, [[0.0] * 7])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "actions of shape (1, 7) cannot be run: this robot takes [N, 2]" in done.stderr
+    assert "actions of shape (1, 7) cannot be run: this robot needs [N, 2]" in done.stderr

@@ -160,7 +160,7 @@ def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
 
     fake.made.clear()
     fake.dies_at = 4
-    message = "pusht: its simulator ended with code -11: cannot draw.*tries them again"
+    message = "pusht: its simulator ended with exit code -11: cannot draw.*tries them again"
     with pytest.raises(DataError, match=message):
         run(tmp_path / "cut")
     assert sorted(fake.made) == [0, 1, 2, 3, 10, 11], "the other job of the dataset was not run"
@@ -187,7 +187,7 @@ def test_a_dataset_of_other_settings_or_of_others_is_not_replaced(tmp_path, fake
         with pytest.raises(ConfigError, match=f"pusht/1.0.0: {how}. Nothing was changed. Choose another directory"):
             run(tmp_path, **change)
     (tmp_path / "pusht/1.0.0/metadata.json").write_text("{}")
-    with pytest.raises(ConfigError, match="it says nothing of what it was made from"):
+    with pytest.raises(ConfigError, match="it does not say how it was made"):
         run(tmp_path)
     assert not fake.made and contents(tmp_path) == kept | {"pusht/1.0.0/metadata.json": b"{}"}
 

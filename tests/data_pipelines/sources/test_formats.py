@@ -68,7 +68,8 @@ def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
     (tmp_path / "机器人").symlink_to(root)
     for read in (open_source, source_name):
         with pytest.raises(
-            DataError, match="机器人: a LeRobot dataset is called as its folder, which has none of a to z"
+            DataError,
+            match="机器人: a LeRobot dataset gets the name of its folder, but this name contains none of a to z",
         ):
             read(tmp_path / "机器人")
 
@@ -206,7 +207,7 @@ def test_actions_that_are_texts_are_damage(tmp_path):
         file["data/demo_10/actions"] = np.full((7, 7), b"left")
 
     source = open_source(write_robomimic(tmp_path / "image.hdf5", change=spoil))
-    with pytest.raises(EpisodeError, match="demo_10: 'steps/action' holds no numbers, but [|]S4"):
+    with pytest.raises(EpisodeError, match="demo_10: 'steps/action' contains no numbers, but [|]S4"):
         source.episode(1, VIEW.image_key, VIEW.action_keys)
 
 
@@ -352,7 +353,8 @@ def test_a_damaged_video_loses_its_episode_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "box, message", [(b"stts", "cannot be decoded"), (b"stsd", "encoded in no known way"), (b"Lavf", None)]
+    "box, message",
+    [(b"stts", "cannot be decoded"), (b"stsd", "the encoding of its video is not known"), (b"Lavf", None)],
 )
 def test_a_video_with_a_damaged_index_is_damage_whatever_ffmpeg_calls_it(tmp_path, box, message):
     """It says that an operation is not permitted. A note that is no text does no harm."""
@@ -386,7 +388,7 @@ def test_what_is_no_dataset_is_named(tmp_path):
     with pytest.raises(DataError, match="no such directory"):
         open_source(tmp_path / "absent")
     (tmp_path / "x.hdf5").write_bytes(b"no file of this kind")
-    with pytest.raises(DataError, match="x.hdf5: no readable HDF5 file"):
+    with pytest.raises(DataError, match="x.hdf5: not a readable HDF5 file"):
         open_source(tmp_path / "x.hdf5")
     with pytest.raises(ConfigError, match="no split 'test'"):
         open_source(write_lerobot(tmp_path / "toy-arm", "v2.1"), "test")

@@ -101,9 +101,9 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ConfigError, match="unknown embodiment 'pusher_gold'; the suite has .*pusher_sand"):
         Environment("pusher_gold")
     env = Environment("pusher_sand")
-    with pytest.raises(ConfigError, match=r"pusher_sand: an action is of shape \(2,\), got \(3,\)"):
+    with pytest.raises(ConfigError, match=r"pusher_sand: an action must have shape \(2,\), got \(3,\)"):
         env.step(np.zeros(3))
     with pytest.raises(ConfigError, match="the action is not finite"):
         env.step(np.array([0.0, np.nan]))
-    with pytest.raises(ConfigError, match="the state is of another robot"):
+    with pytest.raises(ConfigError, match="the state is from another robot"):
         env.set_state(Environment("arm_chalk").get_state())

@@ -121,7 +121,7 @@ def test_the_validation_split_is_what_is_held_out(suite):
     seeds = [int(source.record(i)["episode_metadata/seed"][0]) for i in range(len(source))]
     robot = next(s for s in EMBODIMENTS if s.name == spec.name)
     assert seeds[MIN_EPISODES:] == episode_seeds(robot, 3, 0, "val").tolist()
-    with pytest.raises(ConfigError, match="no split 'test'.*splits there: train, val"):
+    with pytest.raises(ConfigError, match="no split 'test'.*; it has train, val"):
         RldsDataset(suite / spec.name, "train+test")
 
 

@@ -58,13 +58,13 @@ def test_what_is_refused_changes_no_episode():
         ):
             with pytest.raises(ConfigError, match="episodes must be different numbers below 2"):
                 refused()
-    with pytest.raises(ConfigError, match=r"frames: whole numbers are needed, got \[0.5\]"):
+    with pytest.raises(ConfigError, match=r"frames must be whole numbers, got \[0.5\]"):
         sim.rewind(0.5)
-    with pytest.raises(ConfigError, match=r"episodes: whole numbers are needed, got \[1.5\]"):
+    with pytest.raises(ConfigError, match=r"episodes must be whole numbers, got \[1.5\]"):
         SuiteSimulator([PUSHER], episodes=1.5)
-    with pytest.raises(ConfigError, match="with which seed"):
+    with pytest.raises(ConfigError, match="has no seed for the true simulator"):
         sim.reset([start, unknown])
-    with pytest.raises(ConfigError, match="episode 1 can be taken back by 0 frames"):
+    with pytest.raises(ConfigError, match="in episode 1 at most 0 frames can be rewound"):
         sim.rewind(1)
     np.testing.assert_array_equal(sim.images, now)
     assert sim.max_rewind(0) == 1
@@ -101,10 +101,10 @@ def test_the_judge_says_when_the_goal_is_reached():
 
 def test_what_the_suite_has_not_is_said():
     other = type(PUSHER)("walker", 1, (0.0,), (1.0,), (0.0,))
-    with pytest.raises(ConfigError, match="no robot 'walker'"):
+    with pytest.raises(ConfigError, match="robot 'walker' has no true simulator"):
         SuiteSimulator([other])
-    with pytest.raises(ConfigError, match="2 action values in truth, not 3"):
+    with pytest.raises(ConfigError, match="2 action values in the true simulator, not 3"):
         SuiteSimulator([type(PUSHER)("pusher_sand", 2, (0.0,) * 3, (1.0,) * 3, (0.0,) * 3)])
     start = suite_starts("pusher_sand", 8, 1)[0]
-    with pytest.raises(ConfigError, match="with which seed"):
+    with pytest.raises(ConfigError, match="has no seed for the true simulator"):
         SuiteSimulator([PUSHER]).reset(type(start)(start.robot, start.images, start.actions))

@@ -204,7 +204,7 @@ def test_jobs_of_different_settings_do_not_mix(rlds, tmp_path):
         run(rlds, tmp_path, progress=stop_after(10), keep_frames="all")
     assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == []
     run(rlds, tmp_path)
-    with pytest.raises(ConfigError, match="already tokenised in another way.*keep_frames"):
+    with pytest.raises(ConfigError, match="already tokenised with other settings.*keep_frames"):
         run(rlds, tmp_path, keep_frames="all")
 
 
@@ -212,7 +212,7 @@ def test_overwriting_removes_what_was_made_otherwise(rlds, undisturbed, tmp_path
     work = begin(rlds, tmp_path, keep_frames="none")
     run(rlds, tmp_path, keep_frames="all")
     with lock_output(locks_of(work) / "00007"):  # by a process that is alive
-        with pytest.raises(ConfigError, match="toy: process .* is making this dataset in another way"):
+        with pytest.raises(ConfigError, match="toy: process .* is making this dataset with other settings"):
             run(rlds, tmp_path, overwrite=True)
         assert work.is_dir()
     run(rlds, tmp_path, overwrite=True)
@@ -257,7 +257,7 @@ def test_losses_of_all_processes_count_against_the_bound(lossy, tmp_path):
     shared = dict(corrupt="skip", max_skipped=2)
     with pytest.raises(RuntimeError, match="enough"):  # two episodes are lost by then
         run(lossy, tmp_path / "a", progress=stop_after(11), **shared)
-    with pytest.raises(DataError, match="3 episodes are unusable, more than max_skipped=2.*episode 12 "):
+    with pytest.raises(DataError, match="3 episodes cannot be used, more than max_skipped=2.*episode 12 "):
         run(lossy, tmp_path / "a", **shared)
     assert len(kept_parts(tmp_path / "a")) <= 7, "it went on to the end before it said so"
     with pytest.raises(EpisodeError, match="not finite"):  # parts with losses are no longer good enough
@@ -275,7 +275,7 @@ def test_losses_of_a_process_at_the_same_time_are_seen_before_the_end(lossy, tmp
             with pytest.raises(RuntimeError, match="enough"):
                 run(lossy, tmp_path / "a", progress=stop_after(11), **shared)
 
-    with pytest.raises(DataError, match="3 episodes are unusable"):
+    with pytest.raises(DataError, match="3 episodes cannot be used"):
         run(lossy, tmp_path / "a", progress=other, **shared)
     assert len(kept_parts(tmp_path / "a")) <= 7
 

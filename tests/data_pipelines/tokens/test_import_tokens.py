@@ -179,7 +179,7 @@ def test_a_second_run_does_nothing_and_other_folders_are_refused(tmp_path, pair)
     stamp = (tmp_path / "store/toy_arm/train-00000-of-00001.array_record").stat().st_mtime_ns
     assert import_tokens(*pair, tmp_path / "store", hz=4) == first
     assert (tmp_path / "store/toy_arm/train-00000-of-00001.array_record").stat().st_mtime_ns == stamp
-    with pytest.raises(ConfigError, match="in another way .*hz: 4.0 -> 6.0"):
+    with pytest.raises(ConfigError, match="with other settings .*hz: 4.0 -> 6.0"):
         import_tokens(*pair, tmp_path / "store", hz=6)
 
 
@@ -216,9 +216,9 @@ def both(first, second):
 @pytest.mark.parametrize(
     "damage, message",
     [
-        (cut("video.bin", 100), r"video.bin: 100 bytes, but .* make 1344 \(uint32 \[21, 4, 4\]\)"),
-        (cut("segment_ids.bin", 80), "segment_ids.bin: 80 bytes, but num_images .* make 84"),
-        (cut("actions/part_0.bin", 90), r"part_0.bin: 90 bytes are no float32 \[21, A\]"),
+        (cut("video.bin", 100), r"video.bin: it has 100 bytes, but by .* it should have 1344 \(uint32 \[21, 4, 4\]\)"),
+        (cut("segment_ids.bin", 80), "segment_ids.bin: it has 80 bytes, but by num_images .* it should have 84"),
+        (cut("actions/part_0.bin", 90), r"part_0.bin: its 90 bytes are not an array float32 \[21, A\]"),
         (cut("metadata.json", 9), "metadata.json cannot be read"),
         (lambda p: (p / "metadata.json").unlink(), "metadata.json is missing: give a folder of the release"),
         (lambda p: (p / "actions/part_0.bin").unlink(), r"actions: no \*.bin"),
@@ -252,7 +252,7 @@ def test_raw_images_and_odd_vocabularies_are_refused(tmp_path, pair):
     with pytest.raises(ConfigError, match="raw images .* not tokens"):
         import_tokens(*pair, tmp_path / "store", hz=4)
     meta(token_dtype="uint32", vocab_size=1000)(pair[0])
-    with pytest.raises(ConfigError, match="a vocabulary of 1000 is no power of 512"):
+    with pytest.raises(ConfigError, match="the vocabulary size 1000 is not a power of 512"):
         import_tokens(*pair, tmp_path / "store", hz=4)
 
 
@@ -265,7 +265,7 @@ def test_raw_images_and_odd_vocabularies_are_refused(tmp_path, pair):
     ],
 )  # fmt: skip
 def test_metadata_of_the_wrong_kind_is_named(tmp_path, change):
-    with pytest.raises(DataError, match=r"metadata.json: .* Fetch the folder again"):
+    with pytest.raises(DataError, match=r"metadata.json: .* Download the folder again"):
         open_folder(write_folder(tmp_path / "toy_train", **change))
 
 
@@ -282,7 +282,7 @@ def test_episode_numbers_at_both_ends_of_their_type(tmp_path):
     rewrite("segment_ids.bin", np.array([-(2**31), -(2**31), 2**31 - 1, 2**31 - 1], np.int32))(folder)
     assert len(open_folder(folder)) == 2
     rewrite("segment_ids.bin", np.array([2**31 - 1, 2**31 - 1, -(2**31), -(2**31)], np.int32))(folder)
-    with pytest.raises(DataError, match="segment_ids.bin: the episode falls"):
+    with pytest.raises(DataError, match="segment_ids.bin: the episode number falls"):
         open_folder(folder)
 
 

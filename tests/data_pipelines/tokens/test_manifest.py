@@ -122,7 +122,7 @@ def test_columns_of_another_manifest_are_refused(tmp_path, large):
     path = save(large, tmp_path / "a")
     other = save(replace(large, train=replace(large.train, steps=np.asarray(large.train.steps) + 1)), tmp_path / "b")
     path.with_name("episodes.columns").write_bytes(other.with_name("episodes.columns").read_bytes())
-    with pytest.raises(DataError, match="episodes.columns is not the one it was written with"):
+    with pytest.raises(DataError, match="episodes.columns does not belong to it"):
         load_manifest(path)
     path.with_name("episodes.columns").unlink()
     with pytest.raises(DataError, match="cannot be read"):
@@ -174,7 +174,7 @@ def test_a_column_that_claims_more_than_its_file_is_refused(tmp_path):
     write_columns(path, {}, {"x": np.arange(3)})
     columns = Columns(path)
     columns._table["x"] = ("<i8", 2**50, 0, "")
-    with pytest.raises(DataError, match="does not lie inside"):
+    with pytest.raises(DataError, match="reaches beyond the end of the file"):
         columns["x"]
     assert json.dumps(columns.facts) == "{}"
 

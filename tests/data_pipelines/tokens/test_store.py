@@ -107,14 +107,14 @@ def test_unknown_dataset_lists_those_there(store):
 def test_a_copy_under_another_name_is_named(store_root, tmp_path):
     for name in ("arm", "arm_before"):
         shutil.copytree(store_root / "arm", tmp_path / name)
-    with pytest.raises(DataError, match="arm_before: it holds the dataset 'arm'.*move a copy out of the store"):
+    with pytest.raises(DataError, match="arm_before: .* name of its dataset, 'arm'.*move it out of the store"):
         TokenStore(tmp_path)
 
 
 def test_missing_or_empty_store(tmp_path):
-    with pytest.raises(DataError, match="no such token store"):
+    with pytest.raises(DataError, match="there is no token store"):
         TokenStore(tmp_path / "absent")
-    with pytest.raises(DataError, match="no dataset in this token store"):
+    with pytest.raises(DataError, match="the token store is empty"):
         TokenStore(tmp_path)
 
 

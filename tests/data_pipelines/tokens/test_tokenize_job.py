@@ -70,7 +70,7 @@ def test_latents_are_stored_in_half_precision_with_their_own_frames(tmp_path, rl
 
 def test_ids_are_not_taken_for_latents(tmp_path, rlds):
     tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
-    with pytest.raises(ConfigError, match="in another way.*tokenizer.channels: 0 -> 3"):
+    with pytest.raises(ConfigError, match="with other settings.*tokenizer.channels: 0 -> 3"):
         tokenize_dataset(SPEC, rlds, FakeLatents(), tmp_path / "store")
 
 
@@ -127,7 +127,7 @@ def test_second_run_does_nothing_and_other_settings_are_refused(tmp_path, rlds):
     described = replace(SPEC, note="words", camera="more words")
     assert tokenize_dataset(described, rlds, FakeTokenizer(), tmp_path / "store") == first
     assert (tmp_path / "store/toy" / FILES[0]).stat().st_mtime_ns == stamp
-    with pytest.raises(ConfigError, match="in another way.*tokenizer.identity: 'fake' -> 'new'"):
+    with pytest.raises(ConfigError, match="with other settings.*tokenizer.identity: 'fake' -> 'new'"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer("new"), tmp_path / "store")
     with pytest.raises(ConfigError, match="settings.keep_frames: 'val' -> 'all'"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", keep_frames="all")
@@ -141,7 +141,7 @@ def test_interrupted_job_leaves_no_dataset_and_can_be_repeated(tmp_path, rlds):
     with pytest.raises(KeyboardInterrupt):
         tokenize_dataset(SPEC, rlds, Dies(), tmp_path / "store")
     assert visible(tmp_path / "store") == []
-    with pytest.raises(DataError, match="no dataset in this token store"):
+    with pytest.raises(DataError, match="the token store is empty"):
         TokenStore(tmp_path / "store")
     tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     assert files(tmp_path / "store") == ["toy"]
@@ -215,7 +215,7 @@ def test_skipping_too_much_stops_the_job(tmp_path):
     with pytest.raises(DataError, match="more than max_skipped=3"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip", max_skipped=3)
     with pytest.raises(
-        DataError, match=r"no usable episode .* The last left out: .*episode 4 .*is not finite at step 0"
+        DataError, match=r"no episode can be used .* The last one skipped: .*episode 4 .*is not finite at step 0"
     ):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip")
     assert visible(tmp_path / "store") == []

@@ -169,7 +169,7 @@ def test_other_data_is_refused(store, table, manifest, tmp_path):
     other = small_store(tmp_path, "arm")
     small_store(tmp_path, "base")
     small_store(tmp_path, "hand")
-    with pytest.raises(ConfigError, match="not the one the evaluation set was frozen on"):
+    with pytest.raises(ConfigError, match="not the one on which the evaluation set was frozen"):
         eval_batches(TokenStore(other.root), table, manifest, 2)
 
 
@@ -185,8 +185,8 @@ def test_dataset_too_short_to_evaluate_is_reported_and_all_of_them_an_error(tmp_
     store = small_store(tmp_path, "short", [2] * 4)
     frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
     assert frozen.names == ("long",)
-    assert "3 frames, the least there may be, need 3 native frames" in frozen.empty["short"]
-    with pytest.raises(DataError, match="short: 3 frames, the least.*has 2.*a shorter prompt"):
+    assert "a window has at least 3 frames, which at stride 1 need 3 native frames" in frozen.empty["short"]
+    with pytest.raises(DataError, match="short: a window has at least 3 frames.*has 2.*a shorter prompt"):
         freeze_manifest(store, ("short",), 4, 5, 0, prompt=2)
 
 
@@ -228,7 +228,7 @@ def test_the_rate_is_that_of_the_frames(tmp_path):
         batch = next(eval_batches(store, store.embodiment_table(("toy",), rate), frozen, 1))
         assert (np.diff(batch["tokens"][0, :, 0]) == stride).all()
         assert batch["actions"].shape == (1, 4, 3 * stride)
-    with pytest.raises(ConfigError, match="stride 2, here they are at stride 4"):
+    with pytest.raises(ConfigError, match="stride 2, but here the stride is 4"):
         eval_batches(store, store.embodiment_table(("toy",)), frozen, 1)
 
 

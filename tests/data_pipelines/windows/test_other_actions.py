@@ -137,7 +137,7 @@ def test_nothing_is_seen_under_actions_that_there_are_not(tmp_path):
 def test_frames_of_other_windows_or_damaged_ones_are_refused(tmp_path):
     store = small_store(tmp_path)
     frozen = freeze_manifest(store, store.names, 4, 5, 1)
-    with pytest.raises(ConfigError, match="made for other windows than those frozen here"):
+    with pytest.raises(ConfigError, match="made for other windows than the frozen ones"):
         batches(store, 1, counterfactual=frames_for(frozen))
     frames_for(frozen).save(tmp_path / "t.npz")
     whole = (tmp_path / "t.npz").read_bytes()

@@ -77,9 +77,9 @@ def test_the_rate_decides_the_stride(rate, stride):
 
 
 def test_frames_that_are_not_stored_name_the_command_that_stores_them():
-    with pytest.raises(ConfigError, match="toy: 5 Hz is every 2nd .* keeps every 5th.*hma tokenize .*frame_step=1"):
+    with pytest.raises(ConfigError, match="toy: 5 Hz needs every 2nd .* keeps every 5th.*hma tokenize .*frame_step=1"):
         train_windows(OneDataset([60], hz=10, frame_step=5), "toy", 4, rate=5.0)
-    with pytest.raises(ConfigError, match="the native rate is every 1st"):
+    with pytest.raises(ConfigError, match="the native rate needs every 1st"):
         train_windows(OneDataset([60], hz=10, frame_step=5), "toy", 4, rate=None)
 
 
@@ -110,13 +110,17 @@ def test_too_short_episodes_use_up_no_trajectories(runs):
 def test_nothing_long_enough_says_what_is_needed():
     windows = train_windows(OneDataset([2, 3], hz=4), "toy", 12)
     assert len(windows) == 0
-    with pytest.raises(DataError, match="2 frames, the least .* need 4 .* stride 2; the longest of its 2 .* has 3"):
+    with pytest.raises(
+        DataError, match="at least 2 frames, which at stride 2 need 4 .*; the longest of its 2 .* has 3"
+    ):
         require_windows({"toy": windows})
     assert len(train_windows(OneDataset([2, 4], hz=4), "toy", 12)) == 1
 
 
 def test_a_dataset_without_episodes_is_not_a_crash():
-    said = "no val episode to cut .* toy: it has no val episode. Of a single .* add more. .* store.min_val and store"
+    said = (
+        "no val episode for windows.* toy: it has no val episode. Of a single .* add more. .* store.min_val and store"
+    )
     with pytest.raises(DataError, match=said):
         require_windows({"toy": val_windows(OneDataset([10]), "toy", 4, 2)})
 

@@ -127,7 +127,7 @@ def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path,
     shorter = write_trial(tmp_path / "b", trial, table.rows(np.arange(1, len(table))))
     (tmp_path / "nothing").mkdir()
     for b, why in (
-        (shorter, "only one of two evaluations has window ('r0', 100, 0)"),
+        (shorter, "only one of the two evaluations has window ('r0', 100, 0)"),
         (tmp_path / "nothing", "neither a study, nor a finished trial, nor a model that was evaluated"),
     ):
         assert main(["compare", str(a), str(b), "--to", str(tmp_path / "c.csv")]) == Exit.REFUSED == 2
@@ -189,7 +189,10 @@ def test_a_comparison_stays_where_no_place_is_named_for_another(table, tmp_path,
     before = (tmp_path / "comparison.csv").read_bytes()
     assert main(["compare", "a/model", "d/model"]) == 2
     said = capsys.readouterr()
-    assert "a/model - d/model" in said.out and "comparison.csv: another comparison is there, and stays" in said.err
+    assert (
+        "a/model - d/model" in said.out
+        and "comparison.csv holds another comparison, which is not overwritten" in said.err
+    )
     assert (tmp_path / "comparison.csv").read_bytes() == before
     assert main(["compare", "a/model", "d/model", "--to", "comparison.csv"]) == 0
     assert (tmp_path / "comparison.csv").read_bytes() != before

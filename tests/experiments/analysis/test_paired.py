@@ -85,8 +85,8 @@ def changed(table, column: str, row: int, value):
 @pytest.mark.parametrize(
     ("column", "value", "why"),
     [
-        ("episode", 999, r"r1: only one of two evaluations has window \('r1', 103, 0\) \(and 1 others\)"),
-        ("start", 7, r"only one of two evaluations has window \('r1', 103, 0\)"),
+        ("episode", 999, r"r1: only one of the two evaluations has window \('r1', 103, 0\) \(and 1 others\)"),
+        ("start", 7, r"only one of the two evaluations has window \('r1', 103, 0\)"),
         ("frames", 5, r"window \(r1, episode 103, frame 0\) is not the same one in both: 5 and 12 real frames"),
         (
             "psnr_copy",

@@ -83,6 +83,6 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
 def test_a_policy_has_no_frames_to_be_judged(tmp_path):
     policy = make_run(tmp_path, TrainConfig(masking=MaskingConfig(setting="policy")))
     with pytest.raises(
-        ConfigError, match="'policy', which predicts no frames: there are none to judge. `hma evaluate`"
+        ConfigError, match="'policy', which predicts no frames, so there are none to judge. .*`hma evaluate`"
     ):
         check(policy)

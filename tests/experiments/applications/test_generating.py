@@ -102,7 +102,7 @@ def test_what_was_made_under_other_ranges_of_actions_is_not_taken_for_the_same(r
         assert generate(run, recorded, tmp_path, "--episodes", "1") == 2
     finally:
         (run / "robots.json").unlink()
-    assert "was not made of this source with these settings" in " ".join(capsys.readouterr().err.split())
+    assert "was made from another source or with other settings" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_rate_is_the_recordings_where_the_run_does_not_know_it(tmp_path):
@@ -133,7 +133,7 @@ def test_actions_that_stand_in_another_order_than_the_model_learnt_are_not_repla
     assert describe(recorded) != known, "what another camera gives is not taken for the same"
     swapped = replace(spec, action_keys=(f"{key}[1:]", f"{key}[:1]"), action_dims=(1, 1))
     monkeypatch.setattr(trajectories_module, "get_spec", lambda _: swapped)
-    with pytest.raises(ConfigError, match="stand in another order, than when the model was made"):
+    with pytest.raises(ConfigError, match="another order of them, than when the model was trained"):
         opened()
 
 

@@ -67,7 +67,7 @@ def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, c
     monkeypatch.setattr(warm_up, "warm_up", lambda *_, **__: require(False, "enough is said"))
     assert main(["play", str(tmp_path)]) == 2
     said = " ".join(capsys.readouterr().out.split())
-    assert f"not on the page: {', '.join(others)}; there are no held-out frames" in said
+    assert f"not on the page: {', '.join(others)}; this directory has no held-out frames" in said
     assert said.endswith(f"{tmp_path}: {first}; compiling")
 
 

@@ -80,7 +80,7 @@ def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
 
 
 def test_neither_world_is_taken_for_one_that_there_is_not(run):
-    with pytest.raises(ConfigError, match="world: 'learnt' is not a choice; choose one of learned, true"):
+    with pytest.raises(ConfigError, match="world: 'learnt' is not allowed; choose one of learned, true"):
         make_simulator(run, "learnt")
 
 

@@ -95,10 +95,10 @@ def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
         with pytest.raises(ConfigError, match=message):
             read_neutral(tmp_path / "out")
 
-    refused("version 2, this program reads 1", version=2)
-    refused("not a description of this project", format="other")
+    refused("version 2, but this program reads version 1", version=2)
+    refused("not a model description of this project", format="other")
     refused("model.width", model=good["model"] | {"width": "wide"})
-    refused("step: expected a number of steps, got 2.5", step=2.5)
+    refused("step must be a number of steps, got 2.5", step=2.5)
     refused("tensors: expected named fields, got NoneType", tensors=None)
     refused("provenance: expected named fields, got list", provenance=[])
     refused("embed/tables", model=good["model"] | {"factor_vocab": 16})
@@ -120,7 +120,7 @@ def test_weights_that_are_not_finite_are_refused_by_name(tmp_path):
     run = small_run()
     run.params["embed"]["mask"] = np.full_like(run.params["embed"]["mask"], np.nan)
     write_neutral(run, tmp_path / "out")
-    with pytest.raises(ConfigError, match="model.safetensors: embed/mask holds values that are not finite"):
+    with pytest.raises(ConfigError, match="model.safetensors: embed/mask contains values that are not finite"):
         read_neutral(tmp_path / "out")
 
 
@@ -219,7 +219,7 @@ def test_a_program_that_cannot_be_is_refused(tmp_path):
     policy = replace(small_run(), train=train_config(masking=MaskingConfig(setting="policy")))
     with pytest.raises(ConfigError, match="'policy', which predicts no frames"):
         write_stablehlo(policy, tmp_path / "out", ProgramConfig(prompt=2, frames=4))
-    with pytest.raises(ConfigError, match="frames must exceed prompt"):
+    with pytest.raises(ConfigError, match="frames must be more than prompt"):
         ProgramConfig(prompt=3, frames=3)
     with pytest.raises(ConfigError, match="choose some of cpu, cuda"):
         ProgramConfig(platforms=("abacus",))

@@ -137,7 +137,7 @@ def test_tensors_that_are_not_finite_are_refused_by_name(tmp_path):
     tensors["out_x_proj.bias"][3] = np.inf
     halves = {name: x.astype(ml_dtypes.bfloat16) for name, x in tensors.items()}
     for folder, written in (("floats", tensors), ("halves", halves)):
-        with pytest.raises(ConfigError, match=f"{folder}: out_x_proj.bias holds values that are not finite"):
+        with pytest.raises(ConfigError, match=f"{folder}: out_x_proj.bias contains values that are not finite"):
             read_official(write_checkpoint(tmp_path / folder, config, written))
 
 
@@ -156,9 +156,9 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"action_network": ["mlp"]}, "action_network .'mlp'. is not supported"),
         ({"d_model": None}, "missing field.*d_model"),
         ({"num_heads": 3}, "multiple of model.heads"),
-        ({"image_vocab_size": 65}, "65 is no product of 2 equal factors"),
+        ({"image_vocab_size": 65}, "65 cannot be split into 2 equal factors"),
         ({"T": "three"}, "frames: expected int, got 'three'"),
-        ({"d_actions": [3]}, "1 action_domains but|d_actions 3 of push is no multiple of its 2"),
+        ({"d_actions": [3]}, "1 action_domains but|d_actions 3 of push is not a multiple of its 2"),
         ({"action_domains": None}, "missing field.*action_domains"),
         ({"d_actions": ["2"]}, "d_actions must list one value per robot"),
         ({"S": None}, "S must be a positive integer, got None"),
@@ -190,7 +190,7 @@ def test_what_is_no_checkpoint_is_said_so(tmp_path):
     with pytest.raises(ConfigError, match="neither model.safetensors"):
         read_official(tmp_path)
     (tmp_path / "model.safetensors").write_bytes(b"\0" * 100)
-    with pytest.raises(ConfigError, match="no readable safetensors"):
+    with pytest.raises(ConfigError, match="not a readable safetensors"):
         read_official(tmp_path)
 
 

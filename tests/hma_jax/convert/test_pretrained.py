@@ -94,7 +94,7 @@ def test_malicious_checkpoint_is_refused_and_not_run(tmp_path):
 def test_objects_of_a_trainer_in_place_of_weights_are_refused(tmp_path):
     for call in (Call(Global("omegaconf", "OmegaConf"), 1), Call(Global("builtins", "dict"), [])):
         path = write_torch(tmp_path / "x.ckpt", {"state_dict": {"encoder.conv_in.weight": call}}, {})
-        with pytest.raises(ConfigError, match="something else than names and tensors"):
+        with pytest.raises(ConfigError, match="something other than names and tensors"):
             read_magvit2(path)
 
 
@@ -152,7 +152,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
     tensors = official_tensors("svd-vae")
     tensors["quant_conv.bias"][0] = np.nan
     write_safetensors(folder / "diffusion_pytorch_model.safetensors", tensors)
-    with pytest.raises(ConfigError, match="quant_conv.bias holds values that are not finite"):
+    with pytest.raises(ConfigError, match="quant_conv.bias contains values that are not finite"):
         small(folder)
 
 
@@ -162,10 +162,10 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "changes", "message"),
     [
-        ("svd-vae", {"_class_name": "AutoencoderKL"}, "describes AutoencoderKL; supported are"),
-        ("svd-vae", {"in_channels": 1}, "in_channels is 1, supported is 3"),
+        ("svd-vae", {"_class_name": "AutoencoderKL"}, "describes AutoencoderKL, which is not supported; supported are"),
+        ("svd-vae", {"in_channels": 1}, "in_channels is 1, but only 3 is supported"),
         ("svd-vae", {"block_out_channels": None}, "missing field.*block_out_channels"),
-        ("svd-vae", {"block_out_channels": [4, 7]}, "a level of 7 channels does not split into 2 groups"),
+        ("svd-vae", {"block_out_channels": [4, 7]}, "a level of 7 channels cannot be split into 2 groups"),
         ("svd-vae", {"layers_per_block": "two"}, "expected int, got 'two'"),
         ("magvit2", {"ch_mult": None}, "missing field.*ch_mult"),
         ("magvit2", {"token_factorization": True}, "token_factorization is True"),

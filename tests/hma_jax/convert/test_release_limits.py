@@ -181,7 +181,7 @@ def test_another_range_of_clean_values_is_said(tmp_path):
     [
         ({"action_alignment": "causal"}, "action_alignment"),
         ({"conditioning": "cross_attention"}, "conditioning is 'cross_attention'"),
-        ({"tokens": 12}, "model.tokens 12 do not make a square"),
+        ({"tokens": 12}, "model.tokens 12 is not a square number"),
         ({"recall": True}, "model.recall is true"),
         ({"chain_factors": True}, "model.chain_factors is true"),
         ({"diffusion": DIFFUSION}, "diffusion.steps is 20"),

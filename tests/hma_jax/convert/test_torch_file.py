@@ -186,7 +186,7 @@ def test_other_files_and_other_contents_are_named(tmp_path):
     (tmp_path / "old.bin").write_bytes(pickle.dumps({"weight": 1}))
     with pytest.raises(ConfigError, match="saved by torch before 1.6"):
         read_torch(tmp_path / "old.bin")
-    with pytest.raises(ConfigError, match="something else than names and tensors"):
+    with pytest.raises(ConfigError, match="something other than names and tensors"):
         read_torch(write_torch(tmp_path / "x.bin", {"step": 3}, {}))
     with pytest.raises(ConfigError, match="cannot be read"):
         read_torch(write_torch(tmp_path / "y.bin", {"w": rebuild(Storage("FloatStorage", "9", 1), (1,), (1,))}, {}))

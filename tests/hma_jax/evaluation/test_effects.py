@@ -67,7 +67,7 @@ def test_few_episodes_say_less_and_too_few_nothing():
     assert many.errors == pytest.approx(3.0, abs=0.02) and 1.8 < few.errors < 2.0
     assert Difference(-0.3, 0.1, 4).errors == -few.errors and Difference(0.0, 0.0, 4).errors == 0.0
     assert Difference(-0.3, 0.0, 4).errors == -np.inf  # of every episode alike
-    with pytest.raises(ConfigError, match="3 episodes; what actions do is told from at least 4"):
+    with pytest.raises(ConfigError, match="3 episodes; measuring the effect of actions needs at least 4"):
         find_effects(lambda actions: np.ones(len(actions)), recorded(), np.zeros(DIM), np.arange(WINDOWS) % 3)
 
 

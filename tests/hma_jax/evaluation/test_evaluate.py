@@ -133,7 +133,7 @@ def test_a_window_that_ends_before_the_prompt_has_no_error_of_predicted_actions(
     found = protocol._policy_errors(CONFIG, *inputs, None, config, True, (mean, std), real)["action_error"]
     np.testing.assert_array_equal(np.isnan(found), [True, False, False, False])
     np.testing.assert_allclose(found[1:3], [np.mean(own[own > 0] ** -2.0) for own in std[1:3]], rtol=1e-3)
-    with pytest.raises(ConfigError, match="eval.prompt_frames 9 leaves no action to judge in a window of"):
+    with pytest.raises(ConfigError, match="eval.prompt_frames 9 leaves no action to evaluate in a window of"):
         protocol.make_predictor(CONFIG, TABLE, replace(config, prompt_frames=9), "policy")
 
 
@@ -213,17 +213,19 @@ def test_windows_longer_than_the_model_s_are_continued_past_it(params):
     short = {k: v[:, : CONFIG.frames] if k in ("tokens", "actions", "images") else v for k, v in long.items()}
     want = judge([short], EVAL).summary.overall["cross_entropy"].mean
     assert exact.summary.overall["cross_entropy"].mean == pytest.approx(want, rel=1e-6)
-    with pytest.raises(ConfigError, match="windows have the model's 6 frames, got 9"):
+    with pytest.raises(ConfigError, match="windows must have the model's 6 frames, got 9"):
         judge([long], replace(EVAL, context="recorded"))
 
 
 def test_what_cannot_be_evaluated_is_refused(params):
-    with pytest.raises(ConfigError, match="leaves nothing to predict"):
+    with pytest.raises(ConfigError, match="leaves no frame to predict"):
         evaluate(params, CONFIG, TABLE, TOKENIZER, [], EvalConfig(prompt_frames=6))
     with pytest.raises(ConfigError, match="the evaluation has no windows"):
         evaluate(params, CONFIG, TABLE, TOKENIZER, [], EVAL)
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
-    with pytest.raises(ConfigError, match=r"decodes images of \(8, 8, 3\), recorded are \(7, 8, 3\)"):
+    with pytest.raises(
+        ConfigError, match=r"decodes images of shape \(8, 8, 3\), but the recorded ones have \(7, 8, 3\)"
+    ):
         evaluate(params, CONFIG, TABLE, TOKENIZER, [batch | {"images": batch["images"][:, :, 1:]}], EVAL)
 
 

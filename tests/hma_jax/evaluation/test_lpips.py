@@ -146,7 +146,7 @@ class Harmful:
 )
 def test_another_file_is_refused_by_name(weights, package, change, capsys):
     package(change(as_published(weights)))
-    with pytest.raises(ConfigError, match="alexnet.ckpt: not the weights of AlexNet"):
+    with pytest.raises(ConfigError, match="alexnet.ckpt: not the AlexNet weights"):
         load_lpips()
     assert "run by the file" not in capsys.readouterr().out
 

@@ -65,13 +65,13 @@ def test_a_damaged_table_is_named(tmp_path):
     whole = (tmp_path / FILE).read_bytes()
     for content in (b"", b"csv", whole[:-20], flipped(whole, 100)):
         (tmp_path / FILE).write_bytes(content)
-        with pytest.raises(ConfigError, match=f"{FILE}: no table of windows can be read"):
+        with pytest.raises(ConfigError, match=f"{FILE}: the table of windows cannot be read"):
             WindowTable.load(tmp_path / FILE)
     (tmp_path / FILE).unlink()
-    with pytest.raises(ConfigError, match="no table"):
+    with pytest.raises(ConfigError, match="the table of windows cannot be read"):
         WindowTable.load(tmp_path / FILE)
     (tmp_path / "windows.csv.gz").touch()
-    with pytest.raises(ConfigError, match="windows.csv.gz beside it is of an earlier version"):
+    with pytest.raises(ConfigError, match="windows.csv.gz beside it was written by an earlier version"):
         WindowTable.load(tmp_path / FILE)
 
 
@@ -101,13 +101,13 @@ def test_a_table_whose_metrics_are_of_different_windows_is_refused(tmp_path):
     long = make_table().to_arrow("t0")
     moved = long.set_column(2, "episode", pa.array(np.r_[7, long["episode"].to_numpy()[1:]], pa.int32()))
     for table, why in (
-        (moved, "cross_entropy is of other windows than psnr"),
-        (long.slice(0, len(long) - 1), "of other windows"),
+        (moved, "cross_entropy has other windows than psnr"),
+        (long.slice(0, len(long) - 1), "has other windows"),
         (long.drop_columns(["frames"]), "frames"),
         (pa.concat_tables([long, make_table().to_arrow("t1")]), "no trial, or several"),
     ):
         pq.write_table(table, tmp_path / FILE)
-        with pytest.raises(ConfigError, match=f"no table of windows can be read .*{why}"):
+        with pytest.raises(ConfigError, match=f"the table of windows cannot be read .*{why}"):
             WindowTable.load(tmp_path / FILE)
 
 
@@ -166,10 +166,12 @@ def test_a_difference_has_the_error_of_the_differences_by_episode():
 
 def test_other_windows_or_other_datasets_are_not_compared():
     a = make_table()
-    with pytest.raises(ConfigError, match=r"only one of two evaluations has window \('arm', 0, 0\) \(and 1 others\)"):
+    with pytest.raises(
+        ConfigError, match=r"only one of the two evaluations has window \('arm', 0, 0\) \(and 1 others\)"
+    ):
         paired_difference(a, a.rows(np.arange(2, len(a))), 1)
     twice = a.rows(np.r_[0, np.arange(len(a) - 1)])
-    with pytest.raises(ConfigError, match=r"a window stands twice in an evaluation: \('arm', 0, 0\)"):
+    with pytest.raises(ConfigError, match=r"an evaluation contains a window twice: \('arm', 0, 0\)"):
         paired_difference(a, twice, 1)
     with pytest.raises(ConfigError, match="without a common dataset"):
         paired_difference(a, make_table("base"), 1)

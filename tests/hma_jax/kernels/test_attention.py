@@ -120,9 +120,7 @@ def test_every_backend_on_offer_is_known_where_it_runs_and_another_is_refused(pl
         attention.find_backend("flash")
     for name, where in {"cudnn": "an NVIDIA GPU", "splash": "a TPU"}.items():
         if name != own:
-            message = (
-                f"attention '{name}' runs on {where} alone, and the device here is a {platform.upper()}; choose auto"
-            )
+            message = f"attention '{name}' runs only on {where}, but the device is a {platform.upper()}; use auto"
             with pytest.raises(ConfigError, match=message):
                 attention.find_backend(name)
 

@@ -89,7 +89,9 @@ def test_an_episode_is_as_long_as_gymnasium_is_told_and_not_shorter():
             env.reset(seed=0)
             cut = [np.all(env.step(env.action_space.sample())[3]) for _ in range(longest)]
             assert cut == [False] * (longest - 1) + [True]
-    with pytest.raises(ConfigError, match="max_steps: the length of an episode is Gymnasium's max_episode_steps"):
+    with pytest.raises(
+        ConfigError, match="max_steps is not an option: set the length of an episode with Gymnasium's max_episode_steps"
+    ):
         make(max_steps=3)
 
 
@@ -203,7 +205,7 @@ def test_a_vector_of_episodes_without_a_step_is_refused():
 @pytest.mark.parametrize("start_", ["x", None, 1.5, 3, -1])
 def test_a_start_that_is_none_is_refused(start_):
     for env in (RobotEnv(simulator=simulator(), starts=STARTS, robot="arm"), vector(2)):
-        with pytest.raises(ConfigError, match=f"there are 3 starts, counted from 0, no {start_!r}"):
+        with pytest.raises(ConfigError, match=f"there are 3 starts, counted from 0; there is no start {start_!r}"):
             env.reset(options={"start": start_})
 
 
@@ -215,9 +217,9 @@ def test_native_actions_are_no_steps_of_an_environment():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"rate": "model", "history": 3}, "rate, history: options of loading a `run`"),
+        ({"rate": "model", "history": 3}, "rate, history: only for loading a `run`"),
         ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
-        ({"starts": []}, "there is no start to begin at"),
+        ({"starts": []}, "there are no starts, so no episode can begin"),
         ({"run": "somewhere"}, "either `run` or `simulator`"),
     ],
 )
@@ -228,7 +230,7 @@ def test_what_cannot_be_made_is_said(options: dict, message: str):
 
 def test_a_forked_process_does_not_load_a_run_again(monkeypatch, tmp_path):
     monkeypatch.setattr(environment._Task, "loaded_in", os.getpid() + 1)
-    with pytest.raises(ConfigError, match="forked from one that had loaded a run, .* leave vectorization_mode out"):
+    with pytest.raises(ConfigError, match="forked from one that had loaded a run, .* leave out vectorization_mode"):
         environment.RobotEnv(tmp_path)
     monkeypatch.setattr(environment._Task, "loaded_in", os.getpid())
     with pytest.raises(ConfigError, match="no checkpoints"):

@@ -189,7 +189,7 @@ def test_history_bounds_how_far_an_episode_is_taken_back():
     sim, plan = simulator(history=2), chunks_of(0, 12)
     sim.reset(start(0, 1))
     made = run(sim, plan)
-    with pytest.raises(ConfigError, match="taken back by 2 frames, not by 3"):
+    with pytest.raises(ConfigError, match="at most 2 frames can be rewound, got 3"):
         sim.rewind(3)
     sim.rewind(2)
     np.testing.assert_array_equal(run(sim, plan[10:]), made[10:])
@@ -236,7 +236,7 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
         sim.step([low - [0.0, 2.0]])
     assert sim.clipped == [("action 1",)]
     assert [r.message for r in caplog.records] == [
-        "pusher: action 1 of -7 to -7 is outside what its statistics allow, -5 to 7; clipped, here and from now on"
+        "pusher: action 1 of -7 to -7 is outside the range that its statistics allow, -5 to 7; such actions are clipped (this is said once)"
     ]
     sim.reset(start(0, 1))
     sim.step([low])
@@ -257,19 +257,19 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
         (lambda sim: sim.step([np.zeros(2), None]), "episode 0 has not begun"),
         (
             lambda sim: sim.reset("arm"),
-            r"an episode begins at a Start .the simulator's `starts` has some., not at \['arm'\]",
+            r"an episode begins at a Start .see the simulator's `starts`., not at \['arm'\]",
         ),
         (lambda sim: sim.reset([start(0, 2), None]), r"not at \[None\]"),
         (lambda sim: sim.reset(start(0, 2), seeds=[1]), "as many starts and seeds"),
-        (lambda sim: sim.reset(start(0, 2), seeds=[0.5, 1]), r"seeds: whole numbers are needed, got \[0.5, 1\]"),
-        (lambda sim: sim.reset(start(0, 2), seeds=None), "seeds: whole numbers are needed, got None"),
+        (lambda sim: sim.reset(start(0, 2), seeds=[0.5, 1]), r"seeds must be whole numbers, got \[0.5, 1\]"),
+        (lambda sim: sim.reset(start(0, 2), seeds=None), "seeds must be whole numbers, got None"),
         (lambda sim: sim.reset(start(0, 2), episodes=[0, 2]), "numbers below 2"),
-        (lambda sim: sim.reset(start(0, 2), episodes=[0.5]), "episodes: whole numbers are needed"),
-        (lambda sim: sim.rewind(1.5), r"frames: whole numbers are needed, got \[1.5\]"),
-        (lambda sim: sim.branch([1.0, 1.0]), "sources: whole numbers are needed"),
-        (lambda sim: simulator(episodes=1.5), r"episodes: whole numbers are needed, got \[1.5\]"),
-        (lambda sim: simulator(history=1.5), "history: whole numbers are needed"),
-        (lambda sim: sim.robot("walker"), "no robot 'walker' to drive; this model has pusher, arm, base"),
+        (lambda sim: sim.reset(start(0, 2), episodes=[0.5]), "episodes must be whole numbers"),
+        (lambda sim: sim.rewind(1.5), r"frames must be whole numbers, got \[1.5\]"),
+        (lambda sim: sim.branch([1.0, 1.0]), "sources must be whole numbers"),
+        (lambda sim: simulator(episodes=1.5), r"episodes must be whole numbers, got \[1.5\]"),
+        (lambda sim: simulator(history=1.5), "history must be whole numbers"),
+        (lambda sim: sim.robot("walker"), "the model has no robot 'walker'; it has pusher, arm, base"),
     ],
 )
 def test_what_cannot_be_done_is_said(deed, message: str):
@@ -279,13 +279,15 @@ def test_what_cannot_be_done_is_said(deed, message: str):
 
 def test_a_history_of_fewer_frames_than_none_is_refused():
     """An episode could then not be taken back by 0 frames."""
-    with pytest.raises(ConfigError, match="0 frames or more to be taken back by, got history=-1"):
+    with pytest.raises(
+        ConfigError, match="history, the number of frames that can be rewound, must not be negative, got -1"
+    ):
         simulator(history=-1)
 
 
 @pytest.mark.parametrize(("name", "word"), [("outside", "raise"), ("rate", "Native")])
 def test_another_word_is_not_taken_for_the_one_it_resembles(name: str, word: str):
-    with pytest.raises(ConfigError, match=f"{name}: '{word}' is not a choice; choose one of "):
+    with pytest.raises(ConfigError, match=f"{name}: '{word}' is not allowed; choose one of "):
         simulator(**{name: word})
 
 
@@ -384,7 +386,7 @@ def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
 def test_what_predicts_actions_alone_is_no_simulator(setting):
     model, tokenizer = parts()
     other = replace(model, run=replace(model.run, train=TrainConfig(masking=MaskingConfig(setting=setting))))
-    with pytest.raises(ConfigError, match=f"'{setting}', which predicts no frames: there are none to show"):
+    with pytest.raises(ConfigError, match=f"'{setting}', which predicts no frames, so there are none to show"):
         Simulator(other, tokenizer)
 
 

@@ -41,7 +41,7 @@ def test_png_is_lossless_and_grey_becomes_rgb():
 
 
 def test_depths_of_16_bits_are_no_picture():
-    with pytest.raises(ValueError, match="grey values of 16 bits, as of depths, no picture"):
+    with pytest.raises(ValueError, match="16-bit grey values, such as depths, which are not an image"):
         decode_image(png(np.arange(0, 6400, 100, np.uint16).reshape(8, 8)))
 
 
@@ -61,7 +61,7 @@ def test_a_png_that_was_cut_off_is_one(end):
 
 def test_image_that_would_fill_the_memory_is_refused(monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
-    with pytest.raises(ValueError, match="too large to be a frame"):
+    with pytest.raises(ValueError, match="too large for a frame"):
         decode_image(png(np.zeros((8, 8, 3), np.uint8)))
 
 
@@ -73,9 +73,9 @@ def test_image_of_too_many_pixels_is_refused_before_it_is_decoded(kind, monkeypa
     encoded = data.getvalue()
     assert decode_image(encoded).shape == (8, 8, 3)
     monkeypatch.setattr(images, "MAX_PIXELS", 63)
-    with pytest.raises(ValueError, match=r"too large to be a frame \(64 pixels, more than 63\)"):
+    with pytest.raises(ValueError, match=r"too large for a frame \(64 pixels, more than 63\)"):
         decode_image(encoded)
-    with pytest.raises(ValueError, match="too large to be a frame"):
+    with pytest.raises(ValueError, match="too large for a frame"):
         decode_image(encoded, at_least=1)
 
 

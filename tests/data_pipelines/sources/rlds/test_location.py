@@ -159,5 +159,5 @@ def test_paths_stay_paths_and_urls_stay_urls(tmp_path, monkeypatch):
 
 
 def test_unknown_protocol_is_one_clear_message():
-    with pytest.raises(ConfigError, match="nowhere://x: no location that fsspec knows"):
+    with pytest.raises(ConfigError, match="nowhere://x: fsspec does not know this kind of location"):
         locate("nowhere://x")

@@ -236,7 +236,7 @@ def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path, capsy
     asked = ["--robot", "any", "--out", str(root / "out"), "--starts", "3", "--labels", str(path)]
     assert main(["judge", str(tmp_path / "nowhere"), *asked]) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "1.00" in told and "nothing was judged anew, and no other option was looked at" in told
+    assert "1.00" in told and "nothing was evaluated again, and all other options were ignored" in told
     path.write_text(json.dumps({"page": "another", "labels": labels}))
     with pytest.raises(ConfigError, match="labels of another page"):
         read_labels(path, root / "out")

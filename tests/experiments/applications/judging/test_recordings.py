@@ -142,9 +142,12 @@ def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (("--task", "reach"), "--task reach is of robots with a true simulator"),
-        (("--cloned", "2"), "recordings have no expert to clone: leave --cloned out"),
-        (("--steps", "9", "--demonstrations", "9"), "no expert to clone: leave --demonstrations, --steps out"),
+        (("--task", "reach"), "--task reach is only for robots with a true simulator"),
+        (("--cloned", "2"), "with --recordings there is no scripted expert to train policies on: remove --cloned,"),
+        (
+            ("--steps", "9", "--demonstrations", "9"),
+            "no scripted expert to train policies on: remove --demonstrations, --steps,",
+        ),
         (("--split", "val"), "no split 'val'"),
         (("--hold", "7"), "of 20 recordings 0 succeeded and 0 failed (0 do not say, 20 have less than the 10 frames"),
         (("--frames", "0"), "--frames must be at least 1, got 0"),
@@ -165,7 +168,7 @@ def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_pat
 def test_what_is_of_recordings_is_refused_without_them(tmp_path, capsys, flag):
     asked = ["--robot", "pusher_sand", "--out", str(tmp_path / "out"), flag, "1"]
     assert main(["judge", str(tmp_path / "model"), *asked]) == 2
-    assert f"{flag} is of robots without a true simulator: give --recordings" in said(capsys, error=True)
+    assert f"{flag} is only for robots without a true simulator: add --recordings" in said(capsys, error=True)
 
 
 def test_counts_of_policies_that_are_not_judged_are_refused(study, tmp_path, capsys):

@@ -94,7 +94,7 @@ def test_what_is_post_trained_is_no_simulator_and_acts_in_one_by_the_file_of_the
     demos = Demonstrations(images, np.zeros((2, 6, 2), np.float32), np.full(2, 6), none, none[:, 0], np.arange(2))
     run = tmp_path / "runs/own_policy/run"
     own_policy.post_train(first, robot, demos, FEW, run, lambda *_: None)
-    with pytest.raises(ConfigError, match="'policy', which predicts no frames: there are none to show"):
+    with pytest.raises(ConfigError, match="'policy', which predicts no frames, so there are none to show"):
         load_simulator(run)
     page = (Path(__file__).parents[4] / "docs/policies.md").read_text()
     (tmp_path / "mine.py").write_text(page.split("```python\n")[1].split("```")[0])
