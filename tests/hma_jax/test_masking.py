@@ -11,7 +11,7 @@ from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import count_targets, masked_loss
-from hma_jax.objective.masking import mask_tokens
+from hma_jax.objective.masking import hidden_at_inference, mask_tokens
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
 from tests.tiny import DIFFUSION, TABLE, lively_params, mask, random_batch, shallow_config, train_config
@@ -86,6 +86,14 @@ def test_robots_without_actions_or_video_targets_train_what_they_can(setting: st
         assert np.asarray(masked.targets_TS)[film].any()
     if setting != "forward":
         assert np.asarray(masked.action_targets_T)[blind].any()
+
+
+def test_chunks_that_training_never_shows_are_hidden_at_inference():
+    robots = jnp.array([0, 1, 2, 1])
+    hidden = hidden_at_inference(MIXED, "forward", robots, 3)
+    assert hidden.tolist() == [[False] * 3, [True] * 3, [False] * 3, [True] * 3]
+    assert hidden_at_inference(TABLE, "forward", robots[:1], 3) is None
+    assert hidden_at_inference(TABLE, "passive", robots[:1], 3).tolist() == [[True] * 3]
 
 
 @pytest.mark.parametrize("diffusion, digest", [(None, 1553994923), (DIFFUSION, 988358124)])
