@@ -175,7 +175,7 @@ def test_a_position_that_is_no_whole_number_is_said_as_it_is():
     outcome = Outcome(made, None, 0, ())
     assert "own at 0.25 part of the data: 3.000" in _prediction(outcome).text
     assert "<td class=text>0.25 part of the data</td>" in describe_fits([], None, [outcome], "")
-    assert replace(made, x=(132480.0,), axes=("trunk parameters",)).place == "132,480 trunk parameters"
+    assert replace(made, x=(132480.0,), axes=("trunk parameters",)).position == "132,480 trunk parameters"
 
 
 def test_the_sweeps_of_the_page_have_the_seeds_that_a_prediction_needs():
