@@ -1,4 +1,4 @@
-"""What changes from one end of an axis to the other, window by window.
+"""The difference between the two ends of an axis, window by window.
 
 The trials at both ends were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
 robots are judged that are others for every seed, each seed's difference is taken on its own robots, and the error is

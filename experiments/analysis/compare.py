@@ -18,7 +18,7 @@ from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
 NOT_OF_MODELS = (TRUTH, "counterfactual_copy", "retrieval_chance")
-"""Metrics of the windows alone."""
+"""Metrics that depend on the windows alone, not on the model."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Side:
 
     name: str
     seeds: Mapping[int, WindowTable]
-    tokenizer: str  # "": nobody knows
-    says_seed: bool = True  # otherwise its seed is a guess
+    tokenizer: str  # "": unknown
+    says_seed: bool = True  # False: its seed is unknown, and the key of `seeds` stands in
 
 
 @dataclass(frozen=True)

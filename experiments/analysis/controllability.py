@@ -24,7 +24,7 @@ from hma_jax.evaluation.windows import WindowTable
 METRICS = ("delta_psnr", "action_nats", "retrieval", "counterfactual_gain")
 """Metrics that are 0 for a deaf model; retrieval is at chance."""
 
-ENOUGH = 2.0
+FOLLOWING_SEMS = 2.0
 """Standard errors above a deaf model beyond which a robot counts as following actions."""
 
 ROUNDING = 1e-5
@@ -73,9 +73,10 @@ def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Co
 
 
 def count_following(rows: Iterable[Controllability], metric: str) -> tuple[int, int]:
-    """(robots whose metric is more than ENOUGH standard errors above that of a deaf model, robots that have it)."""
+    """(robots whose metric is more than FOLLOWING_SEMS standard errors above that of a deaf model, robots that have
+    it)."""
     own = [row for row in rows if row.metric == metric]
-    return sum(row.errors > ENOUGH for row in own), len(own)
+    return sum(row.errors > FOLLOWING_SEMS for row in own), len(own)
 
 
 def expected_by_chance(rows: Iterable[Controllability], metric: str) -> float:
@@ -84,7 +85,7 @@ def expected_by_chance(rows: Iterable[Controllability], metric: str) -> float:
     the value of a deaf model in every window, is never counted."""
     own = [row for row in rows if row.metric == metric and row.episodes > 1]
     freedom = [row.episodes - 1 for row in own if max(abs(row.mean - row.deaf), row.sem) > ROUNDING]
-    return float(stdtr(freedom, -ENOUGH).sum())
+    return float(stdtr(freedom, -FOLLOWING_SEMS).sum())
 
 
 def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, role: str) -> Sequence[Controllability]:

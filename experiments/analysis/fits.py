@@ -1,14 +1,13 @@
-"""What a scaling fit says, with intervals, and when it says nothing.
+"""Scaling fits with intervals, and the conditions under which a fit is refused or doubtful.
 
 L = E + A N^-alpha, or jointly L = E + A N^-alpha + B D^-beta, of a loss L in nats per token: the smallest loss E,
 and how fast each axis brings it down. Residuals are weighted by the noise that seeds were measured to have, and
 intervals are percentiles over bootstraps of seeds x episodes (`measured`).
 
-Points that cannot tell the form from another are refused, with the reason: fewer than four positions on an axis, a
-loss that does not fall, an exponent at the end of what was searched. What is only doubtful is said beside the
-numbers: one seed per point, a coefficient that a good part of the bootstraps leaves at its bound, an axis along which
-no two trials differ in nothing else, points that lie off the curve by more than seeds scatter, an exponent that hangs
-on the first position.
+A fit is refused, with the reason, where the points do not identify the form: fewer than four positions on an axis, a
+loss that does not fall, an exponent at a bound of the search. Doubts are reported with the numbers: one seed per
+point, a coefficient at its bound in many bootstraps, an axis along which no two trials differ in that axis alone,
+points that lie off the curve by more than seeds scatter, an exponent that depends on the first position.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from experiments.analysis.measured import Measurements
 from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, predict_log
 
 DRAWS, LEVEL = 1000, 0.90
-LEAST = 4
-"""Distinct positions on an axis that a power law with a constant needs: three parameters leave one to be wrong by."""
+MIN_POSITIONS = 4
+"""Distinct positions on an axis that a power law with a constant needs: one more than its three parameters."""
 
 NAMES = (("A", "alpha"), ("B", "beta"))
-WIDE = 4.0
-"""An exponent whose interval spans more than this factor is hardly told; it is said."""
+WIDE_RATIO = 4.0
+"""An exponent whose interval spans more than this factor is reported as doubtful."""
 
-UNLIKELY = 0.05
-"""A lack of fit that chance makes more rarely is said."""
+LACK_OF_FIT_P = 0.05
+"""p-value of the F test below which a lack of fit is reported."""
 
-OFTEN = 0.05
-"""The part of the bootstraps at a bound from which a coefficient's interval is called open: it then ends there."""
+OPEN_SHARE = 0.05
+"""Share of the bootstraps at a bound above which a coefficient's interval counts as open there."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def fit_power(measured: Measurements, draws: int = DRAWS, episodes: bool = True)
     residuals = np.log(measured.value) - predict_log(theta, z)
     found = _coefficients(theta, thetas, centre)
     refused, doubts = _verdict(measured, theta, thetas)
-    wide = [c for c in found if c.name in ("alpha", "beta") and c.high > WIDE * c.low]
+    wide = [c for c in found if c.name in ("alpha", "beta") and c.high > WIDE_RATIO * c.low]
     if not refused:
         doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide)
         doubts += _inferred(measured) + _misfit(measured, residuals) + _first_position(measured, found, weight)
@@ -124,11 +123,11 @@ def _unfit(measured: Measurements) -> str:
     """Why no power law can be fitted; '' if one can."""
     for name, column in zip(measured.axes, measured.x.T, strict=True):
         distinct = np.unique(column)
-        if len(distinct) < LEAST:
-            return f"{len(distinct)} distinct {name}; the form has to be told from at least {LEAST}"
+        if len(distinct) < MIN_POSITIONS:
+            return f"{len(distinct)} distinct {name}; the form has to be told from at least {MIN_POSITIONS}"
         if not (distinct > 0).all():
             return f"{name} has to be positive, got {distinct.min():g}"
-    positions, least = len(np.unique(measured.points)), LEAST + 2 * (len(measured.axes) - 1)
+    positions, least = len(np.unique(measured.points)), MIN_POSITIONS + 2 * (len(measured.axes) - 1)
     if positions < least:
         return (
             f"{positions} positions; the form over {' and '.join(measured.axes)} has to be told from at least {least}"
@@ -149,7 +148,8 @@ def _lines(measured: Measurements, k: int) -> list[np.ndarray]:
 
 
 def _rising(measured: Measurements) -> str:
-    """A loss that does not fall from the first position of an axis to the last, by more than seeds scatter."""
+    """Why no power law can be fitted where the loss does not fall from the first position of an axis to the last by
+    more than seeds scatter; '' where it does."""
     logs, noise = np.log(measured.value), np.nan_to_num(measured.noise())
     for k, name in enumerate(measured.axes):
         falls, errors = [], []
@@ -170,7 +170,7 @@ def _rising(measured: Measurements) -> str:
 
 
 def _inferred(measured: Measurements) -> tuple[str, ...]:
-    """Axes along which no trials were compared: that the loss falls there follows from the form."""
+    """Doubts about axes along which no two trials differ alone: that the loss falls there is inferred from the form."""
     alone = [name for k, name in enumerate(measured.axes) if not _lines(measured, k)]
     return tuple(
         f"no two trials differ in {name} alone: what it does is told by the form, not compared" for name in alone
@@ -192,8 +192,8 @@ def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> 
 
 
 def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
-    """Whether positions lie off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
-    takes trials for independent, which branches of one run are not quite."""
+    """A doubt if positions lie off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
+    assumes independent trials, which branches of one run are not quite."""
     points, count = measured.points, np.bincount(measured.points)
     left, free = len(count) - 1 - 2 * len(measured.axes), measured.freedom
     mean = np.bincount(points, residuals) / count
@@ -202,17 +202,17 @@ def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
         return ()
     ratio = float((count * mean**2).sum()) / left / (scatter / free)
     chance = float(scipy.stats.f.sf(ratio, left, free))
-    if chance >= UNLIKELY:
+    if chance >= LACK_OF_FIT_P:
         return ()
     doubt = f"points lie off the curve by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"
     return (f"{doubt}: over the whole range the loss is not of this form",)
 
 
 def _first_position(measured: Measurements, found: tuple[Coefficient, ...], weight: np.ndarray) -> tuple[str, ...]:
-    """Whether the exponent over one axis hangs on the first position, where a power law need not hold yet."""
+    """A doubt if the exponent over one axis depends on the first position, where a power law need not hold yet."""
     x = measured.x[:, 0]
     keep = x > x.min()
-    if len(measured.axes) > 1 or len(np.unique(x[keep])) < LEAST:
+    if len(measured.axes) > 1 or len(np.unique(x[keep])) < MIN_POSITIONS:
         return ()
     log_x = np.log(measured.x[keep])
     values = measured.value[keep]
@@ -232,12 +232,12 @@ def _verdict(measured: Measurements, theta: np.ndarray, thetas: np.ndarray) -> t
             bound = ALPHA[int(theta[1 + k + i] > 1)]
             return f"{name} is at {bound:g}, the end of what was searched: these points do not tell the form", ()
         part = float((low | high).mean())
-        if part > OFTEN:
+        if part > OPEN_SHARE:
             ends = " and ".join(f"{b:g}" for b, at in zip(ALPHA, (low, high), strict=True) if at.any())
             doubts.append(f"in {part:.0%} of the bootstraps {name} is at the end of what was searched ({ends})")
     lowest = np.log(measured.value.min())
     zero = float((thetas[:, 0] < lowest + np.log(10 * FLOOR)).mean())
-    if zero > OFTEN:
+    if zero > OPEN_SHARE:
         doubts.append(f"in {zero:.0%} of the bootstraps E is zero: the interval of E reaches down to it")
     if measured.seeds_per_point() < 2:
         doubts.append("a point has one seed: the intervals do not hold its noise")

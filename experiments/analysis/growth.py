@@ -1,9 +1,9 @@
-"""Robots whose data still grows, apart from those whose data is exhausted.
+"""The effect of more trajectories, separately for robots that have more and for those whose data is exhausted.
 
-The paper explains the plateau over trajectories by robots that have no more of them. So from each point of an axis that
-caps trajectories to the next, what changes is told for robots that get more and for those that do not: if the paper is
-right, the former alone gain. Paired window by window, as `changes`. Only where every robot keeps its share of the
-windows drawn: under a mixture that weighs robots by what is used of them, those without more lose some to the others.
+The paper explains the plateau over trajectories by robots that have no more of them. If so, from each point of an axis
+that caps trajectories to the next, only robots that get more of them should gain. Differences are paired window by
+window, as in `changes`. Computed only where every robot keeps its share of the windows drawn: under a mixture that
+weighs robots by the trajectories used, those without more lose windows to the others.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Each size's run gives its loss at several budgets, by its decay branches; betwee
 the logarithm (modified Akima, no further out than TOLERANCE). At one budget the loss over log N is fitted by a
 parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A budget at which the smallest or the largest size
 has the lowest loss, or whose parabola has no minimum between them, is refused: the best size may lie beyond. A parabola
-through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter it is
-said: its minimum is then where no bootstrap looks for an error.
+through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter, that
+is reported: the error of its minimum is then larger than the bootstrap's.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ import numpy as np
 import scipy.stats
 from scipy.interpolate import Akima1DInterpolator
 
-from experiments.analysis.fits import DRAWS, OFTEN, UNLIKELY, Coefficient, interval
+from experiments.analysis.fits import DRAWS, LACK_OF_FIT_P, OPEN_SHARE, Coefficient, interval
 from experiments.analysis.measured import Measurements
 from experiments.words import counted
 
 TOLERANCE = 0.1
-"""How far off a budget a size's nearest measured FLOPs may lie beyond its ends, as a part of it."""
+"""By which share of a budget a size's nearest measured FLOPs may miss it, beyond the first or last of them."""
 
-LEAST_SIZES, LEAST_BUDGETS = 4, 3
-"""Sizes at one budget, so that a parabola has one to be wrong by; budgets with a minimum, for the power law."""
+MIN_SIZES, MIN_BUDGETS = 4, 3
+"""Sizes at one budget, one more than a parabola has parameters; budgets with a minimum, for the power law."""
 
 BUDGETS = 4
 
-NEAR = 2
-"""Sizes on either side of the best one that the parabola is fitted to: further out the curve is none."""
+NEIGHBOURS = 2
+"""Sizes on either side of the best one that the parabola is fitted to: further out the curve is no parabola."""
 
 
 @dataclass(frozen=True)
@@ -72,19 +72,19 @@ class IsoFlop:
 
 def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws: int = DRAWS) -> IsoFlop:
     """Of losses over (size N, training FLOPs C). Without `budgets`, BUDGETS of them, evenly spread in log C over
-    where at least LEAST_SIZES sizes were measured."""
+    where at least MIN_SIZES sizes were measured."""
     sizes = np.unique(measured.x[:, 0])
-    if len(sizes) < LEAST_SIZES:
-        return IsoFlop(refused=f"{len(sizes)} sizes; a minimum over sizes needs at least {LEAST_SIZES}")
+    if len(sizes) < MIN_SIZES:
+        return IsoFlop(refused=f"{len(sizes)} sizes; a minimum over sizes needs at least {MIN_SIZES}")
     values = np.concatenate([measured.value[None], measured.draw(draws, np.random.default_rng(0))])  # [1 + R, n]
     lines = [_Line(measured, values, size) for size in sizes]
     budgets = _common_budgets(lines) if budgets is None else np.asarray(budgets, float)
     if not len(budgets):
-        return IsoFlop(refused=f"no budget that {LEAST_SIZES} sizes were trained for")
+        return IsoFlop(refused=f"no budget that {MIN_SIZES} sizes were trained for")
     fitted = [_fit_budget(lines, flops) for flops in budgets]
     found, minima = [b for b, _ in fitted], [(b.flops, m) for b, m in fitted if b.best]
-    if len(minima) < LEAST_BUDGETS:
-        why = f"{len(minima)} of {len(found)} budgets have a minimum; the exponent needs at least {LEAST_BUDGETS}"
+    if len(minima) < MIN_BUDGETS:
+        why = f"{len(minima)} of {len(found)} budgets have a minimum; the exponent needs at least {MIN_BUDGETS}"
         return IsoFlop(tuple(found), refused=why)
     flops, optima = np.log([f for f, _ in minima]), np.stack([m for _, m in minima])  # [b], [b, 1 + R]
     slope, level = np.polyfit(flops - flops.mean(), optima, 1)
@@ -122,13 +122,13 @@ class _Line:
 def _common_budgets(lines: list[_Line]) -> np.ndarray:
     """Evenly spread in log C between the lowest and the highest that enough sizes cover."""
     ends = np.unique(np.concatenate([line.flops for line in lines]))
-    covered = [f for f in ends if sum(line.covers(f) for line in lines) >= LEAST_SIZES]
+    covered = [f for f in ends if sum(line.covers(f) for line in lines) >= MIN_SIZES]
     if not covered:
         return np.array([])
     if covered[0] == covered[-1]:
         return np.array(covered[:1])
     budgets = np.geomspace(covered[0], covered[-1], BUDGETS)
-    return np.array([b for b in budgets if sum(line.covers(b) for line in lines) >= LEAST_SIZES])
+    return np.array([b for b in budgets if sum(line.covers(b) for line in lines) >= MIN_SIZES])
 
 
 def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
@@ -137,12 +137,12 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     sizes = np.array([line.size for line in covering])
     logs = np.stack([line.at(flops) for line in covering]) if covering else np.zeros((0, 1))
     loss = np.exp(logs[:, 0])
-    if len(sizes) < LEAST_SIZES:
-        few = f"{counted(len(sizes), 'size')}; at least {LEAST_SIZES} are needed"
+    if len(sizes) < MIN_SIZES:
+        few = f"{counted(len(sizes), 'size')}; at least {MIN_SIZES} are needed"
         return Budget(flops, sizes, loss, refused=few), np.array([])
     least, at_end = int(np.argmin(loss)), np.isin(np.argmin(logs, 0), (0, len(sizes) - 1))  # at_end [1 + R]
-    first = max(min(least - NEAR, len(sizes) - 2 * NEAR - 1), 0)
-    near = slice(first, first + 2 * NEAR + 1)
+    first = max(min(least - NEIGHBOURS, len(sizes) - 2 * NEIGHBOURS - 1), 0)
+    near = slice(first, first + 2 * NEIGHBOURS + 1)
     sizes, loss, logs = sizes[near], loss[near], logs[near]
     x = np.log(sizes)
     parabolas = np.polyfit(x - x.mean(), logs, 2)  # [3, 1 + R]
@@ -158,7 +158,7 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
         refused = f"the {end} size is best: the minimum may lie beyond"
         return Budget(flops, sizes, loss, **common, refused=refused), lowest
     part = float((at_end[1:] | np.isin(lowest[1:], (x[0], x[-1]))).mean())
-    doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OFTEN else ""
+    doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OPEN_SHARE else ""
     best = Coefficient("N_opt", *(float(np.exp(v)) for v in (lowest[0], *interval(lowest[1:]))))
     misfit = _misfit(logs - np.vander(x - x.mean(), 3) @ parabolas, [line.seeds_near(flops) for line in covering[near]])
     return Budget(flops, sizes, loss, **common, best=best, doubt=doubt, misfit=misfit), lowest
@@ -172,6 +172,6 @@ def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:
         return ""
     ratio = float((residuals[:, 0] ** 2).sum()) / scatter
     chance = float(scipy.stats.f.sf(ratio, len(seeds) - 3, sum(seeds) - len(seeds)))
-    if chance >= UNLIKELY:
+    if chance >= LACK_OF_FIT_P:
         return ""
     return f"sizes lie off the parabola by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"

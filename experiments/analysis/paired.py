@@ -1,6 +1,6 @@
-"""Which trials saw the same windows, so that they may be told apart window by window.
+"""Checks that trials saw the same windows, so that they can be compared window by window (paired).
 
-What makes a window hard for both models then cancels (`compare`). Trials are comparable if they have the same windows
+How hard a window is for both models then cancels (`compare`). Trials are comparable if they have the same windows
 of a robot, with the same number of real frames and the same recorded images; anything else is refused.
 """
 
@@ -13,7 +13,7 @@ from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import WindowTable
 
 TRUTH = "psnr_copy"
-"""Of the recorded images alone, whatever the model: equal for equal windows."""
+"""A metric of the recorded images alone, equal for equal windows whatever the model."""
 
 SAME = 1e-3
 """dB by which two programs may differ on equal images."""
@@ -49,7 +49,7 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
 
 
 def agree(a: WindowTable, b: WindowTable) -> bool:
-    """Whether both saw the same windows in the same order: quicker found out than which one differs."""
+    """Whether both saw the same windows in the same order: quicker than to find the one that differs."""
     if not a.has_windows_of(b) or not np.array_equal(a.frames, b.frames):
         return False
     both = TRUTH in a.metrics and TRUTH in b.metrics

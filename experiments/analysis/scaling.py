@@ -1,4 +1,4 @@
-"""The curves of a study that a power law is fitted to, from its sweeps and every window's numbers.
+"""The scaling curves of a study, from its sweeps and every window's numbers, and their fits.
 
 A sweep over one number is a curve, or one for each of its series. Where its trials differ in width, the axis is not
 the width but the parameters of the trunk: most of the others belong to single robots. Trials that differ in nothing
