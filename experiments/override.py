@@ -1,7 +1,6 @@
-"""A study with single settings changed, as --set gives them: 'path=value'.
+"""Overrides of single settings of a study, as --set gives them: 'path=value'.
 
-Owns how a value is read from text, and what is said of a path that there is not. `settings_help` is what a path that
-ends in `help` shows.
+Owns how a value is parsed, and the suggestions for an unknown path. A path that ends in `help` prints `settings_help`.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ def _assign(values: dict[str, Any], path: str, text: str) -> None:
 
 
 def _instead(values: dict[str, Any], path: str, known: Sequence[str]) -> str:
-    """What there is in place of a setting that there is not: a name that was meant, or the names around it."""
+    """The message for an unknown setting: a name that was probably meant, or the names of its group."""
     node, at, rest = values, [], path.split(".")
     while rest and isinstance(node, dict) and rest[0] in node:
         node = node[rest[0]]
@@ -84,14 +83,14 @@ def _instead(values: dict[str, Any], path: str, known: Sequence[str]) -> str:
 
 
 def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Settings that may be meant by what is left of a path below `group`, the first reason that finds some."""
+    """Settings probably meant by the rest of a path below `group`, by the first rule that finds any."""
     last, leaves = rest[-1], {k.split(".")[-1] for k in known}
 
-    def beside(cutoff: float) -> list[str]:
+    def in_group(cutoff: float) -> list[str]:
         near = difflib.get_close_matches(last, node, n=3, cutoff=cutoff) if len(rest) == 1 else []
         return [k for k in (f"{group}.{n}" if group else n for n in near) if k in known]
 
-    def named(leaf: str) -> list[str]:
+    def by_leaf(leaf: str) -> list[str]:
         found = [k for k in known if k.split(".")[-1] == leaf]
         return [k for k in found if group and k.startswith(f"{group}.")] or found
 
@@ -99,10 +98,10 @@ def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequenc
     return (
         [k for k in known if k.endswith("." + ".".join(rest)) and len(rest) > 1]  # the end of a path
         or (difflib.get_close_matches(whole, known, n=1, cutoff=0.9) if len(rest) > 1 else [])
-        or list(dict.fromkeys(beside(0.85) + named(last)))  # a typing error, or the right name in the wrong place
-        or (beside(0.6) if group else [])
+        or list(dict.fromkeys(in_group(0.85) + by_leaf(last)))  # a typing error, or the right name in the wrong place
+        or (in_group(0.6) if group else [])
         or difflib.get_close_matches(whole, known, n=3, cutoff=0.8)
-        or [k for leaf in difflib.get_close_matches(last, leaves, n=1, cutoff=0.8) for k in named(leaf)]
+        or [k for leaf in difflib.get_close_matches(last, leaves, n=1, cutoff=0.8) for k in by_leaf(leaf)]
     )
 
 

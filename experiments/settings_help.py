@@ -1,4 +1,4 @@
-"""What `--set help` shows: every setting with its value and what stands beside it in the source."""
+"""The table of `--set help`: every setting with its value and the comment on its field in the source."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from experiments.progress import console, tidy_table
 from hma_jax.config.json import to_dict
 
 
-class Described(NamedTuple):
+class SettingHelp(NamedTuple):
     path: str
     value: str  # as --set takes it
     text: str
 
 
-def show_settings(found: list[Described], title: str) -> None:
+def show_settings(found: list[SettingHelp], title: str) -> None:
     table = tidy_table(title, "setting")
     table.add_column("value", overflow="fold")
     table.add_column("meaning", min_width=30)
@@ -33,7 +33,7 @@ def show_settings(found: list[Described], title: str) -> None:
     console.print(table)
 
 
-def describe_settings(config: Any, prefix: str = "") -> Iterator[Described]:
+def describe_settings(config: Any, prefix: str = "") -> Iterator[SettingHelp]:
     """Of a dataclass of values and further such dataclasses, in their order."""
     kinds, texts = typing.get_type_hints(type(config)), comments(type(config))
     for field in fields(config):
@@ -44,7 +44,7 @@ def describe_settings(config: Any, prefix: str = "") -> Iterator[Described]:
         text = texts.get(field.name, "")
         if typing.get_origin(kinds[field.name]) is Literal:
             text = f"{text} ({', '.join(typing.get_args(kinds[field.name]))})".strip()
-        yield Described(path, _as_set(to_dict(value)), text)
+        yield SettingHelp(path, _as_set(to_dict(value)), text)
 
 
 def comments(config: type) -> dict[str, str]:

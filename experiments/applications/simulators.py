@@ -1,4 +1,4 @@
-"""A run's robots in its learned simulator or in their true one, exchangeable by one word."""
+"""Opens a run's robots in its learned simulator or in their true one, behind the same interface."""
 
 from __future__ import annotations
 
@@ -147,11 +147,12 @@ def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:
     return Robot(entry.name, entry.stride, low, high, rest_action(low, high, entry.mean), hz=hz, recorded=recorded)
 
 
-def keep_places(simulator: Simulator, run: Path | str) -> None:
-    """Describes robots anew whose actions are places to go to, as the study's held-out episodes tell: keys then move
-    the place from where it was, and letting go leaves it there, where `rest` would be a jump.
+def mark_absolute_actions(simulator: Simulator, run: Path | str) -> None:
+    """Marks robots whose actions are absolute targets, judged by the study's held-out episodes (`Robot.keeps`): on the
+    page keys then move the last target and letting go keeps it, where `rest` would be a jump.
 
-    What lies beside the run, and the suite, say it themselves. For whoever drives; no simulated frame depends on it.
+    Robots described in a file of the run, and those of the suite, have the mark already. No simulated frame depends on
+    it.
     """
     study = Workspace.of_run(Path(run))
     if (Path(run) / ROBOTS).exists() or not study.store.is_dir():
@@ -161,12 +162,12 @@ def keep_places(simulator: Simulator, run: Path | str) -> None:
         robot for robot in simulator.robots.values() if robot.name not in SPECS and robot.name in store.names
     ]
     simulator.update_robots(
-        [replace(robot, keeps=True) for robot in recorded_robots if _goes_to_places(store, robot.name)]
+        [replace(robot, keeps=True) for robot in recorded_robots if _are_absolute(store, robot.name)]
     )
 
 
-def _goes_to_places(store: TokenStore, name: str) -> bool:
-    """Whether most of its action values drift, as targets do, and do not jump about zero, as changes do."""
+def _are_absolute(store: TokenStore, name: str) -> bool:
+    """Whether most action values drift, as absolute targets do, and do not jump around zero, as deltas do."""
     count = min(len(store.manifest(name).val.episodes), STARTS_PER_ROBOT)
     hints = [f.hint for f in dimension_facts([np.asarray(store.episode(name, "val", i).actions) for i in range(count)])]
     return 2 * hints.count("absolute") > len(hints)

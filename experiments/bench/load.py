@@ -57,7 +57,7 @@ class MemoryPoint:
 
 
 @dataclass(frozen=True)
-class Drained:
+class LoadTiming:
     """What drawing batches took: the timing of one, and the memory as it went on."""
 
     stage: Stage
@@ -75,7 +75,7 @@ class Drained:
         return f"memory over {drawn:,} {self.stage.name}: {self.slope / 1e3:+.1f} kB per thousand"
 
 
-def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threads: int) -> Drained:
+def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threads: int) -> LoadTiming:
     """`windows` training windows; a call is a batch."""
     config = LoaderConfig(batch=batch, frames=frames)
     loader = make_loader(store, store.embodiment_table(store.names), config, threads=threads)
@@ -84,7 +84,7 @@ def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threa
 
 def time_shards(
     sources: Sequence[tuple[DatasetSpec, Path]], frames: int, batch: int, size: int, threads: int
-) -> Drained:
+) -> LoadTiming:
     """The same for single frames of RLDS shards, decoded and resized to `size` pixels."""
     loader = make_frame_loader(sources, size, batch, 0, threads=threads)
     return _drain(loader, _with_threads("RLDS frames", threads), max(frames // batch, 20), batch, batch)
@@ -94,7 +94,7 @@ def _with_threads(what: str, threads: int) -> str:
     return f"{what}, {threads} thread{'s' * (threads != 1)}"
 
 
-def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: int) -> Drained:
+def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: int) -> LoadTiming:
     for _ in range(10):
         next(loader)
     seconds, memory = [], []
@@ -105,10 +105,10 @@ def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: i
         memory.append(MemoryPoint(name, (number + 1) * batch, resident_bytes()))
     # The mean counts: a batch that was ready costs nothing, the next one more.
     timing = replace(summarise(seconds), median=float(np.mean(seconds)))
-    return Drained(Stage(name, batch, timing, frames=frames), tuple(memory))
+    return LoadTiming(Stage(name, batch, timing, frames=frames), tuple(memory))
 
 
-def plot_memory(drained: Sequence[Drained], path: Path) -> None:
+def plot_memory(timings: Sequence[LoadTiming], path: Path) -> None:
     """Resident memory over what was drawn, a panel per stage."""
     import matplotlib.pyplot as plt
 
@@ -116,9 +116,9 @@ def plot_memory(drained: Sequence[Drained], path: Path) -> None:
 
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(
-            1, len(drained), figsize=(4.3 * len(drained), 3.2), layout="constrained", squeeze=False
+            1, len(timings), figsize=(4.3 * len(timings), 3.2), layout="constrained", squeeze=False
         )
-        for panel, one in zip(panels[0], drained, strict=True):
+        for panel, one in zip(panels[0], timings, strict=True):
             drawn, size = ([getattr(p, name) for p in one.memory] for name in ("drawn", "resident_bytes"))
             panel.plot([d / 1e3 for d in drawn], [s / 2**20 for s in size], color=COLOURS["perplexity"])
             panel.set_ylim(0, 1.2 * max(size) / 2**20)

@@ -53,7 +53,7 @@ def attend(q, k, v, attn_bias=None, scale=None):
     return scaled_dot_product_attention(*turned, is_causal=attn_bias is not None, scale=scale).transpose(1, 2)
 
 
-class Released:
+class ReleasedModels:
     """The released base models with drawn weights, `rows` windows of one robot, computed in `dtype`."""
 
     def __init__(self, rows: int, dtype: str):
@@ -147,7 +147,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     rows, dtype = sys.argv[1:]
-    released = Released(int(rows), dtype)
+    released = ReleasedModels(int(rows), dtype)
     calls = {
         "forward": released.forward,
         "frame": released.frame,

@@ -56,7 +56,13 @@ def play(
         if error.name != "aiohttp":
             raise
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
-    from experiments.applications.simulators import DEAF, in_suite, keep_places, load_simulator, true_simulator
+    from experiments.applications.simulators import (
+        DEAF,
+        in_suite,
+        load_simulator,
+        mark_absolute_actions,
+        true_simulator,
+    )
     from hma_jax.simulator.folder import find_decode
     from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
@@ -72,7 +78,7 @@ def play(
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )
-    keep_places(simulator, run)
+    mark_absolute_actions(simulator, run)
     begins = {start.robot for start in simulator.starts}
     if missing := [name for name in simulator.robots if name not in begins]:
         say(

@@ -61,7 +61,7 @@ a { color: inherit; } .hint { color: var(--muted); font-size: .86rem; }
 
 
 @dataclass(frozen=True)
-class Viewed:
+class DatasetView:
     """One dataset as the page shows it."""
 
     sample: Sample
@@ -76,7 +76,7 @@ class Viewed:
         return self.sample.facts
 
 
-def draw_page(datasets: Sequence[Viewed], frames: int, command: str) -> str:
+def draw_page(datasets: Sequence[DatasetView], frames: int, command: str) -> str:
     """The page. `frames`: T of the windows that are counted; `command`: what makes the page again."""
     title = ", ".join(d.facts.name for d in datasets)
     body = [_summary(datasets, frames)]
@@ -93,7 +93,7 @@ def draw_page(datasets: Sequence[Viewed], frames: int, command: str) -> str:
 # --- parts ------------------------------------------------------------------------------------
 
 
-def _summary(datasets: Sequence[Viewed], frames: int) -> str:
+def _summary(datasets: Sequence[DatasetView], frames: int) -> str:
     lines = []
     for i, d in enumerate(datasets):
         f, windows = d.facts, _windows(d, frames)
@@ -115,7 +115,7 @@ def _summary(datasets: Sequence[Viewed], frames: int) -> str:
     return table(head, lines, text=2)
 
 
-def _dataset(i: int, d: Viewed, frames: int) -> list[str]:
+def _dataset(i: int, d: DatasetView, frames: int) -> list[str]:
     f = d.facts
     sampled = "all" if f.sampled == f.episodes else f"{f.sampled} of {f.episodes:,}"
     where = f"{f.version} · split {f.split} · {sampled} episodes read ({f.bytes_read / 1e6:,.1f} MB) · {f.directory}"
@@ -141,7 +141,7 @@ def _part(title: str, *parts: str) -> str:
     return f"<h3>{html.escape(title)}</h3>{''.join(parts)}"
 
 
-def _read_as(d: Viewed) -> str:
+def _read_as(d: DatasetView) -> str:
     if d.entry is None:
         return "<p>There is no way to read it without its rate, or it has no camera.</p>"
     whose = "The registry's entry" if d.registered else "Not in the registry; its contents suggest an entry that"
@@ -156,15 +156,15 @@ def _read_as(d: Viewed) -> str:
     )
 
 
-def _windows(d: Viewed, frames: int) -> WindowFacts | None:
+def _windows(d: DatasetView, frames: int) -> WindowFacts | None:
     return window_facts(d.facts, d.stride, frames) if d.stride else None
 
 
-def _gallery(d: Viewed) -> str:
+def _gallery(d: DatasetView) -> str:
     return f"<div class=gallery>{''.join(_episode(d, example) for example in d.sample.examples)}</div>"
 
 
-def _episode(d: Viewed, example: ExampleEpisode) -> str:
+def _episode(d: DatasetView, example: ExampleEpisode) -> str:
     hz = d.hz or UNKNOWN_HZ
     seconds = example.steps / hz
     speed = min(max(seconds / LONGEST, 1.0), FASTEST)
@@ -195,7 +195,7 @@ def _curves(field: ActionFacts, example: ExampleEpisode) -> str:
     return f"<p class=hint>{html.escape(field.key)}, as recorded</p>{curves(rows, lows, highs, names)}"
 
 
-def _lengths(d: Viewed, frames: int) -> str:
+def _lengths(d: DatasetView, frames: int) -> str:
     f, windows = d.facts, _windows(d, frames)
     n = f.lengths
     words = (
@@ -223,7 +223,7 @@ def _lengths(d: Viewed, frames: int) -> str:
     return words + drawn + table(head, lines, text=0)
 
 
-def _actions(d: Viewed) -> list[str]:
+def _actions(d: DatasetView) -> list[str]:
     chosen = chosen_actions(d.facts, d.entry)
     taken = {field_slice(field.key)[0] for field in chosen}
     parts = [_action(field) for field in chosen]
@@ -252,7 +252,7 @@ def _number(value: float) -> str:
     return f"{value:.3g}".replace("-", "\u2212") if math.isfinite(value) else "–"
 
 
-def _cameras(d: Viewed) -> str:
+def _cameras(d: DatasetView) -> str:
     used = d.entry.image_key if d.entry else ""
     lines = []
     for c in d.facts.cameras:

@@ -1,4 +1,4 @@
-"""Whether the trials of a sweep are what they are taken for: named by what they hold, run by the same sources."""
+"""Checks of the trials of a study: each is the trial that its name says, and all ran the same sources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How one training run is saved and watched: what `hma train` and `hma adapt` ask about it."""
+"""Options of one training run, of `hma train` and `hma adapt`: checkpoints and validation."""
 
 from __future__ import annotations
 

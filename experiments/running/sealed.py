@@ -1,7 +1,7 @@
-"""The result of a trial, sealed: it says of which files it was computed, and holds a hash of itself.
+"""The sealed result of a trial: it holds hashes of the files it was computed from, and of itself.
 
-So a finished trial can be copied from one machine to another, as files, and what was cut off or edited on the way
-is found. It is no protection from somebody who means to deceive and computes the hashes again.
+A finished trial can so be copied between machines, and files that were truncated or edited are detected. It does not
+protect from deliberate forgery, which would compute the hashes again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SEALED = (WINDOWS, SAMPLES, "run/metrics.jsonl", provenance.FILE)
 them again, and a copy may leave them out."""
 
 SPARED = (SAMPLES,)
-"""Of these, files to look at, which are the most of a trial's bytes: a copy may leave them out as well."""
+"""Files among `SEALED` that no number depends on and that are most of a trial's bytes: a copy may leave them out."""
 
 
 def write_result(directory: Path, result: dict[str, Any]) -> None:

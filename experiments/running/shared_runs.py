@@ -1,8 +1,9 @@
-"""Trials that share the beginning of their training: one constant phase, a decay for every number of steps.
+"""Trials that share the beginning of their training: one constant phase of the learning rate, and a decay branch for
+every number of steps (warmup-stable-decay).
 
-Those that are judged otherwise share all of it. What a trial is and what it computes does not depend on it: a trial
-that goes on from another one's checkpoint ends with the same bytes as one that was trained alone
-(`hma_jax.training.branch`). Where the others are not there, or ran elsewhere, it is trained from its first step.
+Trials that differ in their evaluation alone share all of it. Sharing changes no result: a trial that goes on from
+another one's checkpoint ends with the same bytes as one that was trained alone (`hma_jax.training.branch`). Where the
+others' checkpoints are missing, a trial is trained from its first step.
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from hma_jax.config.json import stable_hash
 
 
 @dataclass(frozen=True)
-class Shared:
-    """What a trial has in common with others."""
+class SharedTraining:
+    """The steps of training that a trial shares with others."""
 
     before: tuple[tuple[str, int], ...] = ()  # (id, last common step) of those with fewer steps: it waits for them
     keep: tuple[int, ...] = ()  # steps after which its checkpoint stays, for those with more
 
 
-def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) -> dict[str, Shared]:
-    """For every trial of a study, by id. `former`: others that are finished (`trained.find_trained`)."""
+def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) -> dict[str, SharedTraining]:
+    """The shared training of every trial of a study, by id. `former`: finished trials that are not of this study
+    (`trained.find_trained`)."""
     trained: dict[str, dict[str, int]] = defaultdict(dict)
     for id, trial in former.items():
         trained[stable_hash(training_of(trial))][id] = trial.train.steps
@@ -43,7 +45,7 @@ def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) ->
             others = trained[key] | {other: n for n, other in family[:i]}
             common = [(other, common_steps(optimizer, steps, n)) for other, n in others.items()]
             keep = {common_steps(optimizer, steps, n) for n, _ in family[i + 1 :]} - {0}
-            found[id] = Shared(tuple((other, step) for other, step in common if step), tuple(sorted(keep)))
+            found[id] = SharedTraining(tuple((other, step) for other, step in common if step), tuple(sorted(keep)))
     return found
 
 
@@ -57,7 +59,7 @@ def common_steps(optimizer: OptimizerConfig, fewer: int, more: int) -> int:
 
 
 def begin_shared(directory: Path, before: Iterable[tuple[str, int]]) -> tuple[str, int] | None:
-    """Lets the trial in `directory` go on from the latest checkpoint that it has in common with those `before` it.
+    """Starts the trial in `directory` from the latest checkpoint that it shares with those `before` it.
 
     Its record then has the sources and machines of both. Returns whose it was and its step; None if it begins by
     itself, or has begun.

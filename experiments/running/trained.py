@@ -1,8 +1,6 @@
-"""Finished trials that lie in a study's directory and are not of it: what they were trained for need not be trained
-again.
+"""Finished trials in a study's directory that are not of the study, whose training its trials can share.
 
-A study that is to be judged otherwise (`eval`, `--replace study`) has trials of other names. Their training is the
-same.
+A study whose evaluation was changed (`eval`, `--replace study`) has trials of other names with the same training.
 """
 
 from __future__ import annotations

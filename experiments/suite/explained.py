@@ -39,7 +39,7 @@ PIXELS = 32
 
 
 @dataclass(frozen=True)
-class Explained:
+class ExplainedShare:
     """A row of the table. `sem` is the standard error over states, `moved` the root mean square of
     x' - x in grey levels."""
 
@@ -51,7 +51,7 @@ class Explained:
     moved: float
 
 
-def explained(spec: EmbodimentSpec, states: int = STATES) -> Explained:
+def explained(spec: EmbodimentSpec, states: int = STATES) -> ExplainedShare:
     """The share of one robot, a pure function of its arguments."""
     seeds = episode_seeds(spec, states, 0, "explained")
     rollout, rng = simulate(spec, seeds), np.random.default_rng(0)
@@ -73,7 +73,7 @@ def explained(spec: EmbodimentSpec, states: int = STATES) -> Explained:
     share = spread.sum() / change.sum()
     sem = np.std(spread - share * change, ddof=1) / np.sqrt(states) / change.mean()
     moved = np.sqrt(change.mean() / after.shape[-1])
-    return Explained(spec.name, spec.family, spec.action_dim, float(share), float(sem), float(moved))
+    return ExplainedShare(spec.name, spec.family, spec.action_dim, float(share), float(sem), float(moved))
 
 
 def states_at(spec: EmbodimentSpec, rollout: Rollout, times: np.ndarray) -> State:
@@ -95,12 +95,12 @@ def frames_of(spec: EmbodimentSpec, state: State) -> np.ndarray:
     return pooled.astype(np.float64).mean((2, 4))
 
 
-def read_table(path: Path = OUT) -> dict[str, Explained]:
+def read_table(path: Path = OUT) -> dict[str, ExplainedShare]:
     """The committed table, by robot."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {
-        r["robot"]: Explained(
+        r["robot"]: ExplainedShare(
             r["robot"], r["family"], int(r["action_values"]), float(r["share"]), float(r["sem"]), float(r["moved"])
         )
         for r in rows

@@ -19,7 +19,7 @@ from experiments.cli.main import main
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
 from experiments.running.attempts import AttemptEnd, outcome
-from experiments.running.shared_runs import Shared
+from experiments.running.shared_runs import SharedTraining
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
@@ -128,7 +128,7 @@ def write_job(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
     (directory / "job.json").write_text(json.dumps({"provenance": inputs}))
     monkeypatch.setattr(
-        "experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, Shared())
+        "experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, SharedTraining())
     )
 
 

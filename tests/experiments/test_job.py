@@ -11,7 +11,7 @@ import pytest
 from experiments.presets import SMOKE
 from experiments.running.job import read_job
 from experiments.running.migration import migrate
-from experiments.running.shared_runs import Shared
+from experiments.running.shared_runs import SharedTraining
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
@@ -24,8 +24,8 @@ micro-batches, on a mesh of fsdp 2."""
 def test_a_job_says_the_trial_and_how_it_is_computed():
     trial, execution = reference_trial(SMOKE, 1), ExecutionConfig(dtype="bfloat16", remat="none")
     record = json.loads(json.dumps({"trial": to_dict(trial), "provenance": {}, "execution": to_dict(execution)}))
-    assert read_job(record) == (trial, execution, Shared())
-    shared = Shared((("abc", 800),), keep=(1600,))
+    assert read_job(record) == (trial, execution, SharedTraining())
+    shared = SharedTraining((("abc", 800),), keep=(1600,))
     assert read_job(json.loads(json.dumps(record | {"shared": to_dict(shared)})))[2] == shared
 
 
@@ -35,7 +35,7 @@ def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_i
     judged = replace(SMOKE.eval, other_actions=EvalConfig().other_actions)  # which it does not name
     assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train, eval=judged, **data)
     assert (trial.model.width, trial.train.steps) == (SMOKE.model.width, SMOKE.train.steps)
-    assert shared == Shared()
+    assert shared == SharedTraining()
     assert execution == ExecutionConfig("bfloat16", "products", "auto", accumulate=2, mesh=MeshConfig(fsdp=2))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.cli.main import main
 from experiments.presets import get_preset
-from experiments.settings_help import Described, describe_settings
+from experiments.settings_help import SettingHelp, describe_settings
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Outer:
 
 def test_a_setting_is_told_by_its_own_comment():
     assert list(describe_settings(Outer())) == [
-        Described("inner.a", "1", "of things; a second half"),
-        Described("inner.b", "[]", "Above, over two lines (see figure 2.9)"),
-        Described("inner.c", "x", "(x, y)"),
-        Described("d", "# no comment", ""),
+        SettingHelp("inner.a", "1", "of things; a second half"),
+        SettingHelp("inner.b", "[]", "Above, over two lines (see figure 2.9)"),
+        SettingHelp("inner.c", "x", "(x, y)"),
+        SettingHelp("d", "# no comment", ""),
     ]
 
 

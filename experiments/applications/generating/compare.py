@@ -46,7 +46,7 @@ def psnr_of(pair: Pair, given: int) -> np.ndarray:
     return np.asarray(psnr(pair.generated[given:], pair.recorded[given:]))
 
 
-class Compared(NamedTuple):
+class Comparison(NamedTuple):
     """PSNR against the recording, the mean of every episode's frames, with its interval over episodes."""
 
     generated: Interval
@@ -55,7 +55,7 @@ class Compared(NamedTuple):
 
 def compare(
     directory: Path, recorded: Trajectories, given: int, clips: int, rate: float, progress: Progress | None = None
-) -> Compared:
+) -> Comparison:
     """Writes `psnr.csv` and the first `clips` episodes as MP4 beside `directory`: recording left, model right."""
     rows, home, total = [], directory.parent, len(RldsDataset(directory))
     for i, pair in enumerate(read_pairs(directory, recorded)):
@@ -74,4 +74,4 @@ def compare(
         ]
     write_file(home / "psnr.csv", "\n".join(lines) + "\n")
     means = np.array([[generated.mean(), still_psnr.mean()] for _, generated, still_psnr in rows])
-    return Compared(*(interval_of(mean_and_sem(column, np.arange(len(column)))) for column in means.T))
+    return Comparison(*(interval_of(mean_and_sem(column, np.arange(len(column)))) for column in means.T))

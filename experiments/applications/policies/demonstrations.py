@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.applications.policies.driving import Driven, drive, new_episodes
+from experiments.applications.policies.driving import ExpertRollouts, drive, new_episodes
 from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
@@ -103,7 +103,7 @@ def join(parts: Sequence[Demonstrations]) -> Demonstrations:
     )
 
 
-def _finished(task: Task, driven: Driven, seeds: np.ndarray, after: int | None) -> Demonstrations:
+def _finished(task: Task, driven: ExpertRollouts, seeds: np.ndarray, after: int | None) -> Demonstrations:
     images, acted, done = driven
     solved, (n, frames) = held(done, task.hold), done.shape
     lengths = np.full(n, frames)

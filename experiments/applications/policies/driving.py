@@ -21,7 +21,7 @@ JITTER = 2.0
 """Frames over which the hand of a physics simulator's expert forgets by what it misses."""
 
 
-class Driven(NamedTuple):
+class ExpertRollouts(NamedTuple):
     """n episodes of F frames; action t is given at frame t and held until the next."""
 
     images: np.ndarray  # uint8 [n, F, H, W, 3]
@@ -36,14 +36,16 @@ def new_episodes(task: Task, count: int, seed: int, split: str) -> np.ndarray:
     return new_seeds(task.robot, count, seed, split)
 
 
-def drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, *, noise: float, play: bool) -> Driven:
+def drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, *, noise: float, play: bool) -> ExpertRollouts:
     """`task.frames` frames from each start, a function of the arguments; an action is held for `stride` native
     steps."""
     kind = _drive_suite if task.in_suite else _drive_physics
     return kind(task, seeds, stride, image_size, noise, play)
 
 
-def _drive_suite(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool) -> Driven:
+def _drive_suite(
+    task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool
+) -> ExpertRollouts:
     world = World(noisy(task, noise), seeds)
     rng = np.random.default_rng([int(seeds[0]), len(seeds), 13])
     behaviour = Behaviour(world, rng) if play else make_expert(world, int(seeds[0]))
@@ -60,10 +62,12 @@ def _drive_suite(task: Task, seeds: np.ndarray, stride: int, image_size: int, no
     looks = draw_appearance(world.spec, seeds)
     images = render_frames(world.spec, looks, world.goals, *flat, np.repeat(np.arange(n), frames))
     images = fit_images(images, image_size)
-    return Driven(images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.stack(reached, 1))
+    return ExpertRollouts(images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.stack(reached, 1))
 
 
-def _drive_physics(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool) -> Driven:
+def _drive_physics(
+    task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool
+) -> ExpertRollouts:
     """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its hand forgets by what it misses
     over `JITTER` frames, where that of the data forgets over 0.1 s; `play` wanders."""
     spec, world = task.physics, PhysicsWorld(task.physics, image_size)
@@ -85,4 +89,4 @@ def _drive_physics(task: Task, seeds: np.ndarray, stride: int, image_size: int, 
                     world.step(actions[i, t])
     finally:
         world.close()
-    return Driven(images, actions, reached)
+    return ExpertRollouts(images, actions, reached)

@@ -177,20 +177,20 @@ def load(
         with step("open the token store"):
             opened = make_store(Path(scratch), 0) if store is None else TokenStore(store)
         with step(f"draw windows of {len(opened.names)} datasets"):
-            drained = [time_windows(opened, windows, batch, frames, n) for n in threads]
+            timings = [time_windows(opened, windows, batch, frames, n) for n in threads]
     if data:
         from data_pipelines.registry import get_spec
         from experiments.preparing.sources import name_datasets
 
         sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
         with step(f"draw frames of {len(sources)} RLDS directories"):
-            drained += [time_shards(sources, windows * frames // 10, 4 * batch, size, n) for n in threads]
+            timings += [time_shards(sources, windows * frames // 10, 4 * batch, size, n) for n in threads]
     settings = {"frames": frames, "threads": threads, "datasets": len(opened.names), "size": size}
-    stages, notes = [d.stage for d in drained], tuple(d.describe() for d in drained)
+    stages, notes = [d.stage for d in timings], tuple(d.describe() for d in timings)
     name = "store" if store is None else store.name
     write("load", name, "none", 0, settings, stages, {}, notes, out)
-    write_csv(out / f"load-{name}-memory.csv", MemoryPoint, [p for d in drained for p in d.memory])
-    plot_memory(drained, out / f"load-{name}-memory.png")
+    write_csv(out / f"load-{name}-memory.csv", MemoryPoint, [p for d in timings for p in d.memory])
+    plot_memory(timings, out / f"load-{name}-memory.png")
     console.print(f"wrote {out / f'load-{name}-memory'}.csv and .png", soft_wrap=True)
 
 

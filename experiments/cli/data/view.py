@@ -23,7 +23,7 @@ from hma_jax.runtime.outputs import make_directory
 if TYPE_CHECKING:
     from data_pipelines.inspection.duplicates import Fingerprint
     from data_pipelines.inspection.inspect import Facts
-    from experiments.report.data_page import Viewed
+    from experiments.report.data_page import DatasetView
 
 OTHER_SPLITS = 2
 """Splits beside the one shown that are searched for the same episodes."""
@@ -81,7 +81,7 @@ def view(
 
 def _view_one(
     directory: str, split: str | None, hz: float | None, stride: int | None, frames: int, episodes: int, shown: int
-) -> Viewed:
+) -> DatasetView:
     from data_pipelines.inspection.duplicates import find_duplicates
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.issues import find_issues
@@ -89,7 +89,7 @@ def _view_one(
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_spec
     from data_pipelines.sources.open import source_name
-    from experiments.report.data_page import CLIP_FRAMES, Viewed
+    from experiments.report.data_page import CLIP_FRAMES, DatasetView
 
     known = find_spec(source_name(directory))
     split = split or (known.split if known else "train")
@@ -109,7 +109,7 @@ def _view_one(
     prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes, keys))]
     windows = window_facts(facts, stride, frames) if stride else None
     issues = find_issues(facts, entry, windows, find_duplicates(prints))
-    return Viewed(sample, entry, known is not None, rate, stride, tuple(issues))
+    return DatasetView(sample, entry, known is not None, rate, stride, tuple(issues))
 
 
 def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
@@ -125,7 +125,7 @@ def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]
         return ()
 
 
-def _say_issues(viewed: Viewed, episodes: int) -> None:
+def _say_issues(viewed: DatasetView, episodes: int) -> None:
     colours = {"error": "red", "warning": "yellow"}
     name = escape(viewed.facts.name)
     if not viewed.issues:
@@ -142,7 +142,7 @@ def _say_issues(viewed: Viewed, episodes: int) -> None:
         )
 
 
-def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> None:
+def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None) -> None:
     """The commands that read what can be read, one per rate of frames, or those that lead there."""
     from data_pipelines.inspection.issues import MISFIT
     from data_pipelines.inspection.suggest import window_facts

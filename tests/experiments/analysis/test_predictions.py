@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.analysis.fits import LEAST
+from experiments.analysis.fits import MIN_POSITIONS
 from experiments.analysis.predictions import Outcome, Prediction, load_predictions, save_prediction
 from experiments.cli.main import main
 from experiments.override import override
@@ -185,7 +185,7 @@ def test_the_sweeps_of_the_page_have_the_seeds_that_a_prediction_needs():
     for words in sweeps:
         points = plan_width(override(CPU, words.replace("--set ", "").split())).points
         seeds = Counter(point.x for point in points if point.role == POINT)
-        assert len(seeds) >= LEAST and min(seeds.values()) > 1, words
+        assert len(seeds) >= MIN_POSITIONS and min(seeds.values()) > 1, words
     assert len(sweeps) == 2
 
 

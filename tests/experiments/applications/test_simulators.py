@@ -62,12 +62,12 @@ def test_of_one_s_own_data_targets_stay_where_they_were_moved_to_and_changes_end
     simulator = SimpleNamespace(robots=robots, describe=described.extend)
     workspace = Workspace(tmp_path)
     workspace.store.mkdir()
-    simulators_module.keep_places(simulator, tmp_path / "model")
+    simulators_module.mark_absolute_actions(simulator, tmp_path / "model")
     assert described == [replace(robots["arm"], keeps=True)]
 
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "robots.json").touch()  # what lies beside the run says it
-    simulators_module.keep_places(simulator, tmp_path / "model")
+    simulators_module.mark_absolute_actions(simulator, tmp_path / "model")
     assert len(described) == 1
 
 
