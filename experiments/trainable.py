@@ -1,4 +1,4 @@
-"""What is refused before anything is made, since every trial would fail or come out otherwise than it says."""
+"""Checks before anything is made, of settings under which trials would fail or differ from their description."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def require_trainable(study: Study, sweeps: Sequence[Sweep], launcher_options: L
 
 
 def devices_of(mesh: MeshConfig, share: float | None) -> float:
-    """The devices that a program uses of its `share`; where nobody says that, as many as the mesh takes at least.
+    """The devices that a program uses of its `share`; where that is unknown, as many as the mesh needs at least.
 
     Raises ConfigError for a mesh that does not fit them, as training would.
     """

@@ -173,7 +173,7 @@ def _run_of(trial: Trial) -> str:
 
 def _all_but_size(trial: Trial) -> str:
     """Equal for trials that differ in width, steps and seed alone, and in how many other actions they are judged under
-    (`sweeps.sweep.judge_less`)."""
+    (`sweeps.sweep.limit_other_actions`)."""
     values = _without_steps(trial)
     values["model"].pop("width")
     values["eval"].pop("other_actions")

@@ -183,11 +183,11 @@ def abstract_inputs(
         "actions": ((*shape[:2], table.action_width), jnp.float32),
         "embodiment": (shape[:1], jnp.int32),
     }
-    lying = batch_sharding(mesh)
-    return state, {name: jax.ShapeDtypeStruct(*of, sharding=lying) for name, of in rows.items()}
+    sharding = batch_sharding(mesh)
+    return state, {name: jax.ShapeDtypeStruct(*of, sharding=sharding) for name, of in rows.items()}
 
 
 def _refusal(message: str) -> str:
     lines = [line.strip() for line in message.splitlines() if line.strip()]
-    telling = [line for line in lines if "exceed" in line or "Ran out" in line]
-    return (telling or lines)[0]
+    relevant = [line for line in lines if "exceed" in line or "Ran out" in line]
+    return (relevant or lines)[0]

@@ -1,4 +1,4 @@
-"""What the author of a study expected of its axes, and makes of them.
+"""The author's expectations of a study's axes, with their outcomes, and the author's findings.
 
 The first is predictions/preregistered.csv (`experiments.analysis.preregistered`). The second is findings.md beside the
 page, a section per axis, shown with its curves:
@@ -60,7 +60,7 @@ def read_findings(path: Path, axes: Sequence[str]) -> Findings:
 
 
 def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> str:
-    """Numbers of an axis that were written down before its trials ran, beside what came."""
+    """A table of the preregistered numbers of an axis and their outcomes."""
     own = [c for c in outcomes if c.expected.sweep == sweep.name]
     if not own:
         return ""

@@ -1,4 +1,4 @@
-"""What the report says of scaling fits: coefficients with intervals, predictions and what came, best sizes."""
+"""The section of the report on scaling fits: coefficients with intervals, predictions with outcomes, best sizes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All that a study's report is computed from: results and windows of its finished trials, and fits of them."""
+"""The inputs of a study's report: results and per-window numbers of its finished trials, fits and predictions."""
 
 from __future__ import annotations
 

@@ -64,12 +64,12 @@ def write_report(
 ) -> None:
     """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
     shown = _choose_shown(sweeps, record.study)
-    first = trial_id(_defaults(shown.by)[0], provenance) if shown else ""
+    first = trial_id(_defaults(shown.sweep)[0], provenance) if shown else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
     has_reference = first in finished
     dated = first if has_reference else next(iter(finished), None)
     result = numbers.results[dated] if dated else None
-    robots = robots_of(rows, shown.by, provenance, numbers.windows) if has_reference else []
+    robots = robots_of(rows, shown.sweep, provenance, numbers.windows) if has_reference else []
     name, aside = (shown.name, shown.aside) if shown else (REFERENCE, "")
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
@@ -84,7 +84,7 @@ def write_report(
         findings.rest,
         _clips(workspace.trials / first / "samples.npz", record, robots, aside) if has_reference else "",
         section(f"Robots{', the most controllable first' * are_sorted(robots)}{aside}", describe_robots(
-            rows, shown.by, robots, workspace.data_summary
+            rows, shown.sweep, robots, workspace.data_summary
         )) if has_reference else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
@@ -102,10 +102,10 @@ def write_report(
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _ShownTrials:
     """The trials, one a seed, of which the page shows numbers, clips and robots: those at the default of a sweep."""
 
-    by: Sweep
+    sweep: Sweep
     name: str  # what they are
 
     @property
@@ -114,13 +114,13 @@ class _Shown:
         return "" if self.name == REFERENCE else f" ({self.name})"
 
 
-def _choose_shown(sweeps: Sequence[Sweep], study: Study) -> _Shown | None:
+def _choose_shown(sweeps: Sequence[Sweep], study: Study) -> _ShownTrials | None:
     """The reference trials, by the sweep of the widest scope in which they stand; where they stand in none, what the
     widest has instead, by the name that it has."""
-    those = [s for s in sweeps if _defaults(s)]
-    true = [s for s in those if all(t == reference_trial(study, t.train.seed) for t in _defaults(s))]
-    by = max(true or those, key=lambda s: len(s.scope), default=None)
-    return by and _Shown(by, REFERENCE if true else f"default of {by.name}")
+    with_default = [s for s in sweeps if _defaults(s)]
+    with_reference = [s for s in with_default if all(t == reference_trial(study, t.train.seed) for t in _defaults(s))]
+    sweep = max(with_reference or with_default, key=lambda s: len(s.scope), default=None)
+    return sweep and _ShownTrials(sweep, REFERENCE if with_reference else f"default of {sweep.name}")
 
 
 def _defaults(sweep: Sweep) -> list[Trial]:
@@ -133,7 +133,7 @@ def _headline(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     states: dict[str, State],
-    shown: _Shown | None,
+    shown: _ShownTrials | None,
     result: dict[str, Any] | None,
 ) -> str:
     study = record.study
@@ -146,17 +146,17 @@ def _headline(
     }
     for metric in (m for m in metrics if shown and m in card_notes):
         name, of_untrained = card_notes[metric]
-        found = _at_default(rows, shown.by, metric)
+        found = _at_default(rows, shown.sweep, metric)
         over = "s.e. over episodes and seeds" if found and len(found.seeds) > 1 else "s.e. over episodes of one seed"
         cards.append(card(f"{name}, {shown.name}", found, over))
-        untrained = _at_default(rows, shown.by, metric, UNTRAINED)
+        untrained = _at_default(rows, shown.sweep, metric, UNTRAINED)
         if untrained or shown.name == REFERENCE:  # of others nobody asks it
             cards.append(card(f"{name}, untrained", untrained, of_untrained))
     if shown and "delta_psnr" in metrics:
         cards += [
-            card(f"ΔPSNR, {shown.name}", _at_default(rows, shown.by, "delta_psnr"),
+            card(f"ΔPSNR, {shown.name}", _at_default(rows, shown.sweep, "delta_psnr"),
                  "dB, last frame: true minus random actions"),
-            card("ΔPSNR, shuffled actions", _at_default(rows, shown.by, "delta_psnr", CONTROL),
+            card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
                  "dB, must vanish within its error"),
         ]  # fmt: skip
     cards.append(card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"))

@@ -1,4 +1,4 @@
-"""What the report is made of: sections, cards, tables, numbers with errors, pictures. All HTML."""
+"""HTML elements of the report: sections, cards, tables, numbers with errors, pictures."""
 
 from __future__ import annotations
 

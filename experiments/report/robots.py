@@ -35,7 +35,7 @@ ORDER = ("action_nats", "delta_psnr")
 
 @dataclass(frozen=True)
 class Robot:
-    """What the trials of one configuration, of all seeds, say of one robot."""
+    """One robot's numbers over the trials of one configuration, of all seeds."""
 
     name: str
     errors: float  # standard errors of ORDER from zero; nan if it was not measured

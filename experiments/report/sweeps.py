@@ -1,4 +1,4 @@
-"""What the report says of one sweep: its question, its numbers and what follows from them."""
+"""The section of the report on one sweep: its question, its numbers and what follows from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One attempt at a trial: what it leaves in the trial's directory, and what that says of the trial.
+"""One attempt at a trial: the files it leaves in the trial's directory, and the state of the trial that follows.
 
 The same wherever the attempt runs. Its process holds the trial's lock, which has a lease
 (`data_pipelines.publishing.output_lock`), for as long as it lives; whoever finds the lock free may try again.
@@ -35,7 +35,7 @@ RUN = "run"
 """The training run, with its checkpoints."""
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-"""What an attempt is asked to stop by. It saves and ends with 128 + n; before it can, with -n."""
+"""Signals that ask an attempt to stop. It saves and ends with 128 + n; before it is ready to save, with -n."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Child processes: their share of the machine, and their end with the parent.
 
-The parent puts its wishes into the environment; the child calls `enter_child` before it imports
-JAX, whose thread pools take their size from the cores a process may use.
+The parent passes them in environment variables; the child calls `enter_child` before it imports JAX, whose thread
+pools take their size from the cores that a process may use.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
 _PR_SET_PDEATHSIG = 1
 
 CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
-"""Of what a slot says, what the user may say instead. Which accelerators are the slot's is not among it: they are
-a part of those that the user allows."""
+"""Variables of a slot that the user's environment overrides. Which accelerators a slot has is not among them: they are
+some of those that the user allows."""
 
 
 def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str]:
-    """The environment of a child that has `slot` for itself. What the user says there stays as it is."""
+    """The environment of a child that has `slot` for itself. Variables that the user has set stay as they are."""
     environment = {**KEPT_PAGES, **os.environ}
     environment[_PARENT] = str(os.getpid())
     environment.pop(_CORES, None)

@@ -1,4 +1,4 @@
-"""Runs the trials that are missing, wherever a launcher puts them, and survives what happens to them.
+"""Runs the trials that are missing, by a launcher, and recovers from failures.
 
 A trial that crashes is recorded with its message and the others go on. One whose process is lost or asked to stop
 is tried again and goes on from its checkpoint. The runner itself may be interrupted or killed at any point: the
@@ -35,7 +35,7 @@ from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTE
 from hma_jax.runtime.files import write_file
 
 TRIES = 3
-"""How often in one command a trial may be lost: what kills it may be its own size."""
+"""How often in one command a trial may be lost: it may run out of memory each time."""
 
 POLL_SECONDS = 5.0
 """Seconds between two checks of trials that an earlier runner started elsewhere."""
@@ -52,7 +52,7 @@ class Job:
 
 
 class Monitor:
-    """Hears what the runner does; the default says nothing."""
+    """Callbacks for the progress of a runner; the default ignores it."""
 
     def launched(self, job: Job, resumed: bool) -> None: ...
 

@@ -20,10 +20,10 @@ from typing import Literal
 from hma_jax.config import require
 
 MEMORY = 0.9
-"""Of a GPU's memory, what all trials on it may take; part of it is the driver's and the libraries'."""
+"""Share of a GPU's memory for all trials on it; the rest is for the driver and libraries."""
 
 CHIP_BOUNDS = {1: "1,1,1", 2: "1,2,1", 4: "2,2,1", 8: "2,4,1"}
-"""How so many TPU chips of one host lie, as libtpu wants it said."""
+"""Layout of so many TPU chips of one host, in libtpu's notation."""
 
 
 GOOGLE, TPU_DEVICES = "0x1ae0", ("0x0027", "0x0056", "0x005e", "0x0062", "0x0063", "0x006f", "0x0076")
@@ -32,7 +32,7 @@ GOOGLE, TPU_DEVICES = "0x1ae0", ("0x0027", "0x0056", "0x005e", "0x0062", "0x0063
 
 @dataclass(frozen=True)
 class Accelerators:
-    """What of the machine's accelerators this process may use, by the names that a child is told."""
+    """The accelerators that this process may use, by their names in environment variables."""
 
     kind: Literal["gpu", "tpu"]
     names: tuple[str, ...]
@@ -47,7 +47,7 @@ class Slot:
     sharers: int = 1  # slots on the same accelerators, this one too
 
     def environment(self) -> dict[str, str]:
-        """What a child is told of its accelerators."""
+        """Environment variables that limit a child to its accelerators."""
         variables: dict[str, str] = {}
         if self.sharers > 1:
             variables["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY / self.sharers:.3f}"
@@ -77,7 +77,8 @@ def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerato
 
 
 def _named(visible: str) -> tuple[str, ...]:
-    """Of a list as CUDA reads it: what is no device, such as -1 or what Slurm says of a job without any, ends it."""
+    """The names in a list as CUDA reads it: the first that is no device ends it, such as -1, or NoDevFiles, which Slurm
+    sets for a job without any."""
     names = (name.strip() for name in visible.split(",") if name.strip())
     return tuple(takewhile(lambda name: name != "NoDevFiles" and not name.startswith("-"), names))
 

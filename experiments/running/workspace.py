@@ -59,7 +59,7 @@ class Workspace:
 
     @property
     def counterfactual(self) -> Path:
-        """What would be seen in them under other actions, of the suite."""
+        """Their true frames under other actions, where they are of the suite."""
         return self.root / "counterfactual.npz"
 
     @property
@@ -102,7 +102,7 @@ class Workspace:
 
     @property
     def changes(self) -> Path:
-        """What changes from one end of each axis to the other."""
+        """Differences between the two ends of each axis."""
         return self.root / "changes.csv"
 
     @property
@@ -112,7 +112,7 @@ class Workspace:
 
     @property
     def growth(self) -> Path:
-        """What more trajectories change for robots that have more, and for those that have not."""
+        """The effect of more trajectories on robots that have more, and on those that have not."""
         return self.root / "growth.csv"
 
     @property
@@ -127,12 +127,12 @@ class Workspace:
 
     @property
     def predictions(self) -> Path:
-        """What was said of trials before they ran."""
+        """Predictions of trials, made before they ran."""
         return self.root / "predictions"
 
     @property
     def findings(self) -> Path:
-        """What the study's author makes of its axes, for the page."""
+        """The author's findings by axis, shown on the page."""
         return self.root / "findings.md"
 
     @property
@@ -171,7 +171,7 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Record:
-    """What study.json remembers, so that `hma report` and `hma sweep` need only its directory."""
+    """The content of study.json, so that `hma report` and `hma sweep` need the study's directory alone."""
 
     study: Study
     data: tuple[str, ...] = ()  # RLDS directories of the user; () for the suite

@@ -17,7 +17,7 @@ from typing import Any
 
 from experiments.running.trial import Trial
 from experiments.study import Study
-from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, judge_less
+from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, limit_other_actions
 from experiments.user_file import find_function, naming_line
 from experiments.words import few
 from hma_jax.config import ConfigError, require
@@ -100,7 +100,7 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
             )
     names = [sweep.name for sweep in sweeps]
     require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
-    return [judge_less(study, sweep) for sweep in sweeps]
+    return [limit_other_actions(study, sweep) for sweep in sweeps]
 
 
 def _require_trials(study: Study, sweep: Sweep, where: str) -> None:

@@ -107,9 +107,10 @@ def control_of(trial: Trial) -> Trial:
     return replace(trial, shuffle_actions=True, measure_untrained=False)
 
 
-def judge_less(study: Study, sweep: Sweep) -> Sweep:
-    """The sweep as it is judged: retrieval among many sequences, half of an evaluation's cost, is asked of the
-    reference at all its steps and of its control; of others action-nats need `designs.other_actions` sequences."""
+def limit_other_actions(study: Study, sweep: Sweep) -> Sweep:
+    """The sweep with fewer other actions per evaluation: retrieval among many sequences, half of an evaluation's cost,
+    is measured for the reference at all its steps and for its control; all others are judged under
+    `designs.other_actions` sequences, enough for action-nats."""
     few = study.designs.other_actions
     if few is None:
         return sweep

@@ -255,7 +255,7 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     assert "perplexity" not in said and all(name.removeprefix("squared ") in said for name in shown)
     checked = check_study([sweep], rows, [], {}, [], "reference", [], Check("", "good", ""), None)
     assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
-    cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._Shown(sweep, "reference"), None)
+    cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._ShownTrials(sweep, "reference"), None)
     assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
     listed = describe_robots(rows, sweep, robots_of(rows, sweep, PROVENANCE, {}), tmp_path / "data.json")
     assert ("s.e. above zero" in listed) == ("delta_psnr" in measured) and "ahead of copying" not in listed
@@ -275,7 +275,7 @@ def test_the_error_of_one_seed_is_not_said_to_be_over_seeds(drawn):
     sweep = plan_width(STUDY)
     rows = rows_of(drawn, [sweep])
     for own, said in ((rows, "and seeds"), ([r for r in rows if r.seed == 0], "of one seed")):
-        cards = page._headline(drawn, record_of(), [sweep], own, {}, page._Shown(sweep, "reference"), None)
+        cards = page._headline(drawn, record_of(), [sweep], own, {}, page._ShownTrials(sweep, "reference"), None)
         assert f"s.e. over episodes {said}<" in cards
 
 
