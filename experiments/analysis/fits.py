@@ -103,13 +103,15 @@ def fit_power(measured: Measurements, draws: int = DRAWS, episodes: bool = True)
     values = measured.draw(draws, np.random.default_rng(0), episodes)
     theta, thetas = fit_draws(z, measured.value, values, weight)
     residuals = np.log(measured.value) - predict_log(theta, z)
-    found = _coefficients(theta, thetas, centre)
+    coefficients = _coefficients(theta, thetas, centre)
     refused, doubts = _verdict(measured, theta, thetas)
-    wide = [c for c in found if c.name in ("alpha", "beta") and c.high > WIDE_RATIO * c.low]
+    wide = [c for c in coefficients if c.name in ("alpha", "beta") and c.high > WIDE_RATIO * c.low]
     if not refused:
         doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide)
-        doubts += _inferred(measured) + _misfit(measured, residuals) + _first_position(measured, found, weight)
-    return PowerFit(measured.axes, measured.trial, refused, doubts, found, residuals, noise, theta, thetas, centre)
+        doubts += _inferred(measured) + _misfit(measured, residuals) + _first_position(measured, coefficients, weight)
+    return PowerFit(
+        measured.axes, measured.trial, refused, doubts, coefficients, residuals, noise, theta, thetas, centre
+    )
 
 
 def weight_of(noise: np.ndarray) -> np.ndarray:
@@ -181,11 +183,11 @@ def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> 
     """In units of x: A = A at the centre times exp(alpha centre)."""
 
     def named(t: np.ndarray) -> dict[str, np.ndarray]:
-        found = {"E": np.exp(t[..., 0])}
+        coefficients = {"E": np.exp(t[..., 0])}
         for k, (scale, exponent) in enumerate(NAMES[: len(centre)]):
             alpha = t[..., 1 + len(centre) + k]
-            found |= {scale: np.exp(t[..., 1 + k] + alpha * centre[k]), exponent: alpha}
-        return found
+            coefficients |= {scale: np.exp(t[..., 1 + k] + alpha * centre[k]), exponent: alpha}
+        return coefficients
 
     values, draws = named(theta), named(thetas)
     return tuple(Coefficient(n, float(values[n]), *map(float, interval(draws[n]))) for n in values)
@@ -208,7 +210,9 @@ def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
     return (f"{doubt}: over the whole range the loss is not of this form",)
 
 
-def _first_position(measured: Measurements, found: tuple[Coefficient, ...], weight: np.ndarray) -> tuple[str, ...]:
+def _first_position(
+    measured: Measurements, coefficients: tuple[Coefficient, ...], weight: np.ndarray
+) -> tuple[str, ...]:
     """A doubt if the exponent over one axis depends on the first position, where a power law need not hold yet."""
     x = measured.x[:, 0]
     keep = x > x.min()
@@ -217,7 +221,7 @@ def _first_position(measured: Measurements, found: tuple[Coefficient, ...], weig
     log_x = np.log(measured.x[keep])
     values = measured.value[keep]
     theta, _ = fit_draws(log_x - log_x.mean(0), values, values[None], weight[keep])
-    alpha = next(c for c in found if c.name == "alpha")
+    alpha = next(c for c in coefficients if c.name == "alpha")
     if alpha.low <= theta[2] <= alpha.high:
         return ()
     return (f"without the first position alpha is {theta[2]:.2g} and E {np.exp(theta[0]):.2g}",)

@@ -87,12 +87,12 @@ def starts(log_y: np.ndarray, z: np.ndarray) -> np.ndarray:
     lowest, highest = np.exp(log_y.min()), np.exp(log_y.max())
     shares = [(1.0,)] if k == 1 else [(s, 1 - s) for s in START_SHARE]
     alphas = itertools.product(START_ALPHA if k == 1 else START_ALPHA[::2], repeat=k)
-    found = []
+    grid = []
     for part, share, alpha in itertools.product(START_E, shares, alphas):
         above = highest - part * lowest
         a = [np.log(s * above) + x * column.min() for s, x, column in zip(share, alpha, z.T, strict=True)]
-        found.append([np.log(part * lowest), *a, *alpha])
-    return np.array(found)
+        grid.append([np.log(part * lowest), *a, *alpha])
+    return np.array(grid)
 
 
 def minimise(
@@ -146,8 +146,8 @@ def fit_draws(z: np.ndarray, y: np.ndarray, draws: np.ndarray, weight: np.ndarra
     bounds = bounds_of(np.concatenate([log_y[None], log_draws]), z.shape[1])
     grid = np.clip(starts(log_y, z), bounds.low, bounds.high)
     first = np.argsort(objective(grid, z, log_y, weight))[:40]
-    found, values = minimise(grid[first], z, np.repeat(log_y[None], len(first), 0), weight, bounds)
-    best = found[np.argmin(values)]
+    candidates, values = minimise(grid[first], z, np.repeat(log_y[None], len(first), 0), weight, bounds)
+    best = candidates[np.argmin(values)]
     # Each draw from the fit of the values themselves and from the grid's best point for it.
     cost = np.stack([objective(g, z, log_draws, weight) for g in grid])  # [G, R]
     both = np.concatenate([np.repeat(best[None], len(draws), 0), grid[np.argmin(cost, 0)]])

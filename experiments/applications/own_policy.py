@@ -174,8 +174,8 @@ def read_trials(path: Path) -> dict[str, list[tuple[bool, float]]]:
 
 def summarise(trials: Mapping[str, list[tuple[bool, float]]]) -> list[tuple[str, float, float, float]]:
     """(policy, success, its interval of 95 %) over starts."""
-    found = {name: rate_interval(np.array([success for success, _ in ends])) for name, ends in trials.items()}
-    return [(name, rate.mean, rate.low, rate.high) for name, rate in found.items()]
+    rates = {name: rate_interval(np.array([success for success, _ in ends])) for name, ends in trials.items()}
+    return [(name, rate.mean, rate.low, rate.high) for name, rate in rates.items()]
 
 
 def markdown(rows: list[tuple[str, float, float, float]]) -> str:
@@ -213,14 +213,14 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
             path.parent.mkdir(exist_ok=True)
             with step(name) as report:
                 policy = make_policy(name, simulator, robot, demos, settings, out, report)
-                found = run_policy(task, policy, seeds, size, robot.stride)
-            write_file(path, json.dumps([found.success.tolist(), found.distance.tolist()]))
+                outcome = run_policy(task, policy, seeds, size, robot.stride)
+            write_file(path, json.dumps([outcome.success.tolist(), outcome.distance.tolist()]))
         trials[name] = list(zip(*json.loads(path.read_text()), strict=True))
     return trials
 
 
 def write_results(trials: Mapping[str, list[tuple[bool, float]]], out: Path) -> None:
-    rows = [[name, k, int(s), f"{d:.4f}"] for name, found in trials.items() for k, (s, d) in enumerate(found)]
+    rows = [[name, k, int(s), f"{d:.4f}"] for name, outcomes in trials.items() for k, (s, d) in enumerate(outcomes)]
     write_table(out / "trials.csv", NAMES, rows)
     summary = summarise(trials)
     cells = [[name, *(f"{x:.4f}" for x in numbers)] for name, *numbers in summary]

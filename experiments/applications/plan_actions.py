@@ -163,10 +163,10 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
         demos = record(task, CLONED[way], stride=robot.stride, image_size=size, only_successes=True)
         fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
         policy = clone(demos, BcConfig(frames=1, fit=fit), settings.seed, report)
-    found = run_policy(task, policy, seeds, size, robot.stride)
+    outcome = run_policy(task, policy, seeds, size, robot.stride)
     return [
         {"success": bool(s), "distance": float(d), "seconds": 0.0}
-        for s, d in zip(found.success, found.distance, strict=True)
+        for s, d in zip(outcome.success, outcome.distance, strict=True)
     ]
 
 
@@ -178,29 +178,29 @@ def outcome_paths(out: Path, way: str, starts: int) -> list[Path]:
 
 def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval, float]]:
     """Success of each way of acting, over its starts, and seconds per plan (median over starts)."""
-    rates = [rate_interval(np.array([t["success"] for t in found], float)) for found in trials.values()]
-    seconds = [float(np.median([t["seconds"] for t in found])) for found in trials.values()]
+    rates = [rate_interval(np.array([t["success"] for t in outcomes], float)) for outcomes in trials.values()]
+    seconds = [float(np.median([t["seconds"] for t in outcomes])) for outcomes in trials.values()]
     return list(zip(trials, rates, seconds, strict=True))
 
 
 def write_results(trials: Mapping[str, Sequence[dict]], out: Path) -> None:
     rows = [
         [way, k, int(t["success"]), f"{t['distance']:.4f}", f"{t['seconds']:.4f}"]
-        for way, found in trials.items()
-        for k, t in enumerate(found)
+        for way, outcomes in trials.items()
+        for k, t in enumerate(outcomes)
     ]
     write_table(out / "trials.csv", NAMES, rows)
-    found = summarise(trials)
-    summary = [[way, *(f"{x:.4f}" for x in (r.mean, r.low, r.high, seconds))] for way, r, seconds in found]
-    write_table(out / "summary.csv", ["way", "mean", "low", "high", "seconds_per_plan"], summary)
-    write_file(out / "table.md", markdown(found))
-    draw(found, out / "planning.png")
+    summary = summarise(trials)
+    cells = [[way, *(f"{x:.4f}" for x in (r.mean, r.low, r.high, seconds))] for way, r, seconds in summary]
+    write_table(out / "summary.csv", ["way", "mean", "low", "high", "seconds_per_plan"], cells)
+    write_file(out / "table.md", markdown(summary))
+    draw(summary, out / "planning.png")
 
 
-def markdown(found: Sequence[tuple[str, Interval, float]]) -> str:
+def markdown(summary: Sequence[tuple[str, Interval, float]]) -> str:
     """The table that docs/planning.md shows."""
     lines = ["| acting | success | 95 % interval | seconds per plan |", "|---|---|---|---|"]
-    for way, r, seconds in found:
+    for way, r, seconds in summary:
         took = f"{seconds:.1f}" if seconds else ""
         lines.append(f"| {way} | {r.mean:.2f} | {r.low:.2f} to {r.high:.2f} | {took} |")
     return "\n".join(lines) + "\n"
@@ -216,18 +216,18 @@ def read_trials(path: Path) -> dict[str, list[dict]]:
     return trials
 
 
-def draw(found: Sequence[tuple[str, Interval, float]], path: Path) -> None:
+def draw(summary: Sequence[tuple[str, Interval, float]], path: Path) -> None:
     """Success by way of acting, with its interval."""
     from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, plt, save
 
     with plt.rc_context(STYLE):
         figure, panel = plt.subplots(figsize=(6.4, 2.9), layout="constrained")
-        places, mean = np.arange(len(found))[::-1], np.array([r.mean for _, r, _ in found])
-        low, high = (np.array([getattr(r, end) for _, r, _ in found]) for end in ("low", "high"))
-        colours = [COLOURS["perplexity"] if "in the model" in way else MUTED for way, _, _ in found]
+        places, mean = np.arange(len(summary))[::-1], np.array([r.mean for _, r, _ in summary])
+        low, high = (np.array([getattr(r, end) for _, r, _ in summary]) for end in ("low", "high"))
+        colours = [COLOURS["perplexity"] if "in the model" in way else MUTED for way, _, _ in summary]
         panel.barh(places, mean, color=colours, height=0.62)
         panel.errorbar(mean, places, xerr=[mean - low, high - mean], fmt="none", color=INK, capsize=3)
-        panel.set_yticks(places, [way for way, _, _ in found])
+        panel.set_yticks(places, [way for way, _, _ in summary])
         panel.set(xlim=(0, 1), xlabel="success in the true simulator")
         panel.grid(False, axis="y")
         save(figure, path)

@@ -192,31 +192,31 @@ def action_errors(policy: Policy, demos: Demonstrations, scale: Scale) -> np.nda
 
 def write_results(seeds: tuple[int, ...], trials: Trials, quality: dict, out: Path) -> list[Path]:
     """Returns what it wrote."""
-    tables, found = write_tables(trials, seeds, out), summarise(trials, seeds)
-    shown = "success" if "success" in found[0].measured else "error"
-    measured = [(f"{what}: {one.name}", one.measured[what]) for what in found[0].measured for one in found]
+    tables, summaries = write_tables(trials, seeds, out), summarise(trials, seeds)
+    shown = "success" if "success" in summaries[0].measured else "error"
+    measured = [(f"{what}: {one.name}", one.measured[what]) for what in summaries[0].measured for one in summaries]
     lines = [[name, *(f"{x:.4f}" for x in (r.mean, r.low, r.high))] for name, r in measured]
     lines += [[f"PSNR of {kind}, dB", *(f"{x:.4f}" for x in three)] for kind, three in quality.items()]
     summary, table, figure = out / "summary.csv", out / "table.md", out / "synthetic.png"
     write_table(summary, ["what", "mean", "low", "high"], lines)
-    write_file(table, markdown(found))
+    write_file(table, markdown(summaries))
     tried = tried_conditions(trials)
     each = [[float(np.mean(trials[i, s][shown])) for s in seeds if (i, s) in trials] for i in tried]
-    named = {one.name: one.measured[shown] for one in found[: len(tried)]}
+    named = {one.name: one.measured[shown] for one in summaries[: len(tried)]}
     draw_conditions(named, each, {CONTROL, PASSIVE}, {FEW, ALL}, figure, shown)
     return [*tables, summary, table, figure]
 
 
 def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tuple[float, float, float]]:
     """PSNR in dB against the recording, of the frames after the given ones: mean, low and high over trajectories."""
-    found, recorded = {}, data["recorded"]
+    quality, recorded = {}, data["recorded"]
     for kind in (kind for kind in ("generated", "shuffled", PASSIVE_KIND) if kind in data):
         each = psnr(data[kind].images, recorded.images)
         means = np.array([row[given:length].mean() for row, length in zip(each, recorded.lengths, strict=True)])
         names, numbers = np.full(len(means), kind), np.arange(len(means))
         (interval,) = bootstrap_intervals(Panel(names, numbers, (means[None],), ((0,),)))
-        found[kind] = interval.mean, interval.low, interval.high
-    return found
+        quality[kind] = interval.mean, interval.low, interval.high
+    return quality
 
 
 def make_source(args: argparse.Namespace, simulator: Simulator) -> DemonstrationSource:

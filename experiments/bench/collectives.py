@@ -42,18 +42,18 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
     sizes: Counter[Collective] = Counter()
     channels: set[tuple[str, str]] = set()
     for line in text.splitlines():
-        if (found := LINE.search(line)) is None:
+        if (match := LINE.search(line)) is None:
             continue
         # TPU programs write one gather several times: with every computation during which it goes on.
         if channel := re.search(r"channel_id=(\d+)", line):
-            if (found["kind"], channel[1]) in channels:
+            if (match["kind"], channel[1]) in channels:
                 continue
-            channels.add((found["kind"], channel[1]))
+            channels.add((match["kind"], channel[1]))
         label = re.search(r'op_name="([^"]*)"', line)
-        name, kind = label[1] if label else "", found["kind"]
-        arrays, over = count_bytes(found["result"]), find_axes(line, mesh)
+        name, kind = label[1] if label else "", match["kind"]
+        arrays, over = count_bytes(match["result"]), find_axes(line, mesh)
         # What starts a gather or a permutation holds what is sent beside what is received.
-        size = max(arrays) if found["start"] and kind in ("all-gather", "collective-permute") else sum(arrays)
+        size = max(arrays) if match["start"] and kind in ("all-gather", "collective-permute") else sum(arrays)
         collective = Collective(kind, over, "while/body" in name, explain(kind, name, over, size))
         counts[collective] += 1
         sizes[collective] += size
@@ -63,8 +63,8 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
 
 def count_kinds(collectives: Mapping[Collective, Sent]) -> dict[str, int]:
     """How often each kind stands in the program."""
-    found = {kind: sum(sent.count for c, sent in collectives.items() if c.kind == kind) for kind in KINDS}
-    return {kind: count for kind, count in found.items() if count}
+    counts = {kind: sum(sent.count for c, sent in collectives.items() if c.kind == kind) for kind in KINDS}
+    return {kind: count for kind, count in counts.items() if count}
 
 
 def explain(kind: str, name: str, over: str, size: int) -> str:
@@ -105,16 +105,16 @@ def find_axes(line: str, mesh: Mapping[str, int]) -> str:
 
 def _first_group(line: str, devices: int) -> list[int] | None:
     """The devices of one group, by their places on the mesh, in any of the forms in which XLA writes groups."""
-    if found := re.search(r"replica_groups=\{\{([\d,]+)\}|source_target_pairs=\{\{([\d,]+)\}", line):
-        return [int(x) for x in (found[1] or found[2]).split(",")]
-    if found := re.search(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?", line):
-        groups, shape, order = ([int(x) for x in part.split(",")] if part else None for part in found.groups())
+    if match := re.search(r"replica_groups=\{\{([\d,]+)\}|source_target_pairs=\{\{([\d,]+)\}", line):
+        return [int(x) for x in (match[1] or match[2]).split(",")]
+    if match := re.search(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?", line):
+        groups, shape, order = ([int(x) for x in part.split(",")] if part else None for part in match.groups())
         numbers = np.arange(math.prod(shape)).reshape(shape)
         return numbers.transpose(order).reshape(groups)[0].tolist()
-    if found := re.search(r"replica_groups=mesh\[([^\]]+)\] \{((?:'\w+',?)+)\}", line):
-        sizes = {name: int(size) for name, size in (part.split("=") for part in found[1].split(","))}
+    if match := re.search(r"replica_groups=mesh\[([^\]]+)\] \{((?:'\w+',?)+)\}", line):
+        sizes = {name: int(size) for name, size in (part.split("=") for part in match[1].split(","))}
         numbers = np.arange(math.prod(sizes.values())).reshape(tuple(sizes.values()))
-        apart = tuple(slice(None) if name in found[2].split(",") else 0 for name in sizes)
+        apart = tuple(slice(None) if name in match[2].split(",") else 0 for name in sizes)
         return numbers[apart].ravel().tolist()
     return list(range(devices)) if "replica_groups={}" in line else None
 

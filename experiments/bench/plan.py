@@ -96,14 +96,14 @@ def chips_of(topology: str) -> str:
     """The topology of a cloud's name: v4:2x2x4 of v4-32, v5e:2x4 of v5e-8, as close to a square or a cube as powers of
     two allow. Other names are returned as they are. Raises ConfigError for a number of chips that is not 4, 8,
     16, ..."""
-    found = re.fullmatch(r"(v\d\w*)-(\d+)", topology)
-    if found is None or found[1] not in CORES_PER_CHIP:
+    match = re.fullmatch(r"(v\d\w*)-(\d+)", topology)
+    if match is None or match[1] not in CORES_PER_CHIP:
         return topology
-    kind, count = found[1].replace("litepod", "e"), int(found[2])
-    chips, rest = divmod(count, CORES_PER_CHIP[found[1]])
+    kind, count = match[1].replace("litepod", "e"), int(match[2])
+    chips, rest = divmod(count, CORES_PER_CHIP[match[1]])
     doubled, axes = chips.bit_length() - 1, 3 if kind in ("v4", "v5p") else 2
     whole = not rest and chips == 1 << doubled and doubled >= 2
-    unit = "cores, two for each chip" if CORES_PER_CHIP[found[1]] == 2 else "chips"
+    unit = "cores, two for each chip" if CORES_PER_CHIP[match[1]] == 2 else "chips"
     require(
         whole,
         f"--topology {topology}: the number counts {unit}, and must come to 4, 8, 16, ... chips; for other slices "

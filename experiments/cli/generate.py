@@ -98,8 +98,8 @@ def generate(
     for reason, left in done.skipped.items():
         say(f"left out {left:,} x: {reason}")
     with step("compare with the recordings") as update:
-        found = compare(done.directory, recorded, given, clips, source.hz, update)
-    made, still = found
+        comparison = compare(done.directory, recorded, given, clips, source.hz, update)
+    made, still = comparison
     counted, of_made, of_still = "1 episode", " (one alone has no interval)", ""
     if done.episodes > 1:
         counted = f"{done.episodes:,} episodes"

@@ -119,9 +119,9 @@ def read_memory(size: str | None) -> float | None:
     """Bytes of '80GiB' or '80GB'. Raises ConfigError for what is no size."""
     if size is None:
         return None
-    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?(GiB|GB)", size)
-    require(found is not None, f"--memory {size}: write it as 80GiB or 80GB")
-    return float(found[1]) * {"GiB": 2**30, "GB": 10**9}[found[2]]
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(GiB|GB)", size)
+    require(match is not None, f"--memory {size}: write it as 80GiB or 80GB")
+    return float(match[1]) * {"GiB": 2**30, "GB": 10**9}[match[2]]
 
 
 def _choose_model(

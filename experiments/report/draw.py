@@ -70,14 +70,14 @@ def _draw(workspace: Workspace, record: Record) -> None:
     episodes = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
     growth = find_growth(sweeps, provenance, numbers.windows, episodes)
     optima = find_optima(rows, sweeps)
-    for path, kind, found in (
+    for path, kind, table_rows in (
         (workspace.changes, Change, changes),
         (workspace.best_steps, BestSteps, at_best),
         (workspace.growth, Growth, growth),
         (workspace.optima, Optimum, optima),
     ):
-        if found:
-            write_csv(path, kind, found)
+        if table_rows:
+            write_csv(path, kind, table_rows)
             tables.append(path)
         else:
             path.unlink(missing_ok=True)  # of other trials, drawn before

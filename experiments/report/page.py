@@ -146,9 +146,9 @@ def _headline(
     }
     for metric in (m for m in metrics if shown and m in card_notes):
         name, of_untrained = card_notes[metric]
-        found = _at_default(rows, shown.sweep, metric)
-        over = "s.e. over episodes and seeds" if found and len(found.seeds) > 1 else "s.e. over episodes of one seed"
-        cards.append(card(f"{name}, {shown.name}", found, over))
+        point = _at_default(rows, shown.sweep, metric)
+        over = "s.e. over episodes and seeds" if point and len(point.seeds) > 1 else "s.e. over episodes of one seed"
+        cards.append(card(f"{name}, {shown.name}", point, over))
         untrained = _at_default(rows, shown.sweep, metric, UNTRAINED)
         if untrained or shown.name == REFERENCE:  # of others nobody asks it
             cards.append(card(f"{name}, untrained", untrained, of_untrained))
@@ -310,9 +310,9 @@ def _repeatable(command: str) -> str:
     return shlex.join(kept)
 
 
-def _each(found: Sequence[str]) -> str:
+def _each(values: Sequence[str]) -> str:
     """What trials ran on: once if it is the same for all, otherwise with the number of trials of each."""
-    counts = Counter(found).most_common()
+    counts = Counter(values).most_common()
     if len(counts) == 1:
         return counts[0][0]
     return "; ".join(f"{counted(n, 'trial')}: {what}" for what, n in counts) or "unknown"

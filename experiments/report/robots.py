@@ -58,13 +58,13 @@ def robots_of(
     follows: dict[str, dict[str, Controllability]] = {name: {} for name in sweep.scope}
     for line in controllability(tables) if tables else ():
         follows.setdefault(line.robot, {})[line.metric] = line
-    found = []
+    robots = []
     for name in sweep.scope:
         errors = next((follows[name][m].errors for m in ORDER if m in follows[name]), math.nan)
         if not follows[name]:
             errors = _errors_of_rows(rows, sweep, name)
-        found.append(Robot(name, errors, *_ahead(rows, sweep, name, list(tables.values())), follows[name]))
-    return sorted(found, key=lambda r: -r.errors if not math.isnan(r.errors) else math.inf)
+        robots.append(Robot(name, errors, *_ahead(rows, sweep, name, list(tables.values())), follows[name]))
+    return sorted(robots, key=lambda r: -r.errors if not math.isnan(r.errors) else math.inf)
 
 
 def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
@@ -94,9 +94,11 @@ def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) ->
 def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
     """{robot: how much there is of it}; {} where nobody has counted. Raises ConfigError for a damaged file."""
     try:
-        found = {name: {**facts} for name, facts in json.loads(data_summary.read_text()).items()}
-        require(all(isinstance(facts["episodes"], int) for facts in found.values()), "episodes that are no number")
-        return found
+        facts_by_robot = {name: {**facts} for name, facts in json.loads(data_summary.read_text()).items()}
+        require(
+            all(isinstance(facts["episodes"], int) for facts in facts_by_robot.values()), "episodes that are no number"
+        )
+        return facts_by_robot
     except FileNotFoundError:
         return {}
     except (ValueError, KeyError, TypeError, AttributeError) as error:

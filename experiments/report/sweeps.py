@@ -60,11 +60,11 @@ def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
             points.setdefault(row.x, {})[row.metric] = row
     if not points:
         return ""
-    metrics = list(dict.fromkeys(m for found in points.values() for m in found))
+    metrics = list(dict.fromkeys(m for by_metric in points.values() for m in by_metric))
     lines = []
-    for x, found in points.items():
-        cells = [_with_interval(f) if (f := found.get(m)) else "–" for m in metrics]
-        any_of = next(iter(found.values()))
+    for x, by_metric in points.items():
+        cells = [_with_interval(f) if (f := by_metric.get(m)) else "–" for m in metrics]
+        any_of = next(iter(by_metric.values()))
         chosen = any_of.chosen + (" (an end of what was tried)" if any_of.edge else "")
         lines.append([f"{x:,}", *cells, str(any_of.seeds), chosen])
     head = [sweep.axis, *(CHANGED[m] for m in metrics), "seeds", "steps chosen, and how often"]
@@ -88,11 +88,11 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
             steps.setdefault((row.series, row.first, row.last, row.data), {})[row.metric] = row
     if not steps:
         return ""
-    metrics = list(dict.fromkeys(m for found in steps.values() for m in found))
+    metrics = list(dict.fromkeys(m for by_metric in steps.values() for m in by_metric))
     lines = []
-    for (series, first, last, data), found in steps.items():
-        cells = [_with_interval(f, "+") if (f := found.get(m)) else "–" for m in metrics]
-        any_of = next(iter(found.values()))
+    for (series, first, last, data), by_metric in steps.items():
+        cells = [_with_interval(f, "+") if (f := by_metric.get(m)) else "–" for m in metrics]
+        any_of = next(iter(by_metric.values()))
         whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} without"
         lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells, str(any_of.seeds)])
     head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics), "seeds"]
@@ -149,12 +149,12 @@ def _change(changes: Sequence[Change]) -> str:
     return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {differences}. {interval}</p>"
 
 
-def _with_interval(found: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
+def _with_interval(estimate: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
     """'0.31 (`words`0.22 to 0.4)', the mean alone where nobody knows its error; `sign`: "+" for one before every
     value."""
-    low, high = (f"{end:{sign}.3g}" for end in (found.low, found.high))
-    interval = f" ({words}{low} to {high})" if math.isfinite(found.low) else ""
-    return f"{found.mean:{sign}.3g}{interval}".replace("-", "\u2212")
+    low, high = (f"{end:{sign}.3g}" for end in (estimate.low, estimate.high))
+    interval = f" ({words}{low} to {high})" if math.isfinite(estimate.low) else ""
+    return f"{estimate.mean:{sign}.3g}{interval}".replace("-", "\u2212")
 
 
 def _names(sweep: Sweep, rows: Sequence[Row]) -> str:

@@ -41,15 +41,15 @@ def write_tables(
         loss = training_loss(result).mean if result else 0.0
         rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, available))
     write_trials(workspace.trial_table, rows)
-    found = []
+    controllability_rows = []
     references = [reference_trial(record.study, seed) for seed in record.study.seeds]
     for role, trials in {POINT: references, CONTROL: [control_of(trial) for trial in references]}.items():
         ids = [trial_id(trial, provenance) for trial in trials]
         kept = [id for id in ids if (workspace.trials / id / FILE).exists()]
         seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
-        found += controllability(dict(sorted(seeds.items())), role) if seeds else []
-    if not found:
+        controllability_rows += controllability(dict(sorted(seeds.items())), role) if seeds else []
+    if not controllability_rows:
         workspace.controllability.unlink(missing_ok=True)  # of trials that are no longer the reference
         return [workspace.trial_table]
-    write_csv(workspace.controllability, Controllability, found)
+    write_csv(workspace.controllability, Controllability, controllability_rows)
     return [workspace.trial_table, workspace.controllability]

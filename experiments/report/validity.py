@@ -182,10 +182,10 @@ def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
     if vocabulary is None:
         return []
     name, expected = "An untrained model knows nothing.", math.log(vocabulary)
-    found = [r.mean for r in rows if (r.role, r.scope, r.metric) == (UNTRAINED, OVERALL, HELD_OUT)]
-    if not found:
+    losses = [r.mean for r in rows if (r.role, r.scope, r.metric) == (UNTRAINED, OVERALL, HELD_OUT)]
+    if not losses:
         return [Check(name, "open", "No trial was judged before its first step.")]
-    off = max(found, key=lambda v: abs(v - expected))
+    off = max(losses, key=lambda v: abs(v - expected))
     text = f"{off:.4f} nats per token before the first step; log {vocabulary:,} is {expected:.4f}."
     return [Check(name, "good" if abs(off - expected) < 1e-3 * expected else "bad", text)]
 

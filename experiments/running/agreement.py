@@ -39,15 +39,15 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
             read_result(directory)
             try:
                 job = json.loads((directory / "job.json").read_text())
-                found = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
+                actual_id = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise ConfigError(
                     f"{directory}: the finished trial does not say what it is ({error}). Copy it "
                     "again from where it ran, or remove the directory to run it again"
                 ) from error
             require(
-                found == id,
-                f"{directory}: its job.json describes trial {found}: it was renamed or edited. Remove the directory "
+                actual_id == id,
+                f"{directory}: its job.json describes trial {actual_id}: it was renamed or edited. Remove the directory "
                 "to run the trial again",
             )
 

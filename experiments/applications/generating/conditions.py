@@ -59,7 +59,7 @@ def tried_conditions(trials: Trials) -> list[int]:
 def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") -> Panel:
     """Success of every condition, seed and start, or the error by held-out trajectory."""
     own = [tuple(s for s in seeds if (i, s) in trials) for i in tried_conditions(trials)]  # a run may be under way
-    points = [np.array([trials[i, s][what] for s in found], float) for i, found in enumerate(own)]
+    points = [np.array([trials[i, s][what] for s in own_seeds], float) for i, own_seeds in enumerate(own)]
     each = np.arange(points[0].shape[1])
     return Panel(np.full(len(each), "robot"), each, tuple(points), tuple(own))
 
@@ -67,18 +67,18 @@ def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") ->
 def share_closed(panel: Panel, at: int) -> Interval:
     """Which share of the gap between few and all recorded trajectories condition `at` closes; the interval holds 95 %
     of the draws over seeds and starts in which there is a gap."""
-    found = resample(panel, 2000)
+    draws = resample(panel, 2000)
 
     def share(points: np.ndarray) -> np.ndarray:
         gap = points[..., ALL] - points[..., FEW]
         return (points[..., at] - points[..., FEW]) / np.where(np.abs(gap) < 1e-9, np.nan, gap)
 
-    drawn = share(found.drawn)
+    drawn = share(draws.drawn)
     drawn = drawn[np.isfinite(drawn)]
     if not len(drawn):  # there is no gap in any
         return Interval(math.nan, math.nan, math.nan, math.nan)
     low, high = np.quantile(drawn, [0.025, 0.975])
-    return Interval(float(share(found.value)), float(np.std(drawn)), float(low), float(high))
+    return Interval(float(share(draws.value)), float(np.std(drawn)), float(low), float(high))
 
 
 class Summary(NamedTuple):
@@ -94,14 +94,15 @@ def summarise(trials: Trials, seeds: tuple[int, ...]) -> list[Summary]:
     Of policies that never or always succeed resampling knows no spread: the interval is then Wilson's over starts.
     """
     panels = {what: make_panel(trials, seeds, what) for what in ("success", "error") if what in trials[FEW, seeds[0]]}
-    found = {what: bootstrap_intervals(panel) for what, panel in panels.items()}
-    if "success" in found:
+    intervals = {what: bootstrap_intervals(panel) for what, panel in panels.items()}
+    if "success" in intervals:
         starts = len(panels["success"].episode)
-        found["success"] = [
-            rate_interval(np.full(starts, rate.mean)) if rate.mean in (0.0, 1.0) else rate for rate in found["success"]
+        intervals["success"] = [
+            rate_interval(np.full(starts, rate.mean)) if rate.mean in (0.0, 1.0) else rate
+            for rate in intervals["success"]
         ]
     tried = tried_conditions(trials)
-    summaries = [Summary(CONDITIONS[i].name, {what: each[i] for what, each in found.items()}) for i in tried]
+    summaries = [Summary(CONDITIONS[i].name, {what: each[i] for what, each in intervals.items()}) for i in tried]
     shares = ("10 + 90 generated", MOST), ("other actions", CONTROL), ("a model without actions", PASSIVE)
     for name, at in shares[: 2 + (PASSIVE in tried)]:
         closed = {what: share_closed(panel, at) for what, panel in panels.items()}
@@ -127,13 +128,13 @@ def write_tables(trials: Trials, seeds: tuple[int, ...], out: Path) -> list[Path
     return written
 
 
-def markdown(found: Sequence[Summary]) -> str:
+def markdown(summaries: Sequence[Summary]) -> str:
     """The table that docs/generating.md shows; an interval of a rate ends at 0 and 1."""
     titles, digits = {"success": "success", "error": "action error"}, {"success": 2, "error": 3}
-    measured = found[0].measured
+    measured = summaries[0].measured
     lines = [f"| trained on | {' | '.join(f'{titles[what]} | 95 % interval' for what in measured)} |"]
     lines.append(f"|{'---|' * (1 + 2 * len(measured))}")
-    for one in found:
+    for one in summaries:
         cells = [one.name]
         for what, r in one.measured.items():
             low, high = r.low, r.high

@@ -110,8 +110,8 @@ class ScriptedSource:
 
     def judge(self, policy: Policy) -> dict[str, list[float]]:
         starts = start_seeds(self._task, self.settings.starts, least=self.settings.least)
-        found = run_policy(self._task, policy, starts, self._size, self.robot.stride)
-        return {"success": found.success.astype(int).tolist(), "distance": np.round(found.distance, 4).tolist()}
+        outcome = run_policy(self._task, policy, starts, self._size, self.robot.stride)
+        return {"success": outcome.success.astype(int).tolist(), "distance": np.round(outcome.distance, 4).tolist()}
 
 
 class RecordedSource:
@@ -135,28 +135,28 @@ class RecordedSource:
         self.settings = RecordedSettings(**vars(training), robot=robot.name, **about)
 
     def record(self) -> Demonstrations:
-        found = self._first(self._recorded, self.settings.trajectories)
+        longer = self._first(self._recorded, self.settings.trajectories)
         require(
-            len(found) == self.settings.trajectories,
-            f"{self._recorded.name}, split {self._recorded.split}, has {len(found)} trajectories longer than "
+            len(longer) == self.settings.trajectories,
+            f"{self._recorded.name}, split {self._recorded.split}, has {len(longer)} trajectories longer than "
             f"{self.settings.given} frame(s), {self.settings.trajectories} are needed; name another --split or DATASET",
         )
-        return as_demonstrations([confined(t, self.robot) for t in found])
+        return as_demonstrations([confined(t, self.robot) for t in longer])
 
     def record_held_out(self) -> Demonstrations:
-        found = self._first(self._held_out, self.settings.trajectories)
-        require(bool(found), f"{self._held_out.name}, split {self._held_out.split}, has no trajectory to judge on")
-        return as_demonstrations(found)
+        longer = self._first(self._held_out, self.settings.trajectories)
+        require(bool(longer), f"{self._held_out.name}, split {self._held_out.split}, has no trajectory to judge on")
+        return as_demonstrations(longer)
 
     def _first(self, trajectories: Trajectories, count: int) -> list[Trajectory]:
-        found = []
+        longer = []
         for i in range(len(trajectories)):
-            if len(found) == count:
+            if len(longer) == count:
                 break
             one = trajectories[i]
             if len(one) > self.settings.given:
-                found.append(one)
-        return found
+                longer.append(one)
+        return longer
 
     def judge(self, policy: Policy) -> dict[str, list[float]]:
         return {}
@@ -175,13 +175,13 @@ def as_demonstrations(trajectories: list[Trajectory]) -> Demonstrations:
 
 def as_trajectories(demos: Demonstrations, robot: Robot) -> list[Trajectory]:
     """With the chunks that a demonstration's actions stand for: whole ones, or an action that is held."""
-    found = []
+    trajectories = []
     for i, length in enumerate(demos.lengths):
         acted = demos.actions[i, :length]
         whole = acted.shape[1] == robot.stride * robot.action_dim
         chunks = acted.reshape(length, robot.stride, -1) if whole else np.repeat(acted[:, None], robot.stride, 1)
-        found.append(Trajectory(str(i), demos.images[i, :length], chunks))
-    return found
+        trajectories.append(Trajectory(str(i), demos.images[i, :length], chunks))
+    return trajectories
 
 
 def shuffled_actions(demos: Demonstrations) -> np.ndarray:

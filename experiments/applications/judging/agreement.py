@@ -87,16 +87,19 @@ def _agree(
 ) -> Agreement:
     """`draw` gives true rates [P] anew, where the starts drawn are `columns`."""
     policies, starts = learned_PM.shape
-    found: tuple[dict[str, list[float]], ...] = ({name: [] for name in MEASURES}, {name: [] for name in MEASURES})
+    drawn_measures: tuple[dict[str, list[float]], ...] = (
+        {name: [] for name in MEASURES},
+        {name: [] for name in MEASURES},
+    )
     for rows, columns in _resamples(policies, starts, draws):
         rates = draw(columns), learned_PM[:, columns].mean(1)
-        for kept, which in zip(found, (rows, slice(None)), strict=True):
+        for kept, which in zip(drawn_measures, (rows, slice(None)), strict=True):
             for name, measure in MEASURES.items():
                 kept[name].append(measure(rates[0][which], rates[1][which]))
     value = {name: measure(true_P, learned_PM.mean(1)) for name, measure in MEASURES.items()}
     size = {"n": policies * starts, "episodes": starts}
     both, alone = (
-        {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in found
+        {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in drawn_measures
     )
     return Agreement(both, alone)
 

@@ -50,10 +50,10 @@ class LadderConfig:
 
 def names(config: LadderConfig) -> list[str]:
     """Of all policies, in the order of their training."""
-    found = [RANDOM]
+    policies = [RANDOM]
     for kind, count in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
-        found += [f"{kind}-{step}" for step in config.fit(count).keep] if count else []
-    return found
+        policies += [f"{kind}-{step}" for step in config.fit(count).keep] if count else []
+    return policies
 
 
 def train_ladder(

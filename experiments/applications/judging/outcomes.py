@@ -46,12 +46,12 @@ def judge_rollout(
     seeds: Sequence[int],
 ) -> list[Outcome]:
     """By the head in every world, by the state in the true one. The start itself does not count."""
-    found = {HEAD: held(head.reached(rollout.images[:, 1:], rollout.images[:, :1]), task.hold).any(1)}
+    successes_by_judge = {HEAD: held(head.reached(rollout.images[:, 1:], rollout.images[:, :1]), task.hold).any(1)}
     if world == TRUE:
-        found[STATE] = held(rollout.reached[:, 1:], task.hold).any(1)
+        successes_by_judge[STATE] = held(rollout.reached[:, 1:], task.hold).any(1)
     return [
         Outcome(policy, i, int(numbers[i]), int(seeds[i]), world, judge, bool(success))
-        for judge, each in found.items()
+        for judge, each in successes_by_judge.items()
         for i, success in enumerate(each)
     ]
 

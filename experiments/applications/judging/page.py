@@ -169,9 +169,9 @@ def _agreement(summary: dict[str, Any]) -> str:
         return section("Compared with nothing", f"<p><b>{html.escape(NOTHING)}</b></p>")
     measures = list(next(iter(summary["agreement"].values()))["starts"])
     agreed = [
-        [html.escape(name), html.escape(over), *(shown(found[over][m]) for m in measures)]
-        for name, found in summary["agreement"].items()
-        for over in found
+        [html.escape(name), html.escape(over), *(shown(agreement[over][m]) for m in measures)]
+        for name, agreement in summary["agreement"].items()
+        for over in agreement
     ]
     heading = table(["compared", "interval over other", *measures], agreed, text=2)
     if summary["compared with"] == REAL:
@@ -272,8 +272,8 @@ def _clips(judged: Judgement, *sides: tuple[str, str]) -> str:
         name, start = judged.policies[p], rank % judged.config.starts
         clips = [judged.rollouts(name, world).images[start] for world, _ in sides]
         words = "".join(
-            f"<span>{CALLED[world]}: {'success' if found[p, start] else 'failure'} by {judge}</span>"
-            for found, (world, judge) in zip(successes_by_side, sides, strict=True)
+            f"<span>{CALLED[world]}: {'success' if succeeded[p, start] else 'failure'} by {judge}</span>"
+            for succeeded, (world, judge) in zip(successes_by_side, sides, strict=True)
         )
         figures.append(
             f"<figure class=trio><figcaption>{html.escape(name)}, start {start}</figcaption>"

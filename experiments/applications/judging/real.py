@@ -32,7 +32,7 @@ def read_real(path: Path) -> dict[str, Count]:
     columns = list(rows[0][1]) if rows else []
     missing = [name for name in COLUMNS if name not in columns]
     require(not missing, f"{path}: no column {', '.join(missing)}, or no row; a row has {', '.join(COLUMNS)}")
-    found: dict[str, Count] = {}
+    counts: dict[str, Count] = {}
     for line, row in rows:
         name = row["policy"]
         try:
@@ -43,7 +43,7 @@ def read_real(path: Path) -> dict[str, Count]:
             ) from error
         fits = 0 <= count.successes <= count.episodes and count.episodes >= 1
         require(fits, f"{path}, line {line}: {name} cannot succeed in {count.successes} of {count.episodes} episodes")
-        require(name not in found, f"{path}, line {line}: {name} has a line before this one; add them up")
-        found[name] = count
-    require(len(found) >= FEWEST, f"{path} has {len(found)} policies; an order to compare needs at least {FEWEST}")
-    return found
+        require(name not in counts, f"{path}, line {line}: {name} has a line before this one; add them up")
+        counts[name] = count
+    require(len(counts) >= FEWEST, f"{path} has {len(counts)} policies; an order to compare needs at least {FEWEST}")
+    return counts

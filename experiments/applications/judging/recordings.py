@@ -183,9 +183,9 @@ class RecordedTruth:
         for i in self.held_out:
             images = self._images(i)
             chosen, label = self._labelled(i, len(images))
-            for shown, found in ((images, decisions), (reconstruct(images), decoded_decisions)):
+            for shown, into in ((images, decisions), (reconstruct(images), decoded_decisions)):
                 probability = head.probabilities(shown, shown[:1])
-                found.append(held(probability[None, 1:] > head.threshold, hold).any())
+                into.append(held(probability[None, 1:] > head.threshold, hold).any())
                 if shown is images:
                     scores.append(probability[chosen])
                     labels.append(label)
@@ -207,12 +207,12 @@ class RecordedTruth:
         return self._recorded[i].images[BEFORE:]
 
     def starts(self) -> list[Start]:
-        found = []
+        starts = []
         for i in self._begun_from[: self.config.starts]:
             trajectory = confined(self._recorded[i], self._robot)
             given = trajectory.chunks[:BEFORE].reshape(-1, self._robot.action_dim)
-            found.append(Start(self._robot.name, trajectory.images[:START_FRAMES], given))
-        return found
+            starts.append(Start(self._robot.name, trajectory.images[:START_FRAMES], given))
+        return starts
 
     def open(self) -> AbstractContextManager[None]:
         return nullcontext()

@@ -53,12 +53,12 @@ def summarise(judged: Judgement, real: Mapping[str, Count] | None = None) -> dic
     columns = {name: where for name, where in COLUMNS.items() if where[0] in judged.worlds}
     each = {name: successes(judged.outcomes, judged.policies, *where) for name, where in columns.items()}
     rates = {
-        name: {column: _plain(rate_interval(found[i])) for column, found in each.items()}
+        name: {column: _plain(rate_interval(succeeded[i])) for column, succeeded in each.items()}
         for i, name in enumerate(judged.policies)
     }
     if real:
         counted = {name: _plain(count_interval(*real[name])) if name in real else UNKNOWN for name in judged.policies}
-        rates = {name: {REAL: counted[name], **found} for name, found in rates.items()}
+        rates = {name: {REAL: counted[name], **succeeded} for name, succeeded in rates.items()}
     return {
         "robot": judged.config.task.robot,
         "task": judged.config.task.goal,
@@ -72,10 +72,10 @@ def summarise(judged: Judgement, real: Mapping[str, Count] | None = None) -> dic
         "compared with": REAL if real else REFERENCE if REFERENCE in each else None,
         "agreement": {
             name: {
-                "policies and starts": {m: _plain(x) for m, x in found.measures.items()},
-                "starts": {m: _plain(x) for m, x in found.over_starts.items()},
+                "policies and starts": {m: _plain(x) for m, x in succeeded.measures.items()},
+                "starts": {m: _plain(x) for m, x in succeeded.over_starts.items()},
             }
-            for name, found in _compare(judged, each, real).items()
+            for name, succeeded in _compare(judged, each, real).items()
         },
         "above the control": _plain(mean_above(each[MODEL], each[CONTROL])),
         "episodes alike": _alike(each[MODEL], each[REFERENCE]) if REFERENCE in each else {},

@@ -37,10 +37,10 @@ class CheckedPolicy:
             ("reset", {"episodes": None, "seeds": [0]}, "reset(episodes=None, *, seeds=None)"),
             ("act", {"images": None}, "act(images)"),
         ):
-            found = getattr(policy, method, None)
-            require(callable(found), f"{where} is of type {type(policy).__name__} and has no {shown} ({PAGE})")
+            function = getattr(policy, method, None)
+            require(callable(function), f"{where} is of type {type(policy).__name__} and has no {shown} ({PAGE})")
             try:
-                signature = inspect.signature(found)
+                signature = inspect.signature(function)
                 signature.bind(*takes.values()) if method == "act" else signature.bind(**takes)
             except TypeError as error:
                 raise ConfigError(f"{where}: its {method}{signature} cannot be called as {shown}: {error}") from error
@@ -77,11 +77,13 @@ def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolic
         sys.path.append(folder)  # behind all others: it hides none
     with naming_line(path, PAGE):
         file = run_file(path, SIGNATURE, "policies of your own are", PAGE)
-        found = function_of(file, SIGNATURE, PAGE)(robot)
+        policies = function_of(file, SIGNATURE, PAGE)(robot)
     where = f"{path}: {SIGNATURE}"
-    require(isinstance(found, dict), f"{where} must return a dict of policies by name, got {type(found).__name__}")
-    require(bool(found), f"{where} returned no policy")
-    for name in found:
+    require(
+        isinstance(policies, dict), f"{where} must return a dict of policies by name, got {type(policies).__name__}"
+    )
+    require(bool(policies), f"{where} returned no policy")
+    for name in policies:
         fits = isinstance(name, str) and NAME.fullmatch(name)
         require(
             bool(fits),
@@ -91,10 +93,10 @@ def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolic
         require(
             not TAKEN.fullmatch(name), f"{where}: {name!r} is the name of a policy that is made here; choose another"
         )
-    lower = [name.lower() for name in found]
-    twice = [name for name in found if lower.count(name.lower()) > 1]
+    lower = [name.lower() for name in policies]
+    twice = [name for name in policies if lower.count(name.lower()) > 1]
     require(not twice, f"{where}: {', '.join(twice)} would be the same files where case does not count; rename one")
-    checked = {name: CheckedPolicy(policy, robot, f"{path}: policy {name!r}") for name, policy in found.items()}
+    checked = {name: CheckedPolicy(policy, robot, f"{path}: policy {name!r}") for name, policy in policies.items()}
     return checked, success_of(file)
 
 

@@ -46,12 +46,12 @@ class UserSuccess:
             "goal is reached, or whether it is"
         )
         try:
-            found = np.asarray(given)
+            returned = np.asarray(given)
         except ValueError as error:  # lists of different lengths
             raise ConfigError(f"{wanted}; it gave what is no array ({error})") from error
-        kind = np.issubdtype(found.dtype, np.floating) or found.dtype == bool
-        require(found.shape == (len(images),) and kind, f"{wanted}; it gave {found.dtype} {list(found.shape)}")
-        values = found.astype(np.float32)
+        kind = np.issubdtype(returned.dtype, np.floating) or returned.dtype == bool
+        require(returned.shape == (len(images),) and kind, f"{wanted}; it gave {returned.dtype} {list(returned.shape)}")
+        values = returned.astype(np.float32)
         inside = (values >= 0) & (values <= 1)  # of what is no number, too
         require(bool(inside.all()), f"{wanted}, in [0, 1]; it gave {values[~inside][:1]}")
         return values

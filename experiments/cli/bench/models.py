@@ -27,10 +27,10 @@ def generate(bench: OmitArgPrefixes[Bench], decode: OmitArgPrefixes[Decode]) -> 
 
     subject, how = _subject(bench), _decode(decode)
     stages = _over_batches(bench, "frames", lambda rows: time_frames(subject, rows, how, bench.repeats))
-    found: dict[str, float] = {}
+    time_ratios: dict[str, float] = {}
     for rows in bench.batch:
-        found |= ratios(stages, rows)
-    _finish("generate", bench, subject, stages, found, {"decode": how})
+        time_ratios |= ratios(stages, rows)
+    _finish("generate", bench, subject, stages, time_ratios, {"decode": how})
 
 
 def rollout(
@@ -59,15 +59,15 @@ def rollout(
     stages = _over_batches(
         bench, "rollouts", lambda rows: time_rollouts(subject, rows, frames, prompt, how, bench.repeats, naive)
     )
-    notes, found = (), {}
+    notes, time_ratios = (), {}
     if naive:
-        found = _ratios(bench, stages, "recompute", "rollout")
+        time_ratios = _ratios(bench, stages, "recompute", "rollout")
         with step("compare with recomputation"):
             value = agreement(subject, bench.batch[0], frames, prompt, how)
         what = "largest difference" if subject.config.diffusion else "share of equal tokens"
         notes = (f"against recomputation, {what}: {value:g}",)
     settings = {"decode": how, "frames": frames, "prompt": prompt}
-    _finish("rollout", bench, subject, stages, found, settings, notes)
+    _finish("rollout", bench, subject, stages, time_ratios, settings, notes)
 
 
 def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
@@ -81,8 +81,8 @@ def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
 
     subject = _subject(bench, remat=remat)
     stages = _over_batches(bench, "training steps", lambda rows: time_training(subject, rows, bench.repeats))
-    found = _ratios(bench, stages, "step", "forward") | _ratios(bench, stages, "step", "plain")
-    _finish("train", bench, subject, stages, found, {})
+    time_ratios = _ratios(bench, stages, "step", "forward") | _ratios(bench, stages, "step", "plain")
+    _finish("train", bench, subject, stages, time_ratios, {})
 
 
 def products(bench: OmitArgPrefixes[Bench], program: Program = "step") -> None:
@@ -99,11 +99,11 @@ def products(bench: OmitArgPrefixes[Bench], program: Program = "step") -> None:
     stages = _over_batches(
         bench, f"the products of {program}", lambda rows: time_products(subject, program, rows, bench.repeats)
     )
-    found = {}
+    time_ratios = {}
     for rows in bench.batch:
         whole, *parts = [s.timing.median for s in stages if s.batch == rows]
-        found[f"{program} / the sum of its products alone, batch {rows}"] = whole / sum(parts)
-    _finish(f"products-{program}", bench, subject, stages, found, {})
+        time_ratios[f"{program} / the sum of its products alone, batch {rows}"] = whole / sum(parts)
+    _finish(f"products-{program}", bench, subject, stages, time_ratios, {})
 
 
 def evaluate(
@@ -122,8 +122,8 @@ def evaluate(
 
     subject, config = _subject(bench), EvalConfig(context=context, random_actions=draws)
     stages = _over_batches(bench, "evaluation", lambda rows: time_evaluation(subject, rows, config, bench.repeats))
-    found = _ratios(bench, stages, "literal", "protocol")
-    _finish(f"eval-{context}", bench, subject, stages, found, {"eval": config})
+    time_ratios = _ratios(bench, stages, "literal", "protocol")
+    _finish(f"eval-{context}", bench, subject, stages, time_ratios, {"eval": config})
 
 
 def _over_batches(bench: Bench, what: str, measure: Callable[[int], list[Stage]]) -> list[Stage]:

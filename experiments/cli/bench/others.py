@@ -223,11 +223,11 @@ def release(
     require(min(turns, batch) >= 1, "--turns and --batch must be at least 1")
     names = stages or tuple(RELEASE_STAGES)
     with step(f"time {len(names)} stages beside the release") as update:
-        found, ratios = time_against_release(
+        timed_stages, ratios = time_against_release(
             checkout, python, names, turns, lambda what, turn: update(turn, turns, what), rows=batch, dtype=dtype
         )
     subject = "base" if batch == 1 else f"base-batch-{batch}"
-    write("release", subject, dtype, 0, {"stages": list(names), "batch": batch}, found, ratios, (), out)
+    write("release", subject, dtype, 0, {"stages": list(names), "batch": batch}, timed_stages, ratios, (), out)
 
 
 def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
@@ -242,8 +242,8 @@ def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) ->
 
     files = [f for path in records for f in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
     require(len(files) > 0, "no benchmark records found; make one with `hma bench generate`")
-    found = [read_record(file) for file in files]
-    print(markdown(found))
+    loaded = [read_record(file) for file in files]
+    print(markdown(loaded))
     if figure is not None:
-        plot_records(found, figure)
+        plot_records(loaded, figure)
         console.print(f"wrote {figure}", soft_wrap=True)

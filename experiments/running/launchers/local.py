@@ -48,10 +48,10 @@ class LocalLauncher(Launcher):
     @classmethod
     def share(cls, workers: int | None, settings: LocalSettings) -> float | None:
         """Of this machine's; None without any."""
-        found = find_accelerators()
-        if found is None or not workers or workers == 1:
-            return found and float(len(found.names))
-        slots = cut(workers, found, ())
+        accelerators = find_accelerators()
+        if accelerators is None or not workers or workers == 1:
+            return accelerators and float(len(accelerators.names))
+        slots = cut(workers, accelerators, ())
         return sum(len(slot.accelerators.names) / slot.sharers for slot in slots) / workers
 
     def launch(self, directories: Sequence[Path]) -> list[Child]:
