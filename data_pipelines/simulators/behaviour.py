@@ -1,7 +1,7 @@
-"""What a robot does: an expert that is noisy and now and then loses its head, or wandering.
+"""The behaviour policy of simulated robots: an expert with noise and lapses, or a random walk ("wanders").
 
-Noise and lapses make failures and make actions informative: a model that has seen experts alone
-cannot tell what another action would have done. Knows actions only, no simulator.
+Noise and lapses cause failures and make actions informative: a model that has only seen experts cannot predict what
+other actions lead to. Knows actions only, no simulator.
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ import numpy as np
 from data_pipelines.simulators.spec import SimSpec
 
 LEVELS = (0.0, 0.25, 0.5, 1.0)
-"""An episode's share of its dataset's noise, drawn evenly. At 0 the expert is left alone."""
+"""Factors of the dataset's noise, one of which is drawn per episode. At 0 the expert acts without noise or lapses."""
 
 LAPSES = 0.5
-"""Lapses per second at level 1."""
+"""Lapses per second at level 1. During a lapse the robot follows the random walk in place of the expert."""
 
 LAPSE_SECONDS = (0.3, 1.2)
 
-SETTLED = 1.0
-"""Seconds for which an expert goes on after its success; then it wanders, so that things move."""
+SECONDS_AFTER_SUCCESS = 1.0
+"""Seconds for which an expert continues after its success. Then the random walk takes over: things keep moving."""
 
 Expert = Callable[[], np.ndarray]
-"""The action that an expert takes in the simulator's present state, raw units."""
+"""Gives the expert's action for the current state of the simulator, in raw units."""
 
 
-class Wander:
-    """Smooth noise that grows from 0 to variance 1: an Ornstein-Uhlenbeck process per dimension."""
+class OrnsteinUhlenbeck:
+    """An Ornstein-Uhlenbeck process per dimension: smooth noise that starts at 0 and tends to variance 1."""
 
     def __init__(self, dim: int, steps: float, rng: np.random.Generator):
-        """`steps`: how many it takes to forget."""
-        self.keep = float(np.exp(-1.0 / max(steps, 1e-6)))
+        """`steps`: the correlation time, in steps."""
+        self.decay = float(np.exp(-1.0 / max(steps, 1e-6)))
         self.rng = rng
         self.value = np.zeros(dim)
 
     def step(self) -> np.ndarray:
         fresh = self.rng.standard_normal(self.value.shape)
-        self.value = self.keep * self.value + np.sqrt(1 - self.keep**2) * fresh
+        self.value = self.decay * self.value + np.sqrt(1 - self.decay**2) * fresh
         return self.value
 
 
@@ -57,19 +57,19 @@ class Behaviour:
         self.spec, self.low, self.high, self.rest, self.expert, self.rng = spec, low, high, rest, expert, rng
         self.reach = spec.gain * (high - low) / 2
         self.level = float(rng.choice(LEVELS))
-        self.wander = Wander(len(low), spec.tau * spec.hz, rng)
-        self.jitter = Wander(len(low), 0.1 * spec.hz, rng)
+        self.walk = OrnsteinUhlenbeck(len(low), spec.tau * spec.hz, rng)
+        self.jitter = OrnsteinUhlenbeck(len(low), 0.1 * spec.hz, rng)
         self.lapse = 0  # frames left
-        self.settled = 0  # frames since success
+        self.steps_since_success = 0  # frames since success
 
     def act(self, reached: bool) -> np.ndarray:
         """float32 [A]: the next action; `reached` says whether the goal has been, at any time."""
-        wander = self.rest + self.reach * self.wander.step()
+        walk = self.rest + self.reach * self.walk.step()
         jitter = self.jitter.step()
         lapsing = self._lapsing()
-        self.settled += reached
-        if self.expert is None or lapsing or self.settled > SETTLED * self.spec.hz:
-            action = wander
+        self.steps_since_success += reached
+        if self.expert is None or lapsing or self.steps_since_success > SECONDS_AFTER_SUCCESS * self.spec.hz:
+            action = walk
         else:
             action = self.expert() + self.level * self.spec.noise * (self.high - self.low) / 2 * jitter
         return np.clip(action, self.low, self.high).astype(np.float32)

@@ -30,7 +30,7 @@ class Simulator(Protocol):
         """A new episode; a function of both arguments, whatever ran before."""
 
     def rest(self) -> np.ndarray:
-        """float64 [A]: the action that wandering is centred on."""
+        """float64 [A]: the neutral action, the mean of the random walk."""
 
     def expert(self, rng: np.random.Generator) -> Expert | None:
         """The expert for the episode just started; None where there is none."""

@@ -1,4 +1,4 @@
-"""What the simulators need from the machine: packages, and a way to draw without a screen.
+"""What the simulators need from the machine: packages, and off-screen rendering.
 
 Owns the messages for what is missing. Looks for packages without importing them.
 """
@@ -29,16 +29,16 @@ MODULES = {
 }
 """Package -> the module it installs."""
 
-TOGETHER = {
+IMPORTED_TOGETHER = {
     "gymnasium": ("gymnasium", "gymnasium-robotics", "ogbench"),
     "robosuite": ("robosuite", "robosuite-models"),
 }
-"""Backend -> packages that its module imports, whichever of them a robot is from."""
+"""Backend -> packages that its module imports, whichever of them a robot comes from."""
 
-EVERYWHERE = ("mujoco", "numpy", "simplejpeg")
-"""Packages that decide what is in every dataset: physics and drawing, random draws, the encoding of frames."""
+COMMON_PACKAGES = ("mujoco", "numpy", "simplejpeg")
+"""Packages whose versions affect every dataset: physics and rendering, random numbers, image encoding."""
 
-BENEATH = {
+DEPENDENCIES = {
     "metaworld": ("gymnasium", "scipy"),
     "robosuite": ("mink", "numba", "scipy"),
     "gymnasium": ("dm-control",),
@@ -46,7 +46,7 @@ BENEATH = {
     "pusht": ("gymnasium", "opencv-python", "opencv-python-headless", "pygame", "pymunk", "shapely"),
     "so101": ("gymnasium", "scipy"),
 }
-"""Backend -> what its packages simulate, steer and draw with, where it is installed."""
+"""Backend -> dependencies of its packages whose versions affect simulation, control or rendering, if installed."""
 
 EXTRA = "pip install -e '.[sim]'"
 
@@ -56,20 +56,25 @@ APT = (
 )
 
 GL = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Values of MUJOCO_GL that need no screen -> the library behind each."""
+"""Values of MUJOCO_GL for off-screen rendering -> the library of each."""
 
 
 def missing_packages(specs: Iterable[SimSpec]) -> tuple[str, ...]:
     """Packages that these embodiments need and that are not installed."""
     needed = {"mujoco"}
     for spec in specs:
-        needed.update({spec.package, *TOGETHER.get(spec.backend, ())})
+        needed.update({spec.package, *IMPORTED_TOGETHER.get(spec.backend, ())})
     return tuple(p for p in sorted(needed) if importlib.util.find_spec(MODULES.get(p, p)) is None)
 
 
 def package_versions(spec: SimSpec) -> dict[str, str]:
-    """Versions of the packages that decide what is in a dataset; "" for one that is not installed."""
-    used = {spec.package, *EVERYWHERE, *TOGETHER.get(spec.backend, ()), *BENEATH.get(spec.backend, ())}
+    """Versions of the packages that affect what is in a dataset; "" for one that is not installed."""
+    used = {
+        spec.package,
+        *COMMON_PACKAGES,
+        *IMPORTED_TOGETHER.get(spec.backend, ()),
+        *DEPENDENCIES.get(spec.backend, ()),
+    }
     return {package: _version(package) for package in sorted(used)}
 
 
@@ -80,7 +85,7 @@ def _version(package: str) -> str:
         return ""
 
 
-def find_obstacle(specs: Iterable[SimSpec]) -> str:
+def why_unavailable(specs: Iterable[SimSpec]) -> str:
     """Why these embodiments cannot be simulated on this machine, with what to install; "" where they can."""
     missing = missing_packages(specs)
     if missing:
@@ -99,18 +104,18 @@ def find_obstacle(specs: Iterable[SimSpec]) -> str:
 
 def require_packages(specs: Iterable[SimSpec]) -> None:
     """Raises ConfigError, with what to install, unless these embodiments can be simulated here."""
-    obstacle = find_obstacle(specs)
+    obstacle = why_unavailable(specs)
     require(not obstacle, obstacle)
 
 
-def may_draw() -> bool:
-    """Whether a simulator can draw in this process: with Mesa's software renderer beside TensorFlow, the first picture
-    ends it with a segmentation fault."""
+def can_render() -> bool:
+    """Whether a simulator can render in this process: with Mesa's software renderer and TensorFlow in one process, the
+    first image ends it with a segmentation fault."""
     return "tensorflow" not in sys.modules
 
 
 def gl_backend() -> str:
-    """The library that draws: MUJOCO_GL, egl without it. Raises ConfigError for one with a screen."""
+    """The rendering library: MUJOCO_GL, by default egl. Raises ConfigError for one that needs a screen."""
     backend = os.environ.get("MUJOCO_GL") or "egl"
     if backend not in GL:
         raise ConfigError(f"MUJOCO_GL is {backend!r}; rendering without a screen needs {' or '.join(GL)}")
@@ -118,12 +123,12 @@ def gl_backend() -> str:
 
 
 def prepare_process() -> None:
-    """Settles, before any simulator is imported, how this process draws.
+    """Sets up off-screen rendering for this process; must be called before any simulator is imported.
 
-    Raises ConfigError where TensorFlow is loaded (`may_draw`).
+    Raises ConfigError where TensorFlow is loaded (`can_render`).
     """
     require(
-        may_draw(),
+        can_render(),
         "TensorFlow is loaded in this process, so rendering would end in a segmentation fault; simulate in a process "
         "without `import tensorflow`",
     )

@@ -12,7 +12,7 @@ import numpy as np
 from data_pipelines.simulators.behaviour import Behaviour
 from data_pipelines.simulators.embodiments import EMBODIMENTS
 from data_pipelines.simulators.episode import Simulator
-from data_pipelines.simulators.packages import find_obstacle, may_draw, prepare_process, require_packages
+from data_pipelines.simulators.packages import can_render, prepare_process, require_packages, why_unavailable
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.true_simulator import TrueSimulator
 from hma_jax.simulator.robots import Outside, Robot
@@ -24,7 +24,7 @@ PHYSICS = {spec.name: spec for spec in EMBODIMENTS if len(spec.envs) == 1}
 def can_simulate(robot: Robot) -> bool:
     """Whether this robot has a true simulator that can run in this process."""
     spec = PHYSICS.get(robot.name)
-    return spec is not None and spec.action_dim == robot.action_dim and not find_obstacle([spec]) and may_draw()
+    return spec is not None and spec.action_dim == robot.action_dim and not why_unavailable([spec]) and can_render()
 
 
 class PhysicsState(NamedTuple):

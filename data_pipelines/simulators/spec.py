@@ -58,12 +58,12 @@ class SimSpec:
     instruction: str = ""  # "" takes the environment's name, in words
     kwargs: Mapping[str, Any] = field(default_factory=dict)  # of the environment
     repeat: int = 1
-    expert: str = ""  # who acts; "" wanders at random
+    expert: str = ""  # which script acts; "": a random walk
     success: bool = False  # whether the environment says so
     seconds: tuple[float, float] = (8.0, 10.0)  # shortest and longest episode
-    gain: float = 0.6  # of wandering: share of the action range (standard deviation)
-    tau: float = 0.6  # seconds over which wandering forgets
-    noise: float = 0.4  # of experts: the most, as a share of the action range
+    gain: float = 0.6  # standard deviation of the random walk, as a share of half the action range
+    tau: float = 0.6  # correlation time of the random walk, seconds
+    noise: float = 0.4  # standard deviation of an expert's noise at level 1, as a share of half the action range
     note: str = ""
 
     def __post_init__(self):

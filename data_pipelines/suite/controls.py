@@ -1,9 +1,8 @@
-"""What an action means: how a wish becomes numbers, and what motion numbers ask for.
+"""What an action means: from a goal configuration to action values, and from these to joint velocities.
 
-A control covers some action dimensions and some joints. `encode` is used by the scripted
-behaviour: it turns a wish (a configuration to go to) into action values in the robot's own unit.
-`rate` is the physics' side: the joint velocities that an action asks for; it sees nothing of
-the wish. A robot's action is the concatenation of its controls'.
+A control covers some action dimensions and some joints. The scripted behaviour uses `encode`, which turns a goal
+configuration into action values in the robot's own unit. The physics uses `rate`: the joint velocities that an
+action commands; it does not see the goal. A robot's action is the concatenation of its controls' actions.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LOOKAHEAD_SECONDS = 0.35
 """An absolute target lies at most this far ahead (or one native step, if that is longer)."""
 
 SETTLE_SECONDS = 0.3
-"""A wish is approached at a speed that would reach it in this time (or in one native step)."""
+"""A goal is approached at the speed that would reach it in this time (or in one native step)."""
 
 HEADROOM = 1.3
 """Joints move at most this many times faster than the scripted behaviour asks for."""

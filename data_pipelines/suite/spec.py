@@ -78,8 +78,8 @@ class EmbodimentSpec:
     video_only: bool = False  # the dataset does not say what the actions were
     delay: int = 0  # native steps until an action is executed
     purpose: float = 0.4  # mean share of the time spent on the task; the rest explores
-    restless: float = 1.2  # changes of mind per second
-    noise: float = 0.2  # of the wishes, in units of what a joint can do in 0.5 s
+    restless: float = 1.2  # mean changes of the explored goal per second
+    noise: float = 0.2  # of goals, in units of what a joint can move in 0.5 s
 
     def __post_init__(self):
         name = self.name

@@ -1,11 +1,11 @@
-"""Where the records of a split lie: found out once, kept in a file, reused by every later start.
+"""The index of a split: offsets, lengths and checksums of all records, computed once and cached in a file.
 
 Owns that file. It lies in a cache directory, as datasets may be read-only: `$HMA_CACHE_DIR/index`, by
-default `~/.cache/hma-jax/index`. It is known by the shards' names, sizes and times (of remote ones
-etags or what else the store calls a version), so a start asks for a listing of the directory and
-reads no shard; shards that changed are scanned again, the others are not.
+default `~/.cache/hma-jax/index`. It is valid for the shards' names, sizes and modification times (for remote ones
+ETags or another version stamp), so a start lists the directory and reads no shard; only shards that changed are
+scanned again.
 
-Every process of every host may make it; of one host, one does, and the others wait for it.
+On each host one process makes it while the others wait for it.
 """
 
 from __future__ import annotations
@@ -36,13 +36,14 @@ if TYPE_CHECKING:
 CACHE_VARIABLE = "HMA_CACHE_DIR"
 
 SCANS, REMOTE_SCANS = 16, 64
-"""Shards that are scanned at a time: what takes time is waiting for the disk or the store."""
+"""Shards that are scanned concurrently: most of the time is spent waiting for the disk or the store."""
 
 SAVE_EVERY = 60.0
-"""Seconds of scanning after which what is known so far is kept, for a process that may be killed."""
+"""Seconds of scanning after which the index so far is saved, in case the process is killed."""
 
-SETTLED = 2.0
-"""Seconds that a shard must be older than its scan: a later change could bear the same time."""
+MIN_AGE = 2.0
+"""Seconds between a shard's last change and its scan for the shard's time to be trusted: a change right after the scan
+could have the same time."""
 
 COLUMNS = {"offsets": np.int64, "lengths": np.int64, "checksums": np.uint32}
 
@@ -51,22 +52,22 @@ Scan = Callable[["Location"], tuple[ShardIndex, CorruptRecordError | None]]
 
 @dataclass(frozen=True)
 class Shard:
-    """What is known of one shard. `digest` is over the lengths and checksums of its records."""
+    """The index entry of one shard. `digest` is over the lengths and checksums of its records."""
 
     name: str
     size: int  # bytes
-    stamp: str  # tells versions of the file apart; "": unknown, it is scanned at every start
+    stamp: str  # of this version of the file; "": unknown, it is scanned at every start
     records: int
     digest: str
-    missing: bool = False  # there is no such file
+    missing: bool = False
     damage_at: int = -1  # where the scan stopped; -1: at the file's end
     damage: str = ""
 
 
 class RecordIndex:
-    """The records of some shards, one after the other: `offsets`, `lengths` and `checksums` of each.
+    """`offsets`, `lengths` and `checksums` of the records of several shards, concatenated.
 
-    `shards` in the order asked for; `ends` int64 [shards]: records up to and including each.
+    `ends` int64 [shards]: the number of records up to and including each shard.
     """
 
     def __init__(self, shards: Sequence[Shard], columns: Mapping[str, np.ndarray] | Columns):
@@ -104,25 +105,25 @@ class RecordIndex:
 
 
 def load_index(directory: Location, split: str, shards: Sequence[Location], scan: Scan = scan_shard) -> RecordIndex:
-    """The index of `shards`, all in `directory`, from its file or by scanning what changed.
+    """The index of `shards`, all in `directory`, from its file or by scanning the shards that changed.
 
-    Raises UnreachableError for a directory or shard that cannot be read (what was scanned is kept),
-    DataError for shards that have changed places since they were indexed.
+    Raises UnreachableError for a directory or shard that cannot be read (what was scanned is saved), DataError for
+    shards whose names were swapped since they were indexed.
     """
     listing = list_files(directory)
     path = index_path(directory, split)
     known = _read(path)
-    if known is not None and _current(known, shards, listing):
+    if known is not None and _is_current(known, shards, listing):
         return known
-    with alone(path):
+    with exclusive_lock(path):
         known = _read(path)  # another process may have made it meanwhile
-        if known is not None and _current(known, shards, listing):
+        if known is not None and _is_current(known, shards, listing):
             return known
         return _make(path, shards, listing, known, scan)
 
 
 def index_path(directory: Location, split: str) -> Path:
-    """Where the index of a split is kept."""
+    """The cache file of a split's index."""
     root = os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "hma-jax"
     text = str(directory) if is_remote(directory) else str(directory.absolute())
     return Path(root) / "index" / f"{hashlib.sha256(f'{text}#{split}'.encode()).hexdigest()[:32]}.columns"
@@ -156,11 +157,13 @@ def _make(
             failure = failure or found
             continue
         size, stamp = listing[shard.name]
-        made[shard.name] = _described(shard, size, _settled(shard, stamp, began), *found)
+        made[shard.name] = _describe_shard(shard, size, _stamp_if_old(shard, stamp, began), *found)
         if time.monotonic() - saved > SAVE_EVERY:
             _write(path, shards, made)
             saved = time.monotonic()
-    _check_places({name: s for name, (s, _) in made.items()}, {n: s for n, (s, _) in old_rows.items()}, shards, path)
+    _check_not_swapped(
+        {name: s for name, (s, _) in made.items()}, {n: s for n, (s, _) in old_rows.items()}, shards, path
+    )
     index = _write(path, shards, made)
     if failure is not None:
         raise failure
@@ -170,7 +173,7 @@ def _make(
 def _scan(
     shards: Sequence[Location], scan: Scan
 ) -> Iterator[tuple[Location, tuple[ShardIndex, CorruptRecordError | None] | DataError]]:
-    """Each shard with its index, or with the error that stopped its scan; after one no more are begun."""
+    """Each shard with its index, or with the error of its scan; after an error no further scans are started."""
     failed = False
 
     def found(shard: Location):
@@ -189,7 +192,7 @@ def _scan(
         yield from zip(shards, pool.map(found, shards), strict=True)
 
 
-def _described(
+def _describe_shard(
     shard: Location, size: int, stamp: str, index: ShardIndex, damage: CorruptRecordError | None
 ) -> tuple[Shard, dict[str, np.ndarray]]:
     rows = {name: getattr(index, name).astype(kind, copy=False) for name, kind in COLUMNS.items()}
@@ -198,13 +201,15 @@ def _described(
     return Shard(shard.name, size, stamp, len(index), digest.hexdigest()[:16], **stop), rows
 
 
-def _settled(shard: Location, stamp: str, began: float) -> str:
-    """`stamp`, or "" for a file so new that it may change without one seeing it."""
-    return stamp if is_remote(shard) or int(stamp) / 1e9 < began - SETTLED else ""
+def _stamp_if_old(shard: Location, stamp: str, began: float) -> str:
+    """`stamp`, or "" for a file so new that a later change might not alter its stamp."""
+    return stamp if is_remote(shard) or int(stamp) / 1e9 < began - MIN_AGE else ""
 
 
-def _check_places(new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Sequence[Location], path: Path) -> None:
-    """Two shards whose names were exchanged would exchange their episodes' names too."""
+def _check_not_swapped(
+    new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Sequence[Location], path: Path
+) -> None:
+    """Raises DataError for two shards whose names were swapped: their episodes' names would be swapped too."""
     before = {s.digest: s.name for s in old.values() if s.records}
     for shard in shards:
         now = new.get(shard.name)
@@ -223,14 +228,14 @@ def _check_places(new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Se
 
 
 def _read(path: Path) -> RecordIndex | None:
-    """The index that is kept; None if there is none, or none that can be trusted."""
+    """The cached index; None if there is none, or it is damaged."""
     try:
         columns = Columns(path)
         shards = [Shard(**values) for values in columns.facts["shards"]]
         index = RecordIndex(shards, columns)
         whole = all(len(columns[name]) == len(index) for name in COLUMNS)
     except (OSError, DataError, KeyError, TypeError):
-        return None  # it is made again, of the shards
+        return None  # it is made again from the shards
     return index if whole else None
 
 
@@ -252,10 +257,10 @@ def _write(
             stacklevel=2,
         )
         return index
-    return _read(path) or index  # mapped, which takes no memory of this process
+    return _read(path) or index  # memory-mapped, so that it takes no memory of this process
 
 
-def _current(index: RecordIndex, shards: Sequence[Location], listing: Mapping[str, tuple[int, str]]) -> bool:
+def _is_current(index: RecordIndex, shards: Sequence[Location], listing: Mapping[str, tuple[int, str]]) -> bool:
     if [s.name for s in index.shards] != [p.name for p in shards]:
         return False
     for shard in index.shards:
@@ -272,13 +277,13 @@ def _no_rows() -> dict[str, np.ndarray]:
 
 
 @contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Waits while another process of this host makes the same index."""
+def exclusive_lock(path: Path) -> Iterator[None]:
+    """Held by one process of this host at a time; the others wait."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = open(path.with_name(f"{path.name}.lock"), "w")  # noqa: SIM115
     except OSError:
-        yield  # nothing can be kept there, as `_write` says
+        yield  # nothing can be cached there, as `_write` warns
         return
     with lock:
         with suppress(OSError):  # a file system without locks: two make the same file

@@ -1,6 +1,6 @@
-"""How many steps each episode has, kept when it became known: no shard says it before it is read.
+"""A cache of the number of steps of each episode, which is known only after its record was read.
 
-Owns a file beside the index (see `index`). Losing it costs nothing but the knowledge.
+Owns a file beside the index (see `index`). It may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from data_pipelines.columns import Columns, write_columns
 from data_pipelines.errors import DataError
-from data_pipelines.sources.rlds.index import RecordIndex, alone
+from data_pipelines.sources.rlds.index import RecordIndex, exclusive_lock
 
 
 def load_steps(path: Path, index: RecordIndex) -> np.ndarray:
-    """int32 [records], -1 where it is not known; `path` is that of the index."""
+    """int32 [records], -1 where unknown; `path` is that of the index."""
     try:
-        columns = Columns(_beside(path))
+        columns = Columns(_steps_path(path))
         if columns.facts["index"] == _identity(index):
             return np.array(columns["steps"], np.int32)
     except (OSError, DataError, KeyError, TypeError):
@@ -28,19 +28,19 @@ def load_steps(path: Path, index: RecordIndex) -> np.ndarray:
 
 
 def save_steps(path: Path, index: RecordIndex, steps: np.ndarray) -> None:
-    """Keeps `steps`, and what other processes have kept meanwhile."""
+    """Saves `steps`, merged with what other processes have saved meanwhile."""
     try:
-        with alone(_beside(path)):
+        with exclusive_lock(_steps_path(path)):
             kept = load_steps(path, index)
             merged = np.where(steps >= 0, steps, kept).astype(np.int32)
             if not np.array_equal(merged, kept):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_columns(_beside(path), {"index": _identity(index)}, {"steps": merged})
+                write_columns(_steps_path(path), {"index": _identity(index)}, {"steps": merged})
     except OSError as error:
-        warnings.warn(f"{_beside(path)}: cannot be written ({error.strerror or error}).", stacklevel=2)
+        warnings.warn(f"{_steps_path(path)}: cannot be written ({error.strerror or error}).", stacklevel=2)
 
 
-def _beside(path: Path) -> Path:
+def _steps_path(path: Path) -> Path:
     return path.with_suffix(".steps")
 
 

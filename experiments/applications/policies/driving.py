@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_pipelines.simulators.behaviour import Wander
+from data_pipelines.simulators.behaviour import OrnsteinUhlenbeck
 from data_pipelines.simulators.simulator import PhysicsWorld, new_seeds
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.appearance import draw_appearance
@@ -79,7 +79,7 @@ def _drive_physics(
             world.reset(int(seed))
             sim, rng = world.simulator, np.random.default_rng([int(seed), 13])
             expert, half = sim.expert(rng), (sim.high - sim.low) / 2
-            misses = Wander(spec.action_dim, spec.tau * spec.hz / stride if play else JITTER, rng)
+            misses = OrnsteinUhlenbeck(spec.action_dim, spec.tau * spec.hz / stride if play else JITTER, rng)
             for t in range(task.frames):
                 images[i, t], reached[i, t] = world.render(), world.success()
                 planned = sim.rest() if play else expert()

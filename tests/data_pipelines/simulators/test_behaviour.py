@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_pipelines.simulators import select
-from data_pipelines.simulators.behaviour import LEVELS, SETTLED, Behaviour, Wander
+from data_pipelines.simulators.behaviour import LEVELS, SECONDS_AFTER_SUCCESS, Behaviour, OrnsteinUhlenbeck
 
 (SPEC,) = select(["robosuite_panda_lift"])
 LOW, HIGH, REST = -np.ones(7), np.ones(7), np.zeros(7)
@@ -19,7 +19,7 @@ def actions(seed: int, expert: bool, steps: int = 400, reached: bool = False) ->
 
 
 def test_wandering_is_smooth_and_has_the_spread_it_was_given():
-    wander = Wander(3, steps=20, rng=np.random.default_rng(0))
+    wander = OrnsteinUhlenbeck(3, steps=20, rng=np.random.default_rng(0))
     path = np.stack([wander.step() for _ in range(20_000)])[200:]
     assert abs(path.std() - 1) < 0.1
     assert abs(np.diff(path, axis=0).std() - np.sqrt(2 / 20)) < 0.03
@@ -37,7 +37,7 @@ def test_some_experts_are_left_alone_and_others_err():
 
 def test_after_its_success_an_expert_wanders():
     done, _ = actions(0, expert=True, reached=True)
-    settled = round(SETTLED * SPEC.hz)
+    settled = round(SECONDS_AFTER_SUCCESS * SPEC.hz)
     assert np.abs(np.diff(done[settled + 1 :], axis=0)).min(axis=0).max() > 0
 
 

@@ -212,8 +212,8 @@ def test_the_fingerprint_follows_packages_beneath_the_robots_own(monkeypatch, pa
 
 
 def package_names() -> set[str]:
-    names = {*packages.MODULES, *packages.EVERYWHERE}
-    return names.union(*packages.TOGETHER.values(), *packages.BENEATH.values())
+    names = {*packages.MODULES, *packages.COMMON_PACKAGES}
+    return names.union(*packages.IMPORTED_TOGETHER.values(), *packages.DEPENDENCIES.values())
 
 
 def test_the_fingerprint_follows_the_library_that_draws(monkeypatch, fake):
