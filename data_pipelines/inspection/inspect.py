@@ -25,7 +25,7 @@ from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
 from data_pipelines.sources.rlds.schema import field_slice, read_features, read_info, step_key
-from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched, decode_frame
+from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, SourceFrame, decode_frame
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -347,7 +347,7 @@ class _CameraLog:
         self.frames = self.blank = self.undecodable = 0
         self.still, self.reason = True, ""
 
-    def look(self, encoded: Sequence[Fetched], times: Sequence[int], where: str) -> list[np.ndarray]:
+    def look(self, encoded: Sequence[SourceFrame], times: Sequence[int], where: str) -> list[np.ndarray]:
         """The decoded frames at `times`, noted. Raises EpisodeError for one that cannot be decoded."""
         images = [self._decode(encoded[t], f"{where}: step {t} of {self._key}") for t in times]
         self.sizes |= {image.shape[:2] for image in images}
@@ -364,7 +364,7 @@ class _CameraLog:
         self.reason = self.reason or str(error)
 
     @staticmethod
-    def _decode(frame: Fetched, where: str) -> np.ndarray:
+    def _decode(frame: SourceFrame, where: str) -> np.ndarray:
         return decode_frame(frame, lambda what: EpisodeError(f"{where} {what}"))
 
     def facts(self) -> CameraFacts:

@@ -29,10 +29,10 @@ from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4
-"""Frames taken from one episode at a time: reading the record costs more than decoding a frame."""
+"""Frames of a batch that come from one episode: reading its record costs more than decoding a frame."""
 
-AHEAD = 8
-"""Batches that are read ahead of their use; each thread has one under way, however many there are."""
+PREFETCH_BATCHES = 8
+"""Batches that are prefetched, at least one per thread."""
 
 
 def make_frame_loader(
@@ -83,7 +83,7 @@ def make_frame_loader(
     group = math.gcd(batch, FRAMES_PER_READ)
     draws = Draws(mixture.weights, f"frames/{split}/{seed}")
     batches = _Batches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)
-    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, AHEAD))
+    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, PREFETCH_BATCHES))
     iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
     return FrameLoader(batches, iterator)

@@ -134,7 +134,7 @@ class DatasetSpec:
         """The rate, in Hz, that gives this stride; six digits, which do."""
         return float(f"{self.hz / stride:.6g}")
 
-    def check_like(self, robot: Embodiment, rate: float | None = FRAME_RATE) -> None:
+    def check_compatible(self, robot: Embodiment, rate: float | None = FRAME_RATE) -> None:
         """Raises ConfigError, saying what to change, unless a study at `rate` Hz has the actions of a frame as this
         `robot` of a model has them."""
         name = self.name

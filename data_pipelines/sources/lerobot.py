@@ -108,14 +108,14 @@ class LeRobotSource:
     def rows(self, entry: EpisodeEntry, columns: Iterable[str]) -> Any:
         """The episode's rows, in order: when, and those of `columns` that the file has."""
         with _as_units():
-            first, count = self._place(entry)
+            first, count = self._locate(entry)
             available = self._tables.columns(entry.data)
             return self._tables.read(entry.data, [TIME, *(n for n in columns if n in available)], first, count)
 
     def image(self, entry: EpisodeEntry, camera: str, n: int, where: str) -> bytes:
         """Frame `n` of a camera whose images the table holds or names."""
         with _as_units():
-            first, _ = self._place(entry)
+            first, _ = self._locate(entry)
             self._check_camera(entry, camera, where)
             (value,) = self._tables.read(entry.data, [camera], first + n, 1)[camera].to_pylist()
         return self._image_bytes(value, f"{where}: {quote(camera)} at row {n}")
@@ -125,7 +125,7 @@ class LeRobotSource:
         """Bytes of tables that were read so far, of whole groups of rows."""
         return self._tables.loaded
 
-    def _place(self, entry: EpisodeEntry) -> tuple[int, int]:
+    def _locate(self, entry: EpisodeEntry) -> tuple[int, int]:
         """(first row, rows) in the episode's file."""
         available = self._tables.columns(entry.data)
         missing = [n for n in (EPISODE, TIME, *self.vectors.values()) if n not in available]

@@ -1,7 +1,7 @@
-"""A LeRobot dataset read where it lies: episodes in random access, frames decoded from its videos.
+"""A LeRobot dataset as an `EpisodeSource`: random access to its episodes, without a conversion.
 
-Owns what `lerobot` leaves open: names, sizes and the fingerprint of episodes, and one frame at a time.
-An episode's name is its `episode_index`.
+Owns what `lerobot` leaves open: names, sizes and the fingerprint of episodes, and reading one frame at a time.
+An episode is named by its `episode_index`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from data_pipelines.sources.source import (
     SUCCESS_KEY,
     Corrupt,
     EpisodeSource,
-    Fetched,
     OpenEpisode,
+    SourceFrame,
     decode_frame,
     join_actions,
 )
@@ -44,7 +44,7 @@ class LeRobotDataset(EpisodeSource):
 
     Cameras are `observation/<name>`, numeric features `observation/<name>` and `action`, as the export
     to RLDS names them. Raises DataError for a directory of another layout, ConfigError for another
-    split than train: the files know no other.
+    split than train: the format has no others.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class LeRobotDataset(EpisodeSource):
                 )
             fetch = self._fetch(stack, entry, self._cameras[camera], times, where)
 
-            def decode(n: int, frame: Fetched) -> np.ndarray:
+            def decode(n: int, frame: SourceFrame) -> np.ndarray:
                 advice = "Repair it, or read with corrupt='skip'."
                 return decode_frame(frame, lambda what: EpisodeError(f"{where}, step {n} {what}. {advice}"))
 
@@ -160,7 +160,7 @@ class LeRobotDataset(EpisodeSource):
 
     def _fetch(
         self, stack: ExitStack, entry: EpisodeEntry, name: str, times: np.ndarray, where: str
-    ) -> Callable[[int], Fetched]:
+    ) -> Callable[[int], SourceFrame]:
         """Frames of one camera while `stack` is open."""
         if name in entry.videos:
             path, begin = entry.videos[name]
@@ -169,22 +169,22 @@ class LeRobotDataset(EpisodeSource):
         return lambda n: self._read.image(entry, name, n, where)
 
 
-class _Frames(Sequence[Fetched]):
-    """The frames of one camera, each read when it is asked for. A video is open from the first one on, as long as this
-    lives, so that frames near each other are decoded in one go. One thread at a time."""
+class _Frames(Sequence[SourceFrame]):
+    """The frames of one camera, each read on access. A video stays open from the first access until this object is
+    garbage-collected, so that neighbouring frames are decoded in one pass. Not thread-safe."""
 
     def __init__(self, source: LeRobotDataset, entry: EpisodeEntry, *place: Any):
         self._source, self._entry, self._place, self._length = source, entry, place, entry.length
-        self._fetch: Callable[[int], Fetched] | None = None
+        self._fetch: Callable[[int], SourceFrame] | None = None
         self._open = ExitStack()
         weakref.finalize(self, self._open.close)
         self.nbytes = 0
-        """What was read for the frames that were asked for: of a table whole groups of rows, of a video its pixels."""
+        """Bytes read so far: whole row groups of a table, or the decoded pixels of a video."""
 
     def __len__(self) -> int:
         return self._length
 
-    def __getitem__(self, n: int) -> Fetched:
+    def __getitem__(self, n: int) -> SourceFrame:
         before = self._source._read.loaded
         if self._fetch is None:
             self._fetch = self._source._fetch(self._open, self._entry, *self._place)
@@ -195,7 +195,7 @@ class _Frames(Sequence[Fetched]):
 
 
 def dataset_name(root: Path) -> str:
-    """What the directory is called, as names of datasets are written. Raises DataError where nothing is left of it."""
+    """The directory's name as the name of a dataset. Raises DataError if no valid character is left of it."""
     name = re.sub(r"[^a-z0-9_]+", "_", root.absolute().name.lower()).strip("_")
     if not name:
         raise DataError(

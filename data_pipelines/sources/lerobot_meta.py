@@ -1,6 +1,6 @@
-"""What the `meta` folder of a LeRobot dataset says: features, rate, episodes and where they lie.
+"""Reading the `meta` folder of a LeRobot dataset: features, rate, and the files of each episode.
 
-Owns the difference between the versions. 2.0 and 2.1: a parquet file and, per camera, a video
+Owns the differences between the versions. 2.0 and 2.1: a parquet file and, per camera, a video
 file for each episode; episodes and tasks are JSON lines. 3.0: several episodes per file, and
 parquet tables that say in which file, and at what time of a video, each one begins.
 """
@@ -84,18 +84,18 @@ def _episodes_2(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
     entries = []
     for line, row in _json_lines(path):
         index, length = (_count(row, name, f"{path}: line {line}") for name in ("episode_index", "length"))
-        place = {"episode_chunk": index // chunk_size, "episode_index": index}
-        clips = {k: (_place(root, info, "video_path", video_key=k, **place), 0.0) for k in videos}
+        values = {"episode_chunk": index // chunk_size, "episode_index": index}
+        clips = {k: (_format_path(root, info, "video_path", video_key=k, **values), 0.0) for k in videos}
         tasks = _texts(row, f"{path}: line {line}")
-        entries.append(EpisodeEntry(index, length, _place(root, info, "data_path", **place), clips, tasks))
+        entries.append(EpisodeEntry(index, length, _format_path(root, info, "data_path", **values), clips, tasks))
     return sorted(entries, key=lambda e: e.index)
 
 
 def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[EpisodeEntry]:
     folder = root / "meta" / "episodes"
-    places = {k: [f"videos/{k}/{f}" for f in ("chunk_index", "file_index", "from_timestamp")] for k in videos}
+    fields = {k: [f"videos/{k}/{f}" for f in ("chunk_index", "file_index", "from_timestamp")] for k in videos}
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    columns += [column for group in places.values() for column in group]
+    columns += [column for group in fields.values() for column in group]
     entries = []
     for path in sorted(folder.glob("*/*.parquet")):
         table = read_table(path, [*columns, "tasks"])  # beside them stand statistics, which take far more
@@ -106,11 +106,11 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
             where = f"{path}: row {line}"
             number = {c: (_seconds if c.endswith("timestamp") else _count)(row, c, where) for c in columns}
             clips = {}
-            for key, (chunk, file, begin) in places.items():
-                place = {"chunk_index": number[chunk], "file_index": number[file]}
-                clips[key] = (_place(root, info, "video_path", video_key=key, **place), number[begin])
-            place = {"chunk_index": number["data/chunk_index"], "file_index": number["data/file_index"]}
-            data = _place(root, info, "data_path", **place)
+            for key, (chunk, file, begin) in fields.items():
+                values = {"chunk_index": number[chunk], "file_index": number[file]}
+                clips[key] = (_format_path(root, info, "video_path", video_key=key, **values), number[begin])
+            values = {"chunk_index": number["data/chunk_index"], "file_index": number["data/file_index"]}
+            data = _format_path(root, info, "data_path", **values)
             tasks = _texts(row, where)
             entries.append(EpisodeEntry(number["episode_index"], number["length"], data, clips, tasks))
     return sorted(entries, key=lambda e: e.index)
@@ -145,15 +145,15 @@ def _rows(table: Any, path: Path) -> list[dict[str, Any]]:
         raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
 
 
-_PLACE = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
-"""A place in a path, as `{episode_index:06d}`. Nothing else of Python's formats, which can ask for
-attributes and for gigabytes."""
+_PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
+"""A placeholder in a path template, such as `{episode_index:06d}`. Python's other formats are not supported: they can
+access attributes and ask for gigabytes of padding."""
 
 
-def _place(root: Path, info: dict[str, Any], field: str, **place: Any) -> Path:
-    """The file that `info[field]` names. Raises DataError where it lies outside of `root`."""
+def _format_path(root: Path, info: dict[str, Any], field: str, **values: Any) -> Path:
+    """The path template `info[field]`, filled in. Raises DataError if the path leaves `root`."""
     try:
-        text = _PLACE.sub(lambda m: f"{place[m[1]]:0{m[2]}d}" if m[2] else str(place[m[1]]), info[field])
+        text = _PLACEHOLDER.sub(lambda m: f"{values[m[1]]:0{m[2]}d}" if m[2] else str(values[m[1]]), info[field])
         if "{" in text:
             raise ValueError(f"{quote(text)} is left")
         return safe_join(root, text)

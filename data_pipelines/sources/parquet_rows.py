@@ -165,8 +165,8 @@ def _read_groups(path: Path, layout: _Layout, wanted: dict[int, list[str]]) -> d
     from pyarrow import parquet
 
     with path.open("rb") as file:
-        places = [layout.groups[g].columns.get(name, ()) for g, names in wanted.items() for name in names]
-        check_pages(file, [chunk for place in places for chunk in place])
+        chunks = [layout.groups[g].columns.get(name, ()) for g, names in wanted.items() for name in names]
+        check_pages(file, [chunk for place in chunks for chunk in place])
     found = {}
     with parquet.ParquetFile(path) as file:
         for g, names in wanted.items():

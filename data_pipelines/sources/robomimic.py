@@ -42,8 +42,8 @@ ADVICE = (
 )
 
 
-DAMAGED = (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError)
-"""What h5py raises of a damaged file; the first of a group where an array should be, or an array for a group."""
+DAMAGE_ERRORS = (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError)
+"""What h5py raises for a damaged file; AttributeError for a group in place of an array, or the reverse."""
 
 
 class RobomimicSource:
@@ -56,7 +56,7 @@ class RobomimicSource:
     def __init__(self, path: str | Path, settings: RobomimicSettings = RobomimicSettings()):
         settings.check()
         self.path, self.short_side = Path(path), settings.short_side
-        with self.open() as file, damage(str(path), DataError):
+        with self.open() as file, damage_as(str(path), DataError):
             if "data" not in file:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
@@ -65,8 +65,8 @@ class RobomimicSource:
                 file["data"][self.units[0]], settings.camera
             )
         self.task = str(args.get("env_name", "robomimic"))
-        self.own_hz = _control_rate(self.path, args)
-        self.hz = float(settings.hz or self.own_hz or CONTROL_RATE)
+        self.recorded_hz = _control_rate(self.path, args)
+        self.hz = float(settings.hz or self.recorded_hz or CONTROL_RATE)
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
     def identity(self) -> dict[str, Any]:
@@ -82,14 +82,14 @@ class RobomimicSource:
 
     @functools.cached_property
     def content(self) -> str:
-        """Hash over the name, actions and first picture by each camera of every demonstration: pictures that are drawn
-        anew, of the same states, take as many bytes."""
+        """Hash over the name, actions and first image of each camera of every demonstration. The file's size does not
+        suffice: images rendered again from the same states take as many bytes."""
         digest = hashlib.sha256()
         with self.open() as file:
             for name in self.units:
                 digest.update(f"{name}:".encode())
                 where = f"{self.path}: data/{name}"
-                with suppress(UnitError), damage(where):  # reading the demonstration says what is wrong
+                with suppress(UnitError), damage_as(where):  # reading the demonstration says what is wrong
                     rows = self.array(file["data"][name], "actions", where)
                     digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
                     for camera in self.cameras:
@@ -100,7 +100,7 @@ class RobomimicSource:
     def read(self, unit: int) -> Iterator[Episode]:
         name = self.units[unit]
         where = f"{self.path}: data/{name}"
-        with self.open() as file, damage(where):
+        with self.open() as file, damage_as(where):
             demo = file["data"][name]
             actions = self.array(demo, "actions", where)
             steps = len(actions)
@@ -116,7 +116,7 @@ class RobomimicSource:
             vectors = {"action": actions.reshape(steps, -1)}
             for key in self.layout.vectors:
                 if key != "action":
-                    rows = self.array(demo, source_key(key), where)
+                    rows = self.array(demo, hdf5_path(key), where)
                     vectors[key] = rows.reshape(len(rows), -1)
             rewards = np.asarray(demo["rewards"]) if "rewards" in demo else None
             dones = np.asarray(demo["dones"]) if "dones" in demo else None
@@ -182,14 +182,14 @@ class RobomimicSource:
 
 
 @contextmanager
-def damage(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
-    """`DAMAGED` as errors of `kind`, and as UnreachableError of a failing disk. For looking at a file: not around what
-    anybody else does while it is open."""
+def damage_as(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
+    """Raises `DAMAGE_ERRORS` of the block as `kind`, those of a failing disk as UnreachableError. Only for blocks that
+    read the file: errors of a caller would be taken for damage."""
     try:
         yield
     except (DataError, ConfigError):
         raise
-    except DAMAGED as error:
+    except DAMAGE_ERRORS as error:
         if is_io_error(error):
             raise UnreachableError(f"{where} cannot be read ({error}). Run the same command again.") from error
         advice = ADVICE if kind is UnitError else "Download the file again."
@@ -202,7 +202,7 @@ def read_rows(demo: Any, key: str, rows: slice, where: str) -> np.ndarray:
     def read() -> np.ndarray:
         try:
             return np.asarray(demo[key][rows])
-        except DAMAGED as error:
+        except DAMAGE_ERRORS as error:
             if is_io_error(error):
                 raise  # to be tried again
             raise UnitError(f"{where}/{key} cannot be read ({error}). {ADVICE}") from error
@@ -221,7 +221,7 @@ def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | No
     return None if dones is None else bool(np.max(dones, initial=0) > 0)
 
 
-def source_key(key: str) -> str:
+def hdf5_path(key: str) -> str:
     return "states" if key == "observation/sim_state" else f"obs/{key.removeprefix('observation/')}"
 
 

@@ -1,7 +1,7 @@
-"""A robomimic file read where it lies: demonstrations in random access, frames from its arrays.
+"""A robomimic file as an `EpisodeSource`: random access to its demonstrations, without a conversion.
 
-Owns what `robomimic` leaves open: names, sizes and the fingerprint of demonstrations, and a few frames
-at a time. A demonstration's name is that of the file and its number.
+Owns what `robomimic` leaves open: names, sizes and the fingerprint of demonstrations, and reading a few frames at a
+time. A demonstration is named by the file and its number.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from data_pipelines.errors import EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds.schema import field_slice, step_key
-from data_pipelines.sources.robomimic import RobomimicSource, damage, read_rows, source_key, succeeded
+from data_pipelines.sources.robomimic import RobomimicSource, damage_as, hdf5_path, read_rows, succeeded
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
@@ -27,13 +27,13 @@ from data_pipelines.sources.source import (
     SUCCESS_KEY,
     Corrupt,
     EpisodeSource,
-    Fetched,
     OpenEpisode,
+    SourceFrame,
     join_actions,
 )
 
 BLOCK = 16
-"""Frames read at least: files are often compressed in chunks of several."""
+"""Smallest number of frames to read at a time: files are often compressed in chunks of several."""
 
 
 class RobomimicDataset(EpisodeSource):
@@ -68,7 +68,7 @@ class RobomimicDataset(EpisodeSource):
 
     @property
     def hz(self) -> float | None:
-        return self._read.own_hz  # not the rate of published files, where this one does not say its own
+        return self._read.recorded_hz  # None if the file does not say it, not CONTROL_RATE
 
     def fingerprint(self) -> str:
         """Hash over the file's size and, of every demonstration, what `RobomimicSource.content` says."""
@@ -88,7 +88,7 @@ class RobomimicDataset(EpisodeSource):
         camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
         where = self._where(i)
         with self._read.open() as file:
-            with damage(where):
+            with damage_as(where):
                 demo = file["data"][self._demos[i]]
                 frames = _Frames(demo, _path(camera, image=True), where)
                 if not len(frames):
@@ -106,11 +106,11 @@ class RobomimicDataset(EpisodeSource):
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         where, found = self._where(i), {}
-        with self._read.open() as file, damage(where):
+        with self._read.open() as file, damage_as(where):
             demo = file["data"][self._demos[i]]
             for key in keys:
                 if key in self.features and self.features[key].image:
-                    found[key] = _Opened(self, i, key, len(_Frames(demo, _path(key, image=True), where)))
+                    found[key] = _LazyFrames(self, i, key, len(_Frames(demo, _path(key, image=True), where)))
                 elif key in self.features:
                     found[key] = read_rows(demo, _path(key), slice(None), where).astype(np.float32).ravel()
                 elif key == INSTRUCTION_KEY:
@@ -125,14 +125,14 @@ class RobomimicDataset(EpisodeSource):
     def _camera(self, i: int, key: str) -> Iterator[_Frames]:
         where = self._where(i)
         with self._read.open() as file:
-            with damage(where):
+            with damage_as(where):
                 frames = _Frames(file["data"][self._demos[i]], _path(key, image=True), where)
             yield frames
 
     def _length(self, file: Any, i: int) -> int:
-        """Steps by the actions, -1 where there are none or nobody can tell: then reading the episode says why."""
+        """Number of actions; -1 if there are none or they cannot be read: reading the episode then says why."""
         try:
-            with damage(self._where(i)):
+            with damage_as(self._where(i)):
                 demo = file["data"][self._demos[i]]
                 return len(demo["actions"]) if "actions" in demo else -1
         except EpisodeError:
@@ -151,8 +151,8 @@ class RobomimicDataset(EpisodeSource):
         return succeeded(rewards, dones)
 
 
-class _Frames(Sequence[Fetched]):
-    """Frames of an array of a demonstration, while its file is open. One thread at a time."""
+class _Frames(Sequence[SourceFrame]):
+    """Frames of an array of a demonstration, while its file is open. Not thread-safe."""
 
     def __init__(self, demo: Any, key: str, where: str):
         array = demo.get(key)
@@ -179,8 +179,8 @@ class _Frames(Sequence[Fetched]):
         return self._block[n - at * self._rows]
 
 
-class _Opened(Sequence[Fetched]):
-    """The frames of one camera, each read when it is asked for."""
+class _LazyFrames(Sequence[SourceFrame]):
+    """The frames of one camera, each read on access; opens the file every time."""
 
     def __init__(self, source: RobomimicDataset, i: int, key: str, length: int):
         self._source, self._i, self._key, self._length = source, i, key, length
@@ -205,5 +205,5 @@ def dataset_name(source: RobomimicSource) -> str:
 def _path(key: str, image: bool = False) -> str:
     """Where a field lies in a demonstration."""
     field = key.removeprefix("steps/")
-    path = "actions" if field == "action" else source_key(field)
+    path = "actions" if field == "action" else hdf5_path(field)
     return f"{path}_image" if image else path

@@ -1,7 +1,7 @@
-"""What every source of episodes gives: random access to the episodes of one dataset, by name.
+"""The interface of all formats of robot data: random access to the episodes of one dataset.
 
-Owns the interface that inspection, tokenizer training and tokenising see, and what all formats share:
-looking up cameras and actions, and counting episodes that cannot be used.
+Owns the interface that inspection, tokenizer training and tokenising use, and what all formats share: checking
+cameras and action fields, and counting unusable episodes.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
 
 REWARD_KEY = "steps/reward"
-"""Optional: what each step's action brought about, which the frame after it shows."""
+"""Optional: the reward of each step's action, whose effect the next frame shows."""
 
 MAX_SKIPPED = 16.0
-"""Default bound of the policy corrupt='skip': so many episodes or, below 1, this share of them."""
+"""Default limit of the policy corrupt='skip': a number of episodes or, below 1, a share of them."""
 
 Corrupt = Literal["raise", "skip"]
 
 
 def count_skippable(limit: float, episodes: int) -> int:
-    """How many of `episodes` may be left out: `limit`, or this share of them, rounded down, if it is below 1."""
+    """How many of `episodes` may be skipped: `limit`, or if it is below 1, this share of them, rounded down."""
     require(
         limit >= 0 and (limit < 1 or float(limit).is_integer()),
         f"max_skipped must be a whole number of episodes or, below 1, a fraction of them, got {limit:g}",
@@ -47,8 +47,8 @@ def count_skippable(limit: float, episodes: int) -> int:
     return int(limit if limit >= 1 else limit * episodes)
 
 
-Fetched = bytes | np.ndarray
-"""A frame as its source holds it: encoded, or uint8 [H, W, 3] where no frame stands alone (videos)."""
+SourceFrame = bytes | np.ndarray
+"""A frame as its source gives it: encoded bytes, or uint8 [H, W, 3] where frames are not encoded singly (videos)."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,11 @@ class OpenEpisode:
     index: int
     actions: np.ndarray  # float32 [N, A], native rate, raw units
     success: bool | None
-    fetch: Callable[[int], Fetched]
-    """Native frame n as its source holds it. One thread at a time; in ascending order nothing is read
-    twice. Raises EpisodeError."""
-    decode: Callable[[int, Fetched], np.ndarray]
-    """Native frame n from what `fetch` gave, uint8 [H, W, 3], in any thread. Raises EpisodeError."""
+    fetch: Callable[[int], SourceFrame]
+    """Native frame n as its source gives it. Not thread-safe; in ascending order nothing is read twice. Raises
+    EpisodeError."""
+    decode: Callable[[int, SourceFrame], np.ndarray]
+    """Decodes native frame n from the result of `fetch`: uint8 [H, W, 3]. Thread-safe. Raises EpisodeError."""
 
     @property
     def steps(self) -> int:
@@ -126,43 +126,43 @@ class EpisodeSource(ABC):
 
     @property
     def numbers(self) -> np.ndarray:
-        """int64 [episodes]: which of the episodes named by `runs` each one is. All are there unless a source says
-        otherwise."""
+        """int64 [episodes]: the number of each readable episode among all those named by `runs`. By default all are
+        readable."""
         return np.arange(len(self), dtype=np.int64)
 
     @abstractmethod
     def fingerprint(self) -> str:
-        """Hash that tells other contents apart, not another place."""
+        """Hash of the contents, independent of the location."""
 
     @abstractmethod
     def sizes(self) -> np.ndarray:
-        """int64 [episodes]: bytes of each, about."""
+        """int64 [episodes]: approximate bytes of each."""
 
     @abstractmethod
     def steps(self) -> np.ndarray:
-        """int32 [episodes]: native frames of each; -1 where it is not known before it is read."""
+        """int32 [episodes]: native frames of each; -1 if unknown until it is read."""
 
     @abstractmethod
     def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> AbstractContextManager[OpenEpisode]:
         """Episode `i` in bounded memory, however long: see `OpenEpisode`.
 
         Keys are relative to a step: `observation/image_0`, `action`, `action/arm`, `action[:7]`.
-        Raises ConfigError for keys that there are not, EpisodeError for contents that cannot be used.
+        Raises ConfigError for unknown keys, EpisodeError for unusable contents.
         """
 
     @functools.cached_property
     def ids(self) -> np.ndarray:
-        """uint64 per episode of `runs`: its name as a number, what splits and subsets hash."""
+        """uint64 per episode of `runs`: its name as a number, which splits and subsets hash."""
         return episode_ids(self.runs)
 
     @abstractmethod
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         """Fields of episode `i` by flat key, with all its cameras: numbers as arrays, texts as lists of
-        bytes, images as sequences of `Fetched`. What the episode lacks is absent. Raises EpisodeError."""
+        bytes, images as sequences of `SourceFrame`. What the episode lacks is absent. Raises EpisodeError."""
 
     @property
     def hz(self) -> float | None:
-        """The native rate, where the source says it."""
+        """The native rate; None if the source does not say it."""
         return None
 
     def save_steps(self) -> None:
@@ -182,7 +182,7 @@ class EpisodeSource(ABC):
     ) -> list[np.ndarray]:
         """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers.
 
-        Images may come smaller, but not smaller than `at_least` pixels, where that saves time.
+        Images may be decoded at a reduced size, with no side shorter than `at_least` pixels, where that saves time.
         """
         with self.open_episode(i, image_key, ()) as episode:
             chosen = choose(episode.steps)
@@ -225,7 +225,7 @@ class EpisodeSource(ABC):
                 )
 
     def skip(self, i: int, error: EpisodeError) -> None:
-        """Counts the unusable episode `i` once, whichever of its frames are met; raises `error` under the policy
+        """Counts the unusable episode `i`, only once however often it is read; raises `error` under the policy
         corrupt='raise'."""
         if self.corrupt == "raise":
             raise error
@@ -244,7 +244,7 @@ class EpisodeSource(ABC):
             )
 
 
-def decode_frame(frame: Fetched, unusable: Callable[[str], Exception], at_least: int = 0) -> np.ndarray:
+def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception], at_least: int = 0) -> np.ndarray:
     """uint8 [H, W, 3] of a frame as its source holds it; `at_least` as in `decode_image`.
 
     Raises what `unusable` makes of a reason, for bytes that are no image.
@@ -264,9 +264,9 @@ def join_actions(
     steps: int,
     unusable: Callable[[str], EpisodeError],
 ) -> np.ndarray:
-    """float32 [steps, A]: the fields `keys` (flat, perhaps sliced) of a record, side by side.
+    """float32 [steps, A]: the fields `keys` of a record (flat, possibly sliced), concatenated.
 
-    Raises what `unusable` makes of a reason, for fields of another length and taken values that are not finite.
+    Raises what `unusable` makes of a reason, for fields of another length and values that are not finite.
     """
     columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
     for key in keys:

@@ -1,7 +1,6 @@
-"""Frames of a video at given times, and frames as the bytes that a record holds.
+"""Frames of a video at given times, and the encoding and resizing of stored frames.
 
-Owns decoding through PyAV (extra `convert`) and the size of what is stored. Times are seconds
-since the video's first frame.
+Owns decoding with PyAV (extra `convert`). Times are seconds since the video's first frame.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from data_pipelines.sources.rlds.writer import encode_jpeg
 
 ADVICE = "Download the file again, or leave it out with --skip-damaged (when tokenising, corrupt='skip')."
 
-FAR = 2.0
-"""Seconds from which on a jump forward is a seek: frames in between are decoded otherwise."""
+SEEK_SECONDS = 2.0
+"""A jump forward by more seconds than this seeks; for a shorter one the frames in between are decoded."""
 
 
 def shrink(image: np.ndarray, short_side: int | None) -> np.ndarray:
@@ -38,7 +37,7 @@ def shrink(image: np.ndarray, short_side: int | None) -> np.ndarray:
 
 
 def stored_jpeg(data: bytes, short_side: int | None, where: str) -> bytes:
-    """An encoded image as it is stored: its own bytes where they are a JPEG small enough.
+    """The bytes to store of an encoded image: unchanged if it is a JPEG that is small enough, otherwise a new JPEG.
 
     Raises UnitError, naming `where`, if the bytes are no image.
     """
@@ -66,8 +65,8 @@ class Video:
         self.max_frames = path.stat().st_size // MIN_FRAME_BYTES
         self.rate = float(self._stream.average_rate or self._stream.guessed_rate or 0)
         self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
-        self._coming: Iterator[tuple[float, Any]] | None = None
-        self._around: tuple[Any, Any] = None, None  # the last frame before a time, the first from it on
+        self._frames: Iterator[tuple[float, Any]] | None = None
+        self._neighbours: tuple[Any, Any] = None, None  # last frame before the time asked for, first frame from it on
         self._shown, self._pixels = None, None
 
     def frames(self, times: Sequence[float]) -> Iterator[np.ndarray]:
@@ -75,18 +74,22 @@ class Video:
         return map(self.at, times)
 
     def at(self, time: float) -> np.ndarray:
-        """The frame nearest to `time`, uint8 [H, W, 3], RGB; in ascending order each is decoded once.
+        """The frame nearest to `time`, uint8 [H, W, 3], RGB. With ascending times each frame is decoded once.
 
-        Raises UnitError where none lies within half a frame's time.
+        Raises UnitError if none is within half a frame interval.
         """
         near = 0.5 / self.rate + 1e-4
-        before, after = self._around
-        if self._coming is None or time < (before or after or (np.inf,))[0] or (after and time > after[0] + FAR):
-            self._coming = self._from(time)
-            before, after = None, next(self._coming, None)
+        before, after = self._neighbours
+        if (
+            self._frames is None
+            or time < (before or after or (np.inf,))[0]
+            or (after and time > after[0] + SEEK_SECONDS)
+        ):
+            self._frames = self._from(time)
+            before, after = None, next(self._frames, None)
         while after is not None and after[0] < time:
-            before, after = after, next(self._coming, None)
-        self._around = before, after
+            before, after = after, next(self._frames, None)
+        self._neighbours = before, after
         nearest = min((f for f in (before, after) if f is not None), key=lambda f: abs(f[0] - time), default=None)
         if nearest is None or abs(nearest[0] - time) > near:
             found = "the video has no frame" if nearest is None else f"the nearest is at {nearest[0]:.4f} s"
@@ -99,7 +102,7 @@ class Video:
         """(time, frame) in order, beginning at or before `time`."""
         base = float(self._stream.time_base)
         for target in (self._start + int(max(time - 0.5 / self.rate, 0) / base), None):
-            # Where the index of a file misleads, decode it from its beginning.
+            # If the file's index leads too far, decode from the beginning.
             frames = self._decode(base, self._start if target is None else target)
             first = next(frames, None)
             if first is not None and (first[0] <= time or target is None):
@@ -122,7 +125,7 @@ class Video:
 
 
 def _is_io_error(error: Exception) -> bool:
-    """As `is_io_error`; where a file may not be read the system says EACCES, and FFmpeg says EPERM of its bytes."""
+    """As `is_io_error`, but without EPERM: FFmpeg reports damaged contents so; a denied read is EACCES."""
     return is_io_error(error) and getattr(error, "errno", None) != errno.EPERM
 
 

@@ -67,11 +67,11 @@ def import_tokens(
     folders = {"train": open_folder(train), "val": open_folder(val)}
     plan = _plan(folders, name, hz, patch, frame_step, tokenizer)
     decode = None if tokenizer is None else tokenizer.decode
-    places = [(split, e) for split, folder in folders.items() for e in range(len(folder))]
+    episodes = [(split, e) for split, folder in folders.items() for e in range(len(folder))]
 
     def make(part: Part) -> Iterator[PartItem]:
         for number in part.episodes:
-            split, episode = places[number]
+            split, episode = episodes[number]
             yield split, _episode(folders[split], episode, number, plan, patch, decode if split == "val" else None)
 
     frame_bytes = folders["train"].video[0].nbytes

@@ -1,13 +1,12 @@
-"""One part of a dataset in the token store: its files, and the facts that say it is complete.
+"""One part of a dataset in the token store: its files, and the facts file that marks it as complete.
 
-Owns how a part is written, recognised and described. A part holds the episodes of a range of
-the source; which ranges there are depends on the source alone, so that any number of
-processes, killed and started again, make the same files.
+Owns how a part is written, validated and described. A part holds a range of the source's episodes. The ranges depend
+on the source alone, so that any number of processes, killed and restarted at will, make the same files.
 
     <dataset>/train-00003-of-00120.array_record   its training episodes, if any
     <dataset>/train-00003-of-00120.moments.npy    statistics of the actions of each of these
     <dataset>/val-00003-of-00120.array_record     its held-out episodes, if any
-    <dataset>/parts/00003.json                    its facts, in place only after the others
+    <dataset>/parts/00003.json                    its facts, written after the other files
 """
 
 from __future__ import annotations
@@ -76,10 +75,10 @@ class PartFacts:
 def write_part(
     directory: Path, part: Part, items: Iterable[PartItem], scratch: Path, action_dim: int, keep_frames: set[str]
 ) -> PartFacts:
-    """Writes `items` as the part of the dataset in `directory`, by way of the directory `scratch`.
+    """Writes `items` as a part of the dataset in `directory`, atomically; an existing part is replaced.
 
-    A part is there as a whole or not at all; one that is there is replaced. `keep_frames`:
-    splits whose records hold frames. Raises OSError.
+    `scratch` is a directory for temporary files on the same disk, `keep_frames` the splits whose records hold
+    frames. Raises OSError.
     """
     writers = {
         split: _SplitWriter(scratch / part_name(split, part.number, part.count), split in keep_frames)
@@ -109,11 +108,11 @@ def write_part(
     new_facts.write_text(json.dumps(to_dict(facts)))
     sync(new_facts)
     for split, values in zip(SPLITS, splits, strict=True):
-        place = directory / part_name(split, part.number, part.count)
+        path = directory / part_name(split, part.number, part.count)
         if values.size:
-            os.replace(scratch / place.name, place)
+            os.replace(scratch / path.name, path)
         else:
-            place.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
     sync(directory)
     os.replace(new_facts, _facts_path(directory, part))
     sync(directory / FACTS)
@@ -121,17 +120,17 @@ def write_part(
 
 
 def read_part(directory: Path, part: Part) -> PartFacts | None:
-    """The facts of a finished part; None if it is not there, or not as it was written.
+    """The facts of a finished part; None if it is missing, or its files do not have the sizes they were written with.
 
-    Files are judged by their size: that finds what a crash or a full disk leaves behind.
+    Sizes suffice to detect what a crash or a full disk leaves behind.
     """
     try:
         facts = from_dict(PartFacts, json.loads(_facts_path(directory, part).read_text()))
     except (OSError, ValueError, AttributeError, TypeError, ConfigError):
         return None
     for split in SPLITS:
-        place = directory / part_name(split, part.number, part.count)
-        size = place.stat().st_size if place.is_file() else 0
+        path = directory / part_name(split, part.number, part.count)
+        size = path.stat().st_size if path.is_file() else 0
         if size != getattr(facts, split).size:
             return None
     if facts.train.episodes and not _has_moments(directory, part, len(facts.train.episodes)):
@@ -151,7 +150,7 @@ def _facts_path(directory: Path, part: Part) -> Path:
 
 
 class _SplitWriter:
-    """Appends episodes to one ArrayRecord file, made with the first, and keeps its facts."""
+    """Appends episodes to one ArrayRecord file, created for the first one, and collects its facts."""
 
     def __init__(self, path: Path, keep_frames: bool):
         # Tokens do not compress; frames do. One record per group gives true random access.

@@ -1,7 +1,7 @@
-"""Episodes read and their frames decoded ahead of their use, in order and in bounded memory.
+"""Prefetching: episodes are read and their frames decoded ahead of use, in order and in bounded memory.
 
-Owns the threads. One of them opens records and cuts frames out of them, others decode; what is
-under way is bounded in bytes, so that neither a long episode nor a large image is a problem.
+Owns the threads: some open records, one extracts encoded frames from them, others decode. The prefetched frames are
+bounded in bytes, so that neither long episodes nor large images exhaust the memory.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.sources.source import Fetched, OpenEpisode
+from data_pipelines.sources.source import OpenEpisode, SourceFrame
 
-AHEAD = 128 * 2**20
-"""Bytes of frames that are decoded, or wait for it, ahead of their use."""
+PREFETCH_BYTES = 128 * 2**20
+"""Bytes of prefetched frames, decoded or waiting to be."""
 
-OPEN_AHEAD = 4
-"""Records opened ahead of those whose frames are cut out. Each holds `tfrecord.WHOLE` bytes at most."""
+PREFETCH_RECORDS = 4
+"""Records opened in advance. Each holds at most `tfrecord.MAX_WHOLE_READ` bytes."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Begin:
 
 @dataclass(frozen=True)
 class End:
-    """All frames of episode `index` have come; or it cannot be used, and those that came are void."""
+    """All frames of episode `index` were given; or it is unusable, and those that were given must be discarded."""
 
     index: int
     error: EpisodeError | None = None
@@ -58,8 +58,8 @@ def frames_ahead(
 ) -> Iterator[Item]:
     """The frames of `episodes`, one after the other: Begin, `fit(frame)` of every frame_step-th, End.
 
-    `fit` gives arrays of `frame_bytes`. What it or the decoding raises as EpisodeError ends that
-    episode alone; any other error is raised here. Close the iterator to stop the threads.
+    `fit` gives arrays of `frame_bytes`. An EpisodeError of `fit` or of decoding ends that episode only; any other
+    error is raised here. Close the iterator to stop the threads.
     """
     reader = _Reader(episodes, open_episode, fit, frame_bytes, frame_step, threads)
     try:
@@ -69,11 +69,11 @@ def frames_ahead(
 
 
 class _Closed(Exception):
-    """The frames are no longer wanted."""
+    """The iterator was closed."""
 
 
 class _Budget:
-    """Bytes that one thread takes and another gives back."""
+    """A bounded number of bytes, taken by one thread and given back by another."""
 
     def __init__(self, limit: int):
         self._limit, self._used, self._closed = limit, 0, False
@@ -110,16 +110,16 @@ class _Reader:
     ):
         self._episodes, self._open_episode, self._fit = episodes, open_episode, fit
         self._frame_bytes, self._step = frame_bytes, frame_step
-        self._budget = _Budget(AHEAD)
+        self._budget = _Budget(PREFETCH_BYTES)
         # Begin, End, a frame as (future, its cost), an error to raise, or None at the end.
         self._out: queue.SimpleQueue = queue.SimpleQueue()
         self._decoders = ThreadPoolExecutor(threads, "decode")
-        self._openers = ThreadPoolExecutor(min(OPEN_AHEAD, threads), "open")
+        self._openers = ThreadPoolExecutor(min(PREFETCH_RECORDS, threads), "open")
         self._thread = threading.Thread(target=self._run, name="read", daemon=True)
         self._thread.start()
 
     def items(self) -> Iterator[Item]:
-        failed = None  # the episode whose remaining frames are of no use
+        failed = None  # the unusable episode whose remaining frames are discarded
         begun = -1
         while (item := self._out.get()) is not None:
             if isinstance(item, BaseException):
@@ -155,7 +155,7 @@ class _Reader:
         try:
             waiting = iter(self._episodes)
             for index in self._episodes:
-                while len(opened) < OPEN_AHEAD and (following := next(waiting, None)) is not None:
+                while len(opened) < PREFETCH_RECORDS and (following := next(waiting, None)) is not None:
                     opened.append(self._openers.submit(self._enter, following))
                 self._cut(index, opened.popleft())
             self._out.put(None)
@@ -193,5 +193,5 @@ class _Reader:
         finally:
             self._leave(opening)
 
-    def _decode(self, episode: OpenEpisode, step: int, fetched: Fetched) -> np.ndarray:
+    def _decode(self, episode: OpenEpisode, step: int, fetched: SourceFrame) -> np.ndarray:
         return self._fit(episode.decode(step, fetched))

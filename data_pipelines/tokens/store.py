@@ -141,7 +141,7 @@ class TokenStore:
         for name in names:
             manifest = self.manifest(name)
             manifest.stride_at(rate)  # raises, if it is not stored
-            manifest.spec.check_like(table.entries[table.index(name)], rate)
+            manifest.spec.check_compatible(table.entries[table.index(name)], rate)
 
     def _start(self) -> None:
         self._ends = {

@@ -93,7 +93,7 @@ def tokenize_dataset(
     )  # fmt: skip
     work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8))
     skipped = [
-        SkippedEpisodes(_without_place(reason, source), episodes=count)
+        SkippedEpisodes(_without_location(reason, source), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
@@ -125,7 +125,7 @@ def plan_dataset(
     rate: float | None = FRAME_RATE,
 ) -> Manifest:
     """The manifest of a dataset before it is made. Raises ConfigError for settings that cannot work."""
-    frame_step = stored_step(spec, frame_step, rate)
+    frame_step = resolve_frame_step(spec, frame_step, rate)
     return Manifest(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
@@ -141,9 +141,9 @@ def plan_dataset(
     )
 
 
-def stored_step(spec: DatasetSpec, frame_step: int | None, rate: float | None = FRAME_RATE) -> int:
-    """Every how many native frames one is stored: `frame_step`, or the stride at `rate` Hz (None: native) if it is
-    None. Raises ConfigError for a step that does not divide that stride."""
+def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | None = FRAME_RATE) -> int:
+    """Native frames per stored frame: `frame_step` or, if that is None, the stride at `rate` Hz (None: native). Raises
+    ConfigError for a step that does not divide that stride."""
     stride = spec.stride_at(rate)
     frame_step = stride if frame_step is None else frame_step
     require(
@@ -168,8 +168,8 @@ def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
     )
 
 
-def _without_place(reason: str, source: EpisodeSource) -> str:
-    """A message that is the same wherever the source lies, as a directory or as one file."""
+def _without_location(reason: str, source: EpisodeSource) -> str:
+    """The message without the source's location, so that manifests do not depend on it."""
     place, name = str(source.location), source.location.name
     inside = reason.replace(f"{place}/", "")
     return inside.replace(place, name) if name else inside  # "." has none
@@ -181,7 +181,7 @@ class _Pending:
 
     begin: Begin
     keep: bool
-    came: int = 0  # frames put into the tokenizer's input
+    frame_count: int = 0  # frames put into the tokenizer's input
     frames: list[np.ndarray] = field(default_factory=list)
     end: End | None = None  # None: more frames are to come
 
@@ -219,7 +219,7 @@ class _Work:
                         pending.append(_Pending(Begin(item.index, np.zeros((0, 0)), None), False))
                     pending[-1].end = item
                 else:
-                    pending[-1].came += 1
+                    pending[-1].frame_count += 1
                     if pending[-1].keep:
                         pending[-1].frames.append(item)
                     encoder.put(item)
@@ -235,9 +235,9 @@ class _Work:
 
     def _finished(self, pending: deque[_Pending], encoder: Encoder) -> Iterator[PartItem]:
         """Takes the episodes from `pending` that have all their tokens."""
-        while pending and pending[0].end is not None and encoder.ready >= pending[0].came:
+        while pending and pending[0].end is not None and encoder.ready >= pending[0].frame_count:
             episode = pending.popleft()
-            tokens = encoder.take(episode.came)
+            tokens = encoder.take(episode.frame_count)
             if episode.end.error is not None:
                 yield self._skip(episode.end.error)
                 continue
@@ -258,5 +258,5 @@ class _Work:
     def _skip(self, error: EpisodeError) -> SkippedEpisodes:
         if self._source.corrupt == "raise":
             raise error
-        place = (error.path.name, error.offset) if error.path is not None else ("", -1)
-        return SkippedEpisodes(_without_place(str(error), self._source), *place)
+        file, offset = (error.path.name, error.offset) if error.path is not None else ("", -1)
+        return SkippedEpisodes(_without_location(str(error), self._source), file, offset)

@@ -36,7 +36,7 @@ def setting_of(source: Path, trained: Run, arguments: StudyArguments) -> Setting
         "settings of the model: they are taken from there",
     )
     for name in known_datasets(trained, setting):
-        get_spec(name).check_like(trained.table.entries[trained.table.index(name)], setting.study.rate)
+        get_spec(name).check_compatible(trained.table.entries[trained.table.index(name)], setting.study.rate)
     return setting
 
 

@@ -59,10 +59,10 @@ def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
 def check_sources(study: Study, sources: Sequence[Source]) -> None:
     """Opens every dataset before anything is made of one, which may take hours. Raises ConfigError and DataError for
     what tokenising would refuse of it without reading an episode."""
-    from data_pipelines.tokens.tokenize_job import stored_step
+    from data_pipelines.tokens.tokenize_job import resolve_frame_step
 
     for spec, path in sources:
-        stored_step(spec, study.store.frame_step, study.rate)
+        resolve_frame_step(spec, study.store.frame_step, study.rate)
         opened = open_source((spec, path), study.store)
         opened.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 

@@ -1,7 +1,7 @@
-"""ArrayRecord files as tfds writes them under `--file_format=array_record`: records by their number.
+"""ArrayRecord files as tfds writes them with `--file_format=array_record`: records by their number.
 
-Owns the difference to TFRecord files, with the same two functions as `tfrecord`. A record's place is
-its number; its bytes are compressed and verified by the library, and their number is not known before.
+Owns the differences from TFRecord files, with the same two functions as `tfrecord`. A record's offset is its number;
+the library decompresses and verifies its bytes, and their length is not known before they are read.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 
-ENDS = 65536
-"""Bytes at each end of a file that stand for its contents: the last hold the place of every record."""
+SAMPLED_BYTES = 65536
+"""Bytes at each end of a file that its checksum covers. The last bytes hold the offsets of all records."""
 
 MAX_OPEN_FILES = 128
 """Files that are kept open between reads."""
 
 
 def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
-    """The number of each record, and for all of them the file's mean length and one checksum of its ends.
+    """The index of a file: the number of each record, and for all of them the mean length and a checksum of the ends.
 
     Raises ConfigError for a remote file, DataError for one that is missing or cannot be read.
     """
@@ -42,7 +42,7 @@ def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
         raise ConfigError(f"{path}: ArrayRecord files can be read only from a disk. Copy the dataset to a disk.")
     with open_random_access(path) as file:
         size = file.size
-        ends = file.read(0, ENDS) + file.read(max(size - ENDS, 0), ENDS)
+        ends = file.read(0, SAMPLED_BYTES) + file.read(max(size - SAMPLED_BYTES, 0), SAMPLED_BYTES)
     try:
         records = _reader(path).num_records() if size else 0
     except RuntimeError as error:
@@ -55,7 +55,7 @@ def open_record(path: Location, offset: int, length: int) -> Iterator[bytes]:
     """Record number `offset`, for the time of a `with`, as `tfrecord.open_record`. `length` is not used."""
     del length
     try:
-        payload = _reader(path).read(offset, offset + 1)[0]  # of a list it would go through all records
+        payload = _reader(path).read(offset, offset + 1)[0]  # given a list, the library would go through all records
     except (RuntimeError, IndexError) as error:
         raise _damage(path, offset, error) from error
     yield payload
@@ -89,7 +89,7 @@ def _index(path: Location, records: int, size: int, ends: bytes) -> ShardIndex:
 
 
 def _damage(path: Location, number: int, error: Exception) -> CorruptRecordError:
-    """What the library says of bytes; what the system says of a disk is raised."""
+    """The library's error as damage; an error of the disk is raised as UnreachableError."""
     if any(word in str(error) for word in ("Input/output error", "Stale", "timed out")):
         raise UnreachableError(f"{path}: cannot be read ({error}). Run the same command again.") from error
     return CorruptRecordError(path, number, f"the record with this number cannot be read ({error})")

@@ -149,7 +149,7 @@ class RldsDataset(EpisodeSource):
         known = self._span_cache.get((i, key))
         if known is not None:
             chosen = choose(len(known))
-            path, offset, _ = self._place(i)
+            path, offset, _ = self._locate(i)
             parts = read_parts(self._files.get(path), path, offset, known[chosen].tolist())
         else:
             self.check_keys(image_key, ())
@@ -170,7 +170,7 @@ class RldsDataset(EpisodeSource):
 
     @contextmanager
     def _open(self, i: int, keys: Sequence[str] | None, lazy: bool = True) -> Iterator[dict[str, Feature]]:
-        path, offset, length = self._place(i)
+        path, offset, length = self._locate(i)
         opened = array_record.open_record if self._in_array_records else open_record
         with opened(path, offset, length) as payload:
             yield parse_record(payload, path, offset, keys, lazy)
@@ -204,15 +204,15 @@ class RldsDataset(EpisodeSource):
         others = listing([split.name for split in splits if sum(split.shard_lengths)])
         return f"by dataset_info.json it is empty; splits with episodes: {others or 'none'}."
 
-    def _place(self, i: int) -> tuple[Location, int, int]:
+    def _locate(self, i: int) -> tuple[Location, int, int]:
         if not 0 <= i < len(self):
             raise IndexError(f"{self.name}: episode {i} of {len(self)}")
-        shard, _ = self._index.place(i)
+        shard, _ = self._index.locate(i)
         return self._paths[shard], int(self._index.offsets[i]), int(self._index.lengths[i])
 
     def _unusable(self, i: int, what: str) -> EpisodeError:
-        path, offset, _ = self._place(i)
-        shard, place = self._index.place(i)
+        path, offset, _ = self._locate(i)
+        shard, place = self._index.locate(i)
         number = sum(run.count for run in self.runs[:shard]) + place
         where = f"{self.name}, episode {number} ({path.name}, byte {offset})"
         return EpisodeError(f"{where}: {what}").at(path, offset)

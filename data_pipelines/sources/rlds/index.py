@@ -93,7 +93,7 @@ class RecordIndex:
         """uint32 [records]: of the payload, as stored."""
         return self._columns["checksums"]
 
-    def place(self, i: int) -> tuple[int, int]:
+    def locate(self, i: int) -> tuple[int, int]:
         """(shard, place in it) of record `i`."""
         shard = int(np.searchsorted(self.ends, i, side="right"))
         return shard, i - (int(self.ends[shard - 1]) if shard else 0)

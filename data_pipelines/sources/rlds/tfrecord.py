@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 HEADER = 12  # bytes: length and its checksum
 FOOTER = 4  # bytes: checksum of the payload
 
-WHOLE = 16 * 2**20
+MAX_WHOLE_READ = 16 * 2**20
 """Records up to this many bytes are read as a whole, larger ones on access."""
 
 CHUNK = 4 * 2**20
@@ -158,12 +158,12 @@ def read_parts(file: RandomAccessFile, path: Location, offset: int, spans: Itera
 def open_record(path: str | Location, offset: int, length: int) -> Iterator[bytes | FileView]:
     """The verified payload of a record, for the time of a `with`, in bounded memory.
 
-    Up to WHOLE bytes it is read at once. A larger payload is verified in pieces and given as a view that reads
+    Up to MAX_WHOLE_READ bytes it is read at once. A larger payload is verified in pieces and given as a view that reads
     on access; from a remote store it passes through an unnamed temporary file, so that every byte is fetched
     once. Raises CorruptRecordError as `read_record` does.
     """
     path = locate(path)
-    if length <= WHOLE:
+    if length <= MAX_WHOLE_READ:
         yield read_record(path, offset, length)
         return
     with open_random_access(path) as file:

@@ -63,7 +63,7 @@ def read_back(directory: Path, image_key: str):
     assert builder.info.splits["train"].num_examples == len(dataset)
     from data_pipelines.sources.rlds.tfrecord import read_record
 
-    path, offset, length = dataset._place(0)
+    path, offset, length = dataset._locate(0)
     steps = list(builder.info.features.deserialize_example_np(read_record(path, offset, length))["steps"])
     np.testing.assert_array_equal([s["action"] for s in steps], episodes[0].actions)
     picture = steps[-1]

@@ -242,7 +242,7 @@ def as_array_records(directory):
         name = f"{source.name}-train.array_record-{k:05d}-of-{len(counts):05d}"
         writer = ArrayRecordWriter(str(out / name), "group_size:1")
         for _ in range(count):
-            writer.write(read_record(*source._place(i)))
+            writer.write(read_record(*source._locate(i)))
             i += 1
         writer.close()
     return out

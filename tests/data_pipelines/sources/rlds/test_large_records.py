@@ -20,7 +20,7 @@ SPEC = make_spec(hz=4)
 KEYS = (SPEC.image_key, SPEC.action_keys)
 
 
-GROWTH = 200  # MB: read_ahead.AHEAD, and half as much again for copies
+GROWTH = 200  # MB: read_ahead.PREFETCH_BYTES, and half as much again for copies
 
 
 class Bytes:
@@ -54,14 +54,14 @@ def test_features_nobody_asks_for_are_not_read():
 
 @pytest.fixture
 def directory(tmp_path, monkeypatch):
-    monkeypatch.setattr(tfrecord, "WHOLE", 100)
+    monkeypatch.setattr(tfrecord, "MAX_WHOLE_READ", 100)
     monkeypatch.setattr(tfrecord, "CHUNK", 256)
     return write_rlds(tmp_path, SPEC, [5, 6, 7])
 
 
 def test_episode_is_the_same_in_pieces(directory, monkeypatch):
     pieces = RldsDataset(directory).episode(2, *KEYS)
-    monkeypatch.setattr(tfrecord, "WHOLE", 2**20)
+    monkeypatch.setattr(tfrecord, "MAX_WHOLE_READ", 2**20)
     whole = RldsDataset(directory).episode(2, *KEYS)
     assert np.array_equal(pieces.images, whole.images) and np.array_equal(pieces.actions, whole.actions)
 
@@ -90,7 +90,7 @@ def test_frames_under_way_are_bounded_in_bytes(tmp_path, monkeypatch):
 
     lengths = [200] * 3
     dataset = RldsDataset(write_rlds(tmp_path, SPEC, lengths, change=change))
-    monkeypatch.setattr(read_ahead, "AHEAD", 20 * len(frame))
+    monkeypatch.setattr(read_ahead, "PREFETCH_BYTES", 20 * len(frame))
     cut = []
 
     def open_episode(i):

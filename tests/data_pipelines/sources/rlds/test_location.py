@@ -70,7 +70,7 @@ def test_index_of_a_remote_shard_reads_a_block_at_a_time(remote, monkeypatch):
 
 
 def test_large_remote_record_is_fetched_once_and_in_pieces(remote, monkeypatch):
-    monkeypatch.setattr(tfrecord, "WHOLE", 100)
+    monkeypatch.setattr(tfrecord, "MAX_WHOLE_READ", 100)
     monkeypatch.setattr(tfrecord, "CHUNK", 256)
     dataset = RldsDataset(remote)
     expected = dataset.record(4)
@@ -141,7 +141,7 @@ def test_a_store_that_cannot_be_asked_is_not_said_to_have_no_dataset(remote, mon
 
 @pytest.mark.parametrize("whole", [0, 2**20])
 def test_local_record_is_the_same_at_once_and_in_pieces(local, monkeypatch, whole):
-    monkeypatch.setattr(tfrecord, "WHOLE", whole)
+    monkeypatch.setattr(tfrecord, "MAX_WHOLE_READ", whole)
     index = index_shard(sorted(local.glob("*.tfrecord*"))[0])
     place = (index.path, int(index.offsets[1]), int(index.lengths[1]))
     with open_record(*place) as payload:
