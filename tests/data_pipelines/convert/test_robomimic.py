@@ -58,7 +58,8 @@ def test_pictures_of_another_name_are_no_low_dimensional_file(tmp_path):
 
     path = write_robomimic(tmp_path / "libero.hdf5", change=rename)
     with pytest.raises(
-        DataError, match=r"demo_9/obs has no \*_image.* but agentview_rgb, robot0_eye_in_hand_rgb: rename"
+        DataError,
+        match=r"demo_9/obs has no \*_image.* but agentview_rgb, robot0_eye_in_hand_rgb: in a copy of the file, rename",
     ):
         RobomimicSource(path)
 

@@ -137,7 +137,7 @@ def test_missing_shard(directory):
 
 def test_empty_shard(directory):
     shards(directory)[1].write_bytes(b"")
-    with pytest.raises(DataError, match=r"00001-of-00002: 0 records.*says 3: the file is empty"):
+    with pytest.raises(DataError, match=r"00001-of-00002: it has 0 records.*says 3: the file is empty"):
         RldsDataset(directory)
 
 
@@ -147,7 +147,7 @@ def test_count_that_contradicts_dataset_info(directory, stated):
     info = json.loads(path.read_text())
     info["splits"][0]["shardLengths"][0] = stated
     path.write_text(json.dumps(info))
-    with pytest.raises(DataError, match=rf"00000-of-00002: 3 records, but dataset_info.json says {stated}"):
+    with pytest.raises(DataError, match=rf"00000-of-00002: it has 3 records, but dataset_info.json says {stated}"):
         RldsDataset(directory)
 
 
