@@ -9,7 +9,7 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.generation import decoding
-from hma_jax.generation.decoding import Frame, masked_counts, unmask
+from hma_jax.generation.decoding import Frame, masked_counts, sample_tokens, unmask
 from tests.tiny import DIFFUSION, model_config
 
 
@@ -55,6 +55,43 @@ def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monke
     frame = decoding.decode_frame(SimpleNamespace(config=config), predictions, lambda _: predictions, keys, decode)
     assert min(drawn) == 1 and sum(drawn) == tokens
     np.testing.assert_array_equal(np.sort(frame[..., 0]), [np.repeat(np.arange(1.0, len(drawn) + 1), drawn)] * 2)
+
+
+@pytest.mark.parametrize(("resample", "sizes"), [(False, [2, 2]), (True, [2, 4])])
+def test_every_look_samples_all_that_is_no_longer_masked_where_that_is_asked_for(monkeypatch, resample, sizes):
+    drawn, config = [], model_config(tokens=4, diffusion=DIFFUSION)
+    monkeypatch.setattr(
+        decoding,
+        "denoise",
+        lambda model, z, *_: drawn.append(z.shape[1]) or jnp.zeros((*z.shape[:2], config.frame_shape[1])),
+    )
+    predictions, keys = jnp.zeros((1, 4, 3)), jax.random.split(jax.random.key(0), 1)
+    decode = DecodeConfig(2, sampler=SamplerConfig(steps=3), resample=resample)
+    decoding.decode_frame(SimpleNamespace(config=config), predictions, lambda _: predictions, keys, decode)
+    assert drawn == sizes
+
+
+def test_every_look_draws_with_random_numbers_of_its_own(monkeypatch):
+    seen, config = [], model_config(tokens=4)
+
+    def sample(head, predictions, keys, *_):
+        seen.append(tuple(jax.random.key_data(keys).ravel().tolist()))
+        return jnp.zeros((1, 4), jnp.int32), jnp.zeros((1, 4))
+
+    monkeypatch.setattr(decoding, "sample_tokens", sample)
+    model, predictions = SimpleNamespace(config=config, frame_head=None), jnp.zeros((1, 4, 2))
+    with jax.disable_jit():  # a loop of looks is traced once
+        keys = jax.random.split(jax.random.key(0), 1)
+        decoding.decode_frame(model, predictions, lambda _: predictions, keys, DecodeConfig(3))
+    assert len(seen) == len(set(seen)) == 3
+
+
+def test_the_confidence_in_a_token_is_the_product_of_its_factors_probabilities():
+    logits = jnp.log(jnp.array([[[[0.9, 0.1], [0.4, 0.6]], [[0.2, 0.8], [0.5, 0.5]]]]))  # of two tokens, two factors
+    head = SimpleNamespace(shape=lambda x: x.shape, decode_factors=lambda x, choose: (choose(0, x), x))
+    ids, confidence = sample_tokens(head, logits, jax.random.split(jax.random.key(0), 1), temperature=0)
+    assert ids.tolist() == [[2, 1]]
+    np.testing.assert_allclose(confidence, [[0.9 * 0.6, 0.8 * 0.5]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

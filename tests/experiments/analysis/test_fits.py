@@ -1,11 +1,14 @@
 """Scaling fits on curves with known coefficients: values, intervals, outliers, and what cannot be fitted."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from experiments.analysis import powerlaw
-from experiments.analysis.fits import fit_power, weight_of
+from experiments.analysis.fits import fit_power, interval, weight_of
 from tests.experiments.analysis.curves import measured, only, power, scaled, sizes
 
 
@@ -32,6 +35,8 @@ def test_both_axes_at_once(rng):
     assert not fit.refused
     assert (fit["alpha"].value, fit["beta"].value) == (pytest.approx(0.6, abs=0.05), pytest.approx(0.35, abs=0.03))
     assert all(c.low <= c.value <= c.high for c in fit.coefficients)
+    e, n, alpha, d, beta = (fit[name].value for name in ("E", "A", "alpha", "B", "beta"))
+    np.testing.assert_allclose(fit.at(x), e + n * x[:, 0] ** -alpha + d * x[:, 1] ** -beta, rtol=1e-6)
 
 
 def test_about_nine_of_ten_intervals_hold_the_truth():
@@ -90,6 +95,7 @@ def test_a_noisy_point_weighs_less(rng):
     weight = weight_of(noise)
     np.testing.assert_allclose(weight * noise, weight[0] * noise[0])
     assert np.log(weight).mean() == pytest.approx(0)  # the Huber threshold keeps its meaning
+    np.testing.assert_array_equal(weight_of(np.array([0.0, 0.1])), 1)  # a point whose seeds agree would outweigh all
     fit = fit_power(points, 20)
     assert fit["alpha"].value == pytest.approx(0.5, abs=0.1)
     np.testing.assert_array_equal(fit.noise, noise)
@@ -106,6 +112,22 @@ def test_a_noisy_point_weighs_less(rng):
 def test_what_cannot_be_fitted_is_refused(rng, x, loss, reason):
     fit = fit_power(measured(x, power(x, 1.5, loss), 0.003, 3, rng), draws=20)
     assert reason in fit.refused and not fit.coefficients
+
+
+def test_a_position_of_zero_or_a_loss_below_it_is_refused(rng):
+    points = measured(sizes(5), power(sizes(5), 1.5, (1.0, 0.5)), 1e-3, 3, rng)
+    zero = fit_power(replace(points, x=points.x - points.x.min()), draws=5)
+    assert zero.refused == "trunk parameters has to be positive, got 0"
+    assert "the loss has to be positive, got -" in fit_power(replace(points, value=points.value - 2), draws=5).refused
+
+
+def test_a_fall_along_several_lines_is_known_the_better_for_it(rng):
+    """Seeds scatter by 3 %: a line between two positions of three seeds is known to 3 % sqrt(2 / 3), five to 1.1 %."""
+    x = np.array([(n, d) for n in np.geomspace(1e4, 3e5, 5) for d in np.geomspace(1e3, 1e5, 5)])
+    fit = fit_power(measured(x, power(x, 1.2, (0.0, 0.5), (0.8, 0.5)), 0.03, 3, rng), draws=5)
+    assert "does not fall with trunk parameters" in fit.refused
+    error = float(re.search(r"a standard error over seeds of ([\d.]+) %", fit.refused)[1])
+    assert error == pytest.approx(1.1, abs=0.35)
 
 
 SIZES = np.geomspace(1e4, 3e5, 5)
@@ -145,6 +167,27 @@ def test_points_too_close_together_are_doubtful(rng):
     x = sizes(4, span=2.0)
     fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 0.01, 3, rng), draws=100)
     assert any("anything between" in doubt for doubt in fit.doubts)
+
+
+def test_bootstraps_at_a_bound_are_doubtful(rng):
+    no_floor = fit_power(measured(sizes(6), power(sizes(6), 0.0, (1.0, 0.5)), 0.01, 3, rng), draws=60)
+    steep = fit_power(measured(sizes(6), power(sizes(6), 1.5, (1.0, 3.95)), 0.03, 3, np.random.default_rng(1)), 60)
+    assert any("of the bootstraps E is zero" in doubt for doubt in no_floor.doubts)
+    assert any(doubt.endswith("alpha is at the end of what was searched (4)") for doubt in steep.doubts)
+
+
+def test_of_four_positions_none_is_left_out(rng):
+    """Three are too few for the form: without the first one it would pass through all others."""
+    fit = fit_power(measured(sizes(4), np.array([4.5, 4.4, 4.0, 3.95]), 5e-4, 3, rng), draws=30)
+    assert not fit.refused and not any("without the first position" in doubt for doubt in fit.doubts)
+
+
+def test_intervals_hold_nine_of_ten_draws(rng):
+    np.testing.assert_allclose(interval(np.arange(101.0)), (5, 95))
+    x = sizes(6)
+    fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 1e-3, 3, rng), draws=30, episodes=False)
+    low, high = fit.band(x)
+    assert (low <= fit.at(x)).all() and (fit.at(x) <= high).all() and (high - low < 0.01 * low).all()
 
 
 def test_dropping_seeds_is_said(rng):

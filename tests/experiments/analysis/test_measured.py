@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from experiments.analysis.fits import fit_power
-from experiments.analysis.measured import Measurements, Position, measure
+from experiments.analysis.measured import Measurements, NoLevel, Position, measure
 from hma_jax.evaluation.windows import WindowTable
 from tests.experiments.analysis.curves import power, sizes
 
@@ -34,6 +34,32 @@ def levelled(
                 np.array([robot]), zero, zero, zero + 4, {"cross_entropy": np.array([nats])}
             )
     return measure(("trunk parameters",), places, tables)
+
+
+def windows_of(loss: Sequence[float], robots: str, episode: Sequence[int]) -> WindowTable:
+    """Of robots that are the letters of `robots`."""
+    zero = np.zeros(len(loss), int)
+    return WindowTable(np.array(list(robots)), np.array(episode), zero, zero + 4, {"cross_entropy": np.array(loss)})
+
+
+def test_a_loss_is_the_mean_over_windows_then_over_robots():
+    table = windows_of([1.0, 2.0, 6.0, 4.0, 6.0], "aaabb", [0, 1, 2, 0, 1])
+    positions = [Position(str(seed), "run", seed, (1e4,), ("a", "b")) for seed in range(2)]
+    points = measure(("trunk parameters",), positions, {"0": table, "1": table})
+    assert points.value.tolist() == [4, 4] and points.levels == 0
+    assert points.draw(20, np.random.default_rng(0), episodes=False).tolist() == [[4, 4]] * 20
+
+
+def test_seeds_of_robots_of_their_own_have_one_level_their_geometric_mean():
+    """Robot b is four times as hard as a, on average over the two positions at which both are judged."""
+    losses = {"a1": 2.0, "a2": 1.0, "a3": 0.5, "b1": 9.0, "b2": 32 / 9}
+    positions = [Position(name, name[1], "ab".index(name[0]), (float(name[1]),), (name[0],)) for name in losses]
+    tables = {name: windows_of([loss], name[0], [0]) for name, loss in losses.items()}
+    points = measure(("trunk parameters",), positions, tables)
+    np.testing.assert_allclose(points.value, [4, 2, 1, 9 / 2, 16 / 9])
+    assert points.levels == 1
+    with pytest.raises(NoLevel, match="no position has a finished trial of each"):
+        measure(("trunk parameters",), [positions[0], positions[4]], tables)
 
 
 def test_taking_levels_out_leaves_the_spread_of_seeds_as_it_is():
