@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -13,6 +13,9 @@ from experiments.setting import UNSET, command, require_local, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.config.base import require_seed
+
+if TYPE_CHECKING:
+    from experiments.applications.generating.compare import Comparison
 
 
 def generate(
@@ -99,17 +102,23 @@ def generate(
         say(f"left out {left:,} x: {reason}")
     with step("compare with the recordings") as update:
         comparison = compare(done.directory, recorded, given, clips, source.hz, update)
-    made, still = comparison
-    counted, of_made, of_still = "1 episode", " (one alone has no interval)", ""
-    if done.episodes > 1:
-        counted = f"{done.episodes:,} episodes"
-        of_made = f" ({made.low:.2f} to {made.high:.2f}, 95 % over episodes)"
-        of_still = f" ({still.low:.2f} to {still.high:.2f})"
-    console.print(
-        f"{counted}. PSNR against the recording {made.mean:.2f} dB{of_made}; a still picture {still.mean:.2f}{of_still}",
-        soft_wrap=True,
-    )
+    _print_comparison(comparison, done.episodes)
     written = [done.directory, done.directory.parent / "psnr.csv"]
     written += [done.directory.parent / "clips"] if clips else []
     entry = ("--hz", f"{source.hz:g}", "--entry", f"{called}.toml")
     wrote(*written, then=command("data inspect", done.directory, *entry))
+
+
+def _print_comparison(comparison: Comparison, episodes: int) -> None:
+    """PSNR of the generated frames and of a still picture, with intervals over episodes if there are several."""
+    generated, still = comparison
+    counted, of_generated, of_still = "1 episode", " (one alone has no interval)", ""
+    if episodes > 1:
+        counted = f"{episodes:,} episodes"
+        of_generated = f" ({generated.low:.2f} to {generated.high:.2f}, 95 % over episodes)"
+        of_still = f" ({still.low:.2f} to {still.high:.2f})"
+    console.print(
+        f"{counted}. PSNR against the recording {generated.mean:.2f} dB{of_generated}; a still picture "
+        f"{still.mean:.2f}{of_still}",
+        soft_wrap=True,
+    )

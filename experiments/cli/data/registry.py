@@ -24,7 +24,7 @@ from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
-    from data_pipelines.inspection.inspect import Facts
+    from data_pipelines.inspection.inspect import Facts, Sample
     from data_pipelines.inspection.suggest import Suggestion, WindowFacts
     from data_pipelines.registry import DatasetSpec
 
@@ -114,10 +114,8 @@ def data_inspect(
         registry: TOML file with your own registry entries.
     """
     from data_pipelines.inspection.inspect import inspect_dataset
-    from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry, window_facts
-    from data_pipelines.registry.spec import stride_of
+    from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry
     from data_pipelines.registry.table import find_spec
-    from experiments.contact_sheet import draw_sheet
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
@@ -140,28 +138,10 @@ def data_inspect(
         require(suggestion is not None, f"{facts.name}: no entry to write: {NO_CAMERA}")
         require(bool(suggestion.hz), "--entry needs the native rate, which the files do not contain: add --hz")
     taken = None if entry else known  # as the dataset is read afterwards
-    rate, windows = hz or (taken.hz if taken else suggested), None
-    if rate:
-        stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate)
-        windows = window_facts(facts, stride, frames)
-        source = "" if hz or not taken else " (registry)"
-        if facts.hz not in (None, rate):
-            source += f", although its files say {facts.hz:g}"
-        console.print(
-            f"[bold]rate[/] {rate:g} Hz{source}: stride {stride}, "
-            f"{rate / stride:.2f} Hz; a full window of {frames} frames needs {windows.native} steps, the shortest "
-            f"window {windows.needed}; {windows.long_enough} of {facts.sampled} sampled episodes are long enough for the "
-            f"shortest; about {windows.total:,.0f} windows in the split"
-        )
+    rate = hz or (taken.hz if taken else suggested)
+    windows = _report_windows(facts, rate, hz, taken, frames) if rate else None
     _print_entry(known, suggestion)
-    folder = out or sheets / facts.name
-    folder.mkdir(exist_ok=True)
-    blank = [c.key for c in facts.cameras if c.is_blank]
-    title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
-    drawn = io.BytesIO()
-    draw_sheet(title, sample.examples, blank).save(drawn, format="png")
-    write_file(folder / SHEET, drawn.getvalue())
-    wrote(folder / SHEET)
+    _draw_contact_sheet(sample, out or sheets / facts.name)
     if json is not None:
         values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
         write_file(json, to_strict_json(values))
@@ -170,6 +150,40 @@ def data_inspect(
         _write_entry(entry, suggestion)
     if known is not None or entry is not None:
         _say_next(facts, windows, entry or registry, other_rate(facts, rate, registry) if taken else None)
+
+
+def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetSpec | None, frames: int) -> WindowFacts:
+    """Prints at which stride frames are taken at a native `rate`, and how many windows there are. `hz`: the rate given
+    by the user; `taken`: the registry entry by which the dataset will be read."""
+    from data_pipelines.inspection.suggest import window_facts
+    from data_pipelines.registry.spec import stride_of
+
+    stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate)
+    windows = window_facts(facts, stride, frames)
+    source = "" if hz or not taken else " (registry)"
+    if facts.hz not in (None, rate):
+        source += f", although its files say {facts.hz:g}"
+    console.print(
+        f"[bold]rate[/] {rate:g} Hz{source}: stride {stride}, "
+        f"{rate / stride:.2f} Hz; a full window of {frames} frames needs {windows.native} steps, the shortest "
+        f"window {windows.needed}; {windows.long_enough} of {facts.sampled} sampled episodes are long enough for the "
+        f"shortest; about {windows.total:,.0f} windows in the split"
+    )
+    return windows
+
+
+def _draw_contact_sheet(sample: Sample, folder: Path) -> None:
+    """Writes FOLDER/contact_sheet.png."""
+    from experiments.contact_sheet import draw_sheet
+
+    facts = sample.facts
+    folder.mkdir(exist_ok=True)
+    blank = [c.key for c in facts.cameras if c.is_blank]
+    title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
+    drawn = io.BytesIO()
+    draw_sheet(title, sample.examples, blank).save(drawn, format="png")
+    write_file(folder / SHEET, drawn.getvalue())
+    wrote(folder / SHEET)
 
 
 def print_facts(facts: Facts) -> None:
