@@ -50,8 +50,8 @@ def guarded(
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
         what = "stopped by SIGTERM" if code == Exit.STOPPED else "interrupted"
-        anew = f"begins anew, but keeps {keeps}" if keeps else "begins anew"
-        _say(f"{what}; the same command {'goes on from here' if resumes else anew}")
+        anew = f"starts again from the beginning, but keeps {keeps}" if keeps else "begins anew"
+        _say(f"{what}; the same command {'continues from here' if resumes else anew}")
         _end_together(request, code)
         return code
     except Exception as error:  # the boundary of the program

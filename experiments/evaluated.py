@@ -56,10 +56,12 @@ def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:
         lines = _differences_of_windows(place, wanted)
     if lines:
         raise ConfigError(
-            f"{place}: the results there are of another evaluation (there -> asked for):\n  "
+            f"{place}: the existing results are from another evaluation (there -> asked for):\n  "
             + "\n  ".join(lines)
-            + "\nNothing was changed. Write the new ones elsewhere with --to DIR, or add --replace, which puts them in "
-            "place of those."
+            + (
+                "\nNothing was changed. Write the new results elsewhere with --to DIR, or overwrite the existing ones "
+                "with --replace."
+            )
         )
 
 

@@ -72,12 +72,12 @@ def _instead(values: dict[str, Any], path: str, known: Sequence[str]) -> str:
     group = ".".join(at)
     if not isinstance(node, dict):  # the path goes on where a value is
         if node is None and group == "model.diffusion":
-            return f"{group} is null in this study, which takes ids; start from a preset that ends in -continuous"
+            return f"{group} is null in this study, whose tokens are ids; use a preset that ends in -continuous"
         return f"no such setting; {group} is a value, {json.dumps(node)}"
     names = [f"{name}.*" if isinstance(value, dict) else name for name, value in node.items()]
     inside = f"{group or 'a study'} has {', '.join(names)}"
     if not rest:
-        return f"that is a group of settings, set one of them; {inside}"
+        return f"this is a group of settings, set one of them; {inside}"
     meant = _meant(node, group, rest, known)
     return f"no such setting; did you mean {' or '.join(meant[:4])}?" if meant else f"no such setting; {inside}"
 

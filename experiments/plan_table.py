@@ -93,7 +93,7 @@ def _describe_done(done: Done, trials: int) -> str:
     parts = [name for name, exists in existing.items() if exists]
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
     parts += [f"{counted(sum(done.steps.values()), 'step')} of training"] if done.steps else []
-    text = f"There already, and not counted: {', '.join(parts)}. " if parts else ""
+    text = f"Already done, and not counted: {', '.join(parts)}. " if parts else ""
     if done.left:
         how = " or ".join(sorted(set(done.left.values())))
         text += f"{len(done.left)} of {trials} trials {how}: not run again, and not counted, without --retry-failed. "
@@ -110,13 +110,13 @@ def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before:
     if len(plans) == 1:
         what = "to train" if not evaluated else "for the trial"
     elif devices.at_once is None:
-        what = f"for the trials, one after the other; {_duration(alone)} if the cluster runs all at a time"
+        what = f"for the trials, one after the other; {_duration(alone)} if the cluster runs all at the same time"
     else:
         what = f"for the trials, {'one after the other' if workers == 1 else f'{workers} at a time'}"
     if not before.seconds and not before.unknown:
         whole = f"About {_duration(spent)} {what}"
     elif before.unknown:
-        whole = f"About {_duration(spent)} {what}, and what it takes to prepare: {describe(before, _duration)}"
+        whole = f"About {_duration(spent)} {what}, and the preparation: {describe(before, _duration)}"
     else:
         whole = (
             f"About {_duration(before.seconds + spent)} in all: {_duration(before.seconds)} to prepare "
@@ -127,7 +127,7 @@ def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before:
     hours = devices.each * trials / 3600
     held = f"{hours:,.{0 if hours >= 100 else 1}f} device-hours"
     judged = "to train and to evaluate, sampler steps included" if evaluated else "to train"
-    shared = "" if len(plans) == 1 else " What trials have in common is counted once."
+    shared = "" if len(plans) == 1 else " Training that trials share is counted once."
     return (
         f"{whole}. {_flops(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
         f"{_flops(study.flops_per_second)}/s each (flops_per_second); {held} "

@@ -126,5 +126,8 @@ def describe(cost: PreparingCost, duration: Callable[[float], str]) -> str:
     if not cost.unknown:
         return text
     known = cost.datasets - len(cost.unknown)
-    without = f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, whose frames the registry does not say"
+    without = (
+        f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, because the registry does not have their "
+        "number of frames"
+    )
     return f"{without}; {duration(cost.seconds)} with the other {known} alone ({text})" if known else without

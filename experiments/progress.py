@@ -200,7 +200,7 @@ class SweepMonitor(Monitor):
             self.bars.update(self.all, completed=self.ended_count)
         colour = "green" if state.event == FINISHED else "yellow" if again else "red"
         message = f": {escape(state.message)}" if state.message else ""
-        more = "; it goes on from its last checkpoint" if again else ""
+        more = "; it continues from its last checkpoint" if again else ""
         self.bars.console.print(
             f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {escape(job.title)} "
             f"[dim]({_clock(seconds)})[/]{message}{more}"

@@ -68,7 +68,9 @@ def run_study(
         provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
-            what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
+            what = (
+                f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again"
+            )
             say(what)
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
         shown = unique_trials(plan_sweeps(study, tuple(every.values())), provenance)
@@ -187,5 +189,5 @@ def _without_result(job: Job, state: State, refused: bool) -> str:
     """A trial, its state and why it has it. `refused`: another one was, after which the runner starts none."""
     why = state.message
     if not why and refused and state.event in (MISSING, PREEMPTED):
-        why = "not started, since another trial was refused"
+        why = "not started, because another trial was refused"
     return ": ".join(filter(None, (state.event, job.title, why)))

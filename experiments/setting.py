@@ -121,8 +121,8 @@ def require_local(flag: str, path: Path | None) -> None:
     """Raises ConfigError for what was meant as an address: datasets are read there, but nothing is written."""
     if path is not None and is_address(path):
         raise ConfigError(
-            f"{flag} {path}: only a directory of a file system can be written to, not a bucket; mount the bucket, or "
-            "choose a disk that all hosts share and copy to the bucket what is finished"
+            f"{flag} {path}: results cannot be written to a bucket, only to a directory of a file system; mount the "
+            "bucket, or use a disk that all hosts share and copy the finished results"
         )
 
 
@@ -202,8 +202,8 @@ def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, .
     missing = [n for n in names if n not in found]
     if missing:
         raise ConfigError(
-            f"no directory for {', '.join(missing)} in {', '.join(roots)}; with a mixture, --data takes the "
-            "directories that hold <name>/<version>"
+            f"no directory for {', '.join(missing)} in {', '.join(roots)}; with --mixture, give in --data the "
+            "directories that contain <name>/<version>"
         )
     return tuple(str(found[n]) for n in names)
 

@@ -194,7 +194,10 @@ class Study:
         check_micro_batches(self.train.batch, self.execution.accumulate)
         check_decoding(self.model, self.eval.decode)  # as the evaluation would, which comes after training
         self.eval.check_images(self.tokenizer.image_shape)
-        require(not self.train.seed, f"train.seed: a trial has one of seeds; set seeds={self.train.seed}")
+        require(
+            not self.train.seed,
+            f"train.seed cannot be set, because trials take their seeds from seeds; set seeds={self.train.seed}",
+        )
         for name in ("tau", "flops_per_second"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")
         require(self.trial_seconds >= 0, f"trial_seconds must not be negative, got {self.trial_seconds:g}")
@@ -204,12 +207,12 @@ class Study:
         )
         require(
             self.eval.prompt_frames < self.model.frames,
-            f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of "
-            f"model.frames {self.model.frames}",
+            f"eval.prompt_frames {self.eval.prompt_frames} leaves no frame to predict in a window of model.frames "
+            f"{self.model.frames}; use fewer",
         )
         require(len(set(self.datasets)) == len(self.datasets), f"datasets repeat: {self.datasets}")
         known = sorted(set(self.unseen) & set(self.datasets))
-        require(not known, f"unseen robots are trained on: {', '.join(known)}; leave them out of datasets")
+        require(not known, f"unseen robots must not be trained on: remove {', '.join(known)} from datasets")
 
     def _check_tokens(self) -> None:
         """Raises ConfigError unless the model takes the tokens that the tokenizer makes."""

@@ -59,8 +59,8 @@ def _require_actions(robots: Sequence[str], rate: float | None) -> None:
     without = [name for name in robots if not declared_table((name,), rate).entries[0].chunk]
     require(
         not without,
-        f"{few(without)}: no model can be adapted to robots without actions, since all that a robot has to itself is of "
-        "them; leave them out (the axis fewshot adapts to --set unseen=...)",
+        f"{few(without)}: a model cannot be adapted to robots without actions, because all of a robot's own "
+        "parameters are for actions; leave them out (the axis fewshot adapts to --set unseen=...)",
     )
 
 
@@ -68,7 +68,7 @@ def require_only(train: TrainConfig, robots: Sequence[str], rate: float | None) 
     """Raises ConfigError, as training would, where `train.only` names others than the `robots` that a model is trained
     on, and where none of those that it names has anything to itself that would be trained."""
     without = [name for name in train.only if name not in robots]
-    require(not without, f"train.only: there is no robot {few(without)} to train, but {few(robots)}")
+    require(not without, f"train.only: the study has no robot {few(without)}, but {few(robots)}")
     if train.only:
         from hma_jax.training.step import check_own
 

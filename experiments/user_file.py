@@ -57,5 +57,5 @@ def naming_line(path: Path, page: str) -> Iterator[None]:
             raise ConfigError(f"{where}: {error}" if line else str(error)) from error
         words = ": ".join(filter(None, (type(error).__name__, error.msg if syntax else str(error))))
         raise ConfigError(
-            f"{where}: {words}; mend it there ({page}), or add --debug to see what called what"
+            f"{where}: {words}; correct the file ({page}), or add --debug to see the traceback"
         ) from error

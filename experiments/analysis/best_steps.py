@@ -105,7 +105,10 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
         matched[steps] = own.aligned_to(first)
     half = halves(first)
     if not half.any():
-        raise NotComparable("steps are chosen on other episodes than those judged, and there is one; judge more")
+        raise NotComparable(
+            "steps are chosen on one half of the episodes and evaluated on the other, but there is only one episode; "
+            "evaluate more"
+        )
     chosen = []
     for h in (0, 1):
         losses = {steps: _mean_of_robots(t, half == h) for steps, t in matched.items()}

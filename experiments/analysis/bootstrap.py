@@ -38,9 +38,9 @@ class Panel:
     seeds: tuple[tuple[int, ...], ...]  # of each point, in the order of its rows
 
     def __post_init__(self):
-        require(len(self.points) == len(self.seeds) > 0, "a panel needs points, and the seeds of each")
+        require(len(self.points) == len(self.seeds) > 0, "a panel needs points and their seeds")
         for values, seeds in zip(self.points, self.seeds, strict=True):
-            require(len(set(seeds)) == len(seeds) > 0, f"seeds repeat, or there are none: {seeds}")
+            require(len(set(seeds)) == len(seeds) > 0, f"seeds must be given, each once, got {seeds}")
             require(
                 values.shape == (len(seeds), len(self.robot)) and len(self.robot) == len(self.episode) > 0,
                 f"{len(seeds)} seeds of {len(self.robot)} windows do not have values of shape {values.shape}",
@@ -70,7 +70,7 @@ class Panel:
             shared = tuple(s for s in left_seeds if s in right_seeds)
             if not shared:
                 raise NotComparable(
-                    f"seeds {left_seeds} and {right_seeds} have none in common; run the same seeds of both"
+                    f"seeds {left_seeds} and {right_seeds} have none in common; run both with the same seeds"
                 )
             points.append(left[[left_seeds.index(s) for s in shared]] - right[[right_seeds.index(s) for s in shared]])
             names.append(shared)
@@ -87,14 +87,14 @@ def make_panel(points: Sequence[dict[int, WindowTable]], metric: str, robots: Se
     first = first.among(chosen)
     lacking = [name for name in chosen if name not in first.datasets]
     if lacking:
-        raise NotComparable(f"not judged: {', '.join(lacking)}")
+        raise NotComparable(f"not evaluated: {', '.join(lacking)}")
 
     def values(table: WindowTable) -> np.ndarray:
         own = table.among(chosen)
         if not agree(first, own):
             shared = require_same_windows(first, table)
             if len(shared) < len(chosen):
-                raise NotComparable(f"not judged in every trial: {', '.join(sorted(set(chosen) - set(shared)))}")
+                raise NotComparable(f"not evaluated in every trial: {', '.join(sorted(set(chosen) - set(shared)))}")
             own = own.aligned_to(first)
         require(metric in own.metrics, f"a trial has no {metric}; it has {', '.join(own.metrics)}")
         return own.metrics[metric]

@@ -57,7 +57,7 @@ def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Co
 
     Raises NotComparable unless all seeds saw the same windows.
     """
-    require(len(seeds) > 0, "no trial to take controllability from")
+    require(len(seeds) > 0, "there is no trial to compute controllability from")
     first, truth, rows = next(iter(seeds.values())), read_table(), []
     matched = {}
     for seed, table in seeds.items():

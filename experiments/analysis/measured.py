@@ -138,7 +138,7 @@ def measure(
     Raises NotComparable unless trials of the same robots were judged on the same windows, and NoLevel where they are of
     several robots that nothing makes comparable.
     """
-    require(len(positions) > 0, "no finished trial to measure")
+    require(len(positions) > 0, "there is no finished trial")
     groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for i, position in enumerate(positions):
         groups[position.scope].append(i)
@@ -164,7 +164,7 @@ def _levelled(value: np.ndarray, x: np.ndarray, seed: np.ndarray) -> np.ndarray:
     points = np.unique(x, axis=0, return_inverse=True)[1].ravel()
     shared = set.intersection(*(set(points[seed == s].tolist()) for s in np.unique(seed)))
     if not shared:
-        raise NoLevel("every seed was judged on other robots, and no position has a finished trial of each")
+        raise NoLevel("every seed was evaluated on other robots, and no position has a finished trial of every seed")
     logs, common = np.log(value), np.isin(points, list(shared))
     level = {s: logs[common & (seed == s)].mean() for s in np.unique(seed)}
     mean = np.mean(list(level.values()))

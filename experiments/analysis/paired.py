@@ -35,7 +35,7 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
         return list(a.datasets)
     shared = [name for name in a.datasets if name in b.datasets]
     if not shared:
-        raise NotComparable(f"no robot was judged in both: {few(a.datasets)} and {few(b.datasets)}")
+        raise NotComparable(f"no robot was evaluated in both: {few(a.datasets)} and {few(b.datasets)}")
     for robot in shared:
         try:
             of_a = a.of(robot)
@@ -62,7 +62,7 @@ def _require_equal(table: WindowTable, of_a: np.ndarray, of_b: np.ndarray, what:
     if len(differing):
         robot, episode, start = table.names[differing[0]]
         raise NotComparable(
-            f"window ({robot}, episode {episode}, frame {start}) is not the same one in both: {of_a[differing[0]]:g} and "
-            f"{of_b[differing[0]]:g} {what} (and {len(differing) - 1} others of {robot}); compare trials of one frozen set of "
-            "windows, on the same data and with the same prompt"
+            f"window ({robot}, episode {episode}, frame {start}) differs between the two: {of_a[differing[0]]:g} and "
+            f"{of_b[differing[0]]:g} {what} (and {len(differing) - 1} others of {robot}); compare trials that were "
+            "evaluated on the same frozen windows, the same data and with the same prompt"
         )

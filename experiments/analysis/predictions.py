@@ -78,17 +78,19 @@ def predict(
     """
     ids = tuple(p.trial for p in held_out)
     finished = [id for id in ids if id in windows]
-    require(not finished, f"{', '.join(finished)} has a result already: a prediction is made before its trial is run")
+    require(
+        not finished, f"{', '.join(finished)} already has a result: a prediction must be made before its trial runs"
+    )
     others = Curve(curve.name, curve.axes, tuple(p for p in curve.positions if p.trial not in ids))
     fitted = fit_curve(others, windows, episodes=False)
     fit = fitted.fit
-    require(not fit.refused, f"{curve.name}: nothing can be predicted: {fit.refused}")
+    require(not fit.refused, f"{curve.name}: no prediction is possible: {fit.refused}")
     x = np.array([held_out[0].x])
     noise, freedom = noise_near(fitted.measured, x[0])
     require(
         np.isfinite(noise),
-        f"{curve.name}: one seed per point: the interval of a prediction needs their noise; run the trials that it is made "
-        "from under several (--set seeds=0,1,2)",
+        f"{curve.name}: every point has one seed, but the interval of a prediction needs the noise between seeds; run "
+        "the trials that it is made from with several seeds (--set seeds=0,1,2)",
     )
     luck = np.random.default_rng(1).standard_t(freedom, len(fit.thetas)) / np.sqrt(len(ids))
     spread = np.exp(noise * luck)
@@ -121,7 +123,7 @@ def compare(
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
     """Raises ConfigError where there is one already: what was said is not said again."""
-    require(not path.exists(), f"{path} is a prediction that was made before; it stays. Give another --out")
+    require(not path.exists(), f"{path} is an earlier prediction, which is not overwritten. Give another --out")
     path.parent.mkdir(parents=True, exist_ok=True)
     values = to_dict(prediction)
     write_file(path, json.dumps({"hash": stable_hash(values), **values}, indent=1) + "\n")
@@ -143,6 +145,6 @@ def _load(path: Path) -> Prediction:
         seal = values.pop("hash")
         prediction = from_dict(Prediction, values)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # ConfigError is a ValueError
-        raise ConfigError(f"{path}: no prediction can be read ({error}); restore it, or remove it") from error
-    require(seal == stable_hash(values), f"{path} was changed after it was written; restore it, or remove it")
+        raise ConfigError(f"{path}: the prediction cannot be read ({error}); restore the file, or remove it") from error
+    require(seal == stable_hash(values), f"{path} was changed after it was written; restore the file, or remove it")
     return prediction

@@ -67,11 +67,11 @@ def read_expected(path: Path) -> list[Expected]:
     try:
         text = path.read_text(encoding="utf-8-sig")  # as spreadsheets save it, too
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not UTF-8 ({error}); save it as such") from error
+        raise ConfigError(f"{path} is not UTF-8 ({error}); save it in this encoding") from error
     with io.StringIO(text, newline="") as file:
         reader = csv.DictReader(file)
         known = (columns, columns[:-1])
-        require(reader.fieldnames in known, f"{path}: its columns have to be {','.join(known[1])}, and may be seeds")
+        require(reader.fieldnames in known, f"{path}: its columns must be {','.join(known[1])}, and optionally seeds")
         found: list[Expected] = []
         lines: dict[tuple, int] = {}  # of each number that is spoken of
         for record in reader:
@@ -82,18 +82,18 @@ def read_expected(path: Path) -> list[Expected]:
                 seeds = tuple(int(seed) for seed in record.pop("seeds", "").split())
                 found.append(Expected(**record | {name: float(record[name]) for name in numbers}, seeds=seeds))
             except (TypeError, ValueError) as error:
-                raise ConfigError(f"{path}, line {number}: no prediction ({error})") from error
+                raise ConfigError(f"{path}, line {number}: not a prediction ({error})") from error
             e = found[-1]
             where = f"{path}, line {number}"
-            require(e.low <= e.mean <= e.high, f"{where}: low, mean and high do not ascend")
-            require(math.isfinite(e.high - e.low), f"{where}: an interval without an end holds more than can come")
+            require(e.low <= e.mean <= e.high, f"{where}: low must not be above mean, and mean not above high")
+            require(math.isfinite(e.high - e.low), f"{where}: low and high must be finite")
             # A difference the other way round is the same number.
             positions = frozenset(map(_position, (e.x, e.against)))
-            require(len(positions) > 1, f"{where}: x has to name a point, and against, if it is given, another one")
+            require(len(positions) > 1, f"{where}: x must name a point, and against, if given, another point")
             first = lines.setdefault((e.sweep, e.series, positions, e.metric, frozenset(e.seeds)), number)
             require(
                 first == number,
-                f"{where}: of the same number as line {first}, which would count twice; keep the one that "
+                f"{where}: it predicts the same number as line {first}, which would count twice; keep the one that "
                 "was written first",
             )
     return found

@@ -38,7 +38,7 @@ class FinishedTrial:
 def read_trial(directory: Path) -> FinishedTrial:
     """Raises ConfigError for a trial that is not finished, was changed, or kept no numbers of its windows."""
     if not (directory / RESULT).exists():
-        raise ConfigError(f"{directory}: no finished trial (it has no {RESULT})")
+        raise ConfigError(f"{directory}: not a finished trial (it has no {RESULT})")
     read_result(directory)  # that its files are those it was sealed with
     windows = WindowTable.load(directory / FILE)
     try:
@@ -46,7 +46,8 @@ def read_trial(directory: Path) -> FinishedTrial:
         trial, provenance = read_job(job)[0], inputs_of(job["provenance"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
-            f"{directory}: the finished trial does not say what it is ({error}); copy it again from where it ran"
+            f"{directory}: the description of the finished trial cannot be read ({error}); copy the trial again from "
+            "where it ran"
         ) from error
     return FinishedTrial(directory.name, trial, provenance, windows)
 
@@ -82,7 +83,7 @@ def read_side(path: Path) -> Side:
     if (path / FILE).exists():
         tokenizer, seed = _said_of(path)
         return Side(path.name, {seed or 0: WindowTable.load(path / FILE)}, tokenizer, says_seed=seed is not None)
-    raise ConfigError(f"{path}: neither a study, nor a finished trial, nor a model that was evaluated (no {FILE})")
+    raise ConfigError(f"{path}: neither a study, nor a finished trial, nor an evaluated model (no {FILE})")
 
 
 def _said_of(run: Path) -> tuple[str, int | None]:

@@ -35,7 +35,7 @@ def open_study(workspace: Workspace) -> PreparedData:
     """Tokenizer, tokens and windows of a study. Raises ConfigError where they are not there."""
     needed = (workspace.store, workspace.tokenizer, workspace.manifest)
     missing = [str(path) for path in needed if not path.exists()]
-    require(not missing, f"{', '.join(missing)}: not made yet; give the --out of the study that has the robots' tokens")
+    require(not missing, f"{', '.join(missing)}: not found; give the --out of a study that has tokens of the robots")
     return open_prepared_data(workspace)
 
 
@@ -54,11 +54,11 @@ def choose_robots(
     unknown = [name for name in selected if name not in available]
     require(
         bool(selected) and not unknown,
-        f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(available)}",
+        f"the study has no windows of {', '.join(unknown) or 'any robot'}; it has windows of {', '.join(available)}",
     )
     shortages = {name: short for name in selected if (short := shortage(store, manifest, name, windows, out))}
     remaining = [name for name in selected if name not in shortages]
-    others = f". Nor are there enough of {few(selected[1:])}" if len(selected) > 1 else ""
+    others = f". The same holds for {few(selected[1:])}" if len(selected) > 1 else ""
     require(bool(remaining), f"{shortages.get(selected[0])}{others}")
     return remaining, shortages
 
@@ -86,17 +86,17 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
     held_out, settings = len(token_manifest.val.steps), token_manifest.settings
     if of_all >= MIN_EPISODES:
         why = (
-            f"--windows {windows} takes {judged} of the {of_all} episodes that the {len(frozen)} windows there are of; "
-            "give more"
+            f"--windows {windows} uses {judged} of the {of_all} episodes that the {len(frozen)} frozen windows come "
+            "from; use more windows"
         )
     elif held_out >= MIN_EPISODES:
         why = (
-            f"{held_out} are held out, and the {len(frozen)} frozen windows are of {of_all} of them: "
-            "eval.windows_per_dataset took no more, or the others are too short. Freeze more with `hma tokenize ... "
-            f"{command_words('--out', out)} --set eval.windows_per_dataset=64 --replace windows`"
+            f"{held_out} are held out, but the {len(frozen)} frozen windows come from {of_all} of them: "
+            "eval.windows_per_dataset is too small, or the other episodes are too short. Freeze more with `hma "
+            f"tokenize ... {command_words('--out', out)} --set eval.windows_per_dataset=64 --replace windows`"
         )
     elif token_manifest.spec.val_split:
-        why = f"Its own split {token_manifest.spec.val_split} has {held_out}: leave val_split out of its entry"
+        why = f"Its split {token_manifest.spec.val_split} has {held_out}: remove val_split from its entry"
     else:
         episodes = held_out + len(token_manifest.train.steps)
         why = (
@@ -104,7 +104,7 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
             f"store.val_fraction={settings.val_fraction:g} and at most "
             f"store.max_val_fraction={settings.max_val_fraction:g}. {_hold_out_more(settings, episodes)}"
         )
-    return f"{robot} has {judged} episodes to be judged; what actions do is told from at least {MIN_EPISODES}. {why}"
+    return f"{robot} has {judged} held-out episodes with windows, but the check needs at least {MIN_EPISODES}. {why}"
 
 
 def _hold_out_more(settings: JobSettings, episodes: int) -> str:
@@ -113,12 +113,12 @@ def _hold_out_more(settings: JobSettings, episodes: int) -> str:
         count = count_held_out(episodes, settings.val_fraction, AT_LEAST, max(AT_LEAST, settings.max_val), share)
         if count >= MIN_EPISODES:
             return (
-                "It is judged on episodes that it was not trained on: tokenise and train in another --out, with --set "
-                f"store.min_val={AT_LEAST}{more} from the first command on ({count} of {episodes} are held out then)"
+                "To hold out more, tokenise and train again in another --out, with --set "
+                f"store.min_val={AT_LEAST}{more} in every command ({count} of {episodes} are then held out)"
             )
     return (
-        f"No setting holds out {MIN_EPISODES} of {episodes}, half of them at most: record more, or name the dataset's own "
-        "validation split in its entry (split and val_split), if it has one"
+        f"At most half of the {episodes} can be held out, which is fewer than {MIN_EPISODES}: record more, or, if the "
+        "dataset has its own validation split, give it in the entry (split and val_split)"
     )
 
 

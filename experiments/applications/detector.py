@@ -101,7 +101,7 @@ class Detector:
     @classmethod
     def load(cls, path: Path) -> Detector:
         """Raises ConfigError where there is none."""
-        advice = "make a detector with python -m experiments.applications.detector RUN"
+        advice = "train a detector with python -m experiments.applications.detector RUN"
         with reading_arrays(path, advice) as arrays:
             weights = {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if name != "robots"}
             return cls(weights, [str(name) for name in arrays["robots"]])
@@ -167,7 +167,7 @@ def _save_progress(path: Path, done: int, trained: Any, rng: np.random.Generator
 def _resume(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]:
     """(steps done, training state) as `_save_progress` wrote them, in the structure of `fresh`; restores `rng`."""
     leaves, structure = jax.tree.flatten(fresh)
-    with reading_arrays(path, "remove it, the same command trains anew") as arrays:
+    with reading_arrays(path, "remove it; the same command then trains again") as arrays:
         kept = [jnp.asarray(arrays[f"leaf/{i}"]) for i in range(len(leaves))]
         rng.bit_generator.state = json.loads(str(arrays["rng"]))
         return int(arrays["done"]), jax.tree.unflatten(structure, kept)
@@ -224,14 +224,14 @@ def reconstructed(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> S
 def suite_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
     """Those of the suite, whose true positions are known. Raises ConfigError if there are none."""
     known = {name: robot for name, robot in robots.items() if name in SPECS}
-    require(bool(known), "no robot of the suite: nobody knows where its tools are")
+    require(bool(known), "the model has no robot of the suite, and only for these the positions of tools are known")
     return known
 
 
 def select_robots(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
     """Those of `names`, or all. Raises ConfigError for one that is not there."""
     unknown = sorted(set(names) - set(robots))
-    require(not unknown, f"--robots: {', '.join(unknown)} cannot be watched; there are {', '.join(robots)}")
+    require(not unknown, f"--robots: {', '.join(unknown)} cannot be used; choose from {', '.join(robots)}")
     return {name: robot for name, robot in robots.items() if not names or name in names}
 
 
@@ -270,11 +270,11 @@ def main() -> None:
     robots = list(suite_robots(simulator.robots))
     require(
         not weights.exists() or (args.out / FILE).exists(),
-        f"{weights} is there already, and nothing says of which run; choose another --out or remove it",
+        f"{weights} exists, but it is not known for which run it was trained; choose another --out or remove it",
     )
     pin_settings(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
     if existing := weights.exists():
-        note = f"{short(weights)} of this run is there already; remove it to have it made again"
+        note = f"{short(weights)} of this run exists already; remove it to train it again"
         say(note)
     else:
         make_detector(robots, simulator.tokenizer, args.out)

@@ -128,8 +128,8 @@ def main() -> None:
             rows += new
             update(i + 1, len(robots), robot.name)
     if short:
-        console.print(f"left out, their episodes are too short or nothing is seen at the end: {', '.join(short)}")
-    require(bool(rows), "no robot is left to look at; watch others, or a model with a shorter window")
+        console.print(f"left out, since their episodes are too short or show no object at the end: {', '.join(short)}")
+    require(bool(rows), "no robot is left; choose other --robots, or a model with a shorter window")
     write_rows(args.out / TABLE, rows)
     for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
         own_rows = [row for row in rows if str(row["what"]).startswith(prefix)]

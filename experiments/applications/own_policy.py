@@ -193,8 +193,8 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
     window = simulator.model.config.frames
     require(
         window <= settings.frames,
-        f"{run} sees {window} frames, an episode here has {settings.frames}: there is nothing to train it on; name a "
-        "run with a shorter window",
+        f"{run} has a window of {window} frames, but an episode here has only {settings.frames}, so there are no "
+        "windows to train on; give a run with a shorter window",
     )
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
     pin_settings(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made

@@ -47,12 +47,13 @@ def pin_settings(
         differences = [line for line in diff(known, comparable) if not line.startswith(free)]
         require(
             not differences,
-            f"{out} holds results of other settings ({'; '.join(differences)}); choose another --out or remove it",
+            f"{out} holds results made with other settings ({'; '.join(differences)}); choose another --out or remove "
+            "it",
         )
         require(
             SIMULATOR in known,
-            f"{path} does not say how frames were filled and what the robots' ranges were: choose another --out, or "
-            "remove that file if you know that nothing of this has changed",
+            f"{path} does not contain the decoding of frames and the robots' action ranges: choose another --out, or, "
+            "if you know that neither has changed, remove this file",
         )
         return
     write_settings(out, run, simulator, settings, file)

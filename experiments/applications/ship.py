@@ -78,11 +78,16 @@ def ship(
     it would be too large.
     """
     shipped = not out.exists() or (out / REPORT).is_file() or not any(out.iterdir())
-    require(shipped, f"--out {out} holds no {REPORT}, so that it is no shipped model; all of it would be removed")
+    require(
+        shipped,
+        f"--out {out} has no {REPORT}, so it is not a shipped model, and it would be overwritten; choose another --out",
+    )
     run = load_run(source, "auto")
     simulator = load_simulator(source)
     foreign = [name for name, robot in simulator.robots.items() if not in_suite(robot)]
-    require(not foreign, f"{', '.join(foreign)}: not of the suite, so that there is no truth to compare with")
+    require(
+        not foreign, f"{', '.join(foreign)}: not robots of the suite, so there is no true simulator to compare with"
+    )
     aside = out.with_name(f".{out.name}.making")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
@@ -94,7 +99,9 @@ def ship(
         save_beside(simulator, aside, decode)
         add(aside)
         size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())
-        require(size <= LARGEST, f"{size:,} bytes are more than the {LARGEST:,} that a repository should carry")
+        require(
+            size <= LARGEST, f"the model has {size:,} bytes, more than the {LARGEST:,} bytes allowed for the repository"
+        )
         publish(aside, out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
@@ -104,7 +111,7 @@ def to_half_precision(params: Params) -> Params:
     """The parameters in float16, which `load_model` reads as float32. Raises ConfigError for a weight that is too large
     for it."""
     half = jax.tree.map(lambda x: np.asarray(x, np.float16), params)
-    require(all(np.isfinite(x).all() for x in jax.tree.leaves(half)), "a weight is too large for half precision")
+    require(all(np.isfinite(x).all() for x in jax.tree.leaves(half)), "a weight is too large for float16")
     return half
 
 

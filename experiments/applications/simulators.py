@@ -35,7 +35,7 @@ STARTS_PER_ROBOT = 6
 START_FRAMES = 3
 """Frames that an episode begins with: enough to see what moves."""
 
-DEAF = "the model was trained without actions (train.masking.setting passive): what it shows does not depend on them"
+DEAF = "the model was trained without actions (train.masking.setting passive), so its frames do not depend on them"
 
 
 def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any) -> Simulator:
@@ -58,8 +58,8 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
         simulator.starts = find_starts(simulator, study)
     require(
         bool(simulator.starts),
-        f"{run}: there is no {STARTS} beside the run, and neither a robot with a true simulator nor held-out frames in "
-        f"{study.store} to start from; move the run into the directory of a study that has tokens of its robots",
+        f"{run}: the run has no starts for episodes: no {STARTS} beside it, no robot with a true simulator, and no "
+        f"held-out frames in {study.store}. Move the run into the directory of a study that has tokens of its robots",
     )
     return simulator
 
@@ -83,7 +83,8 @@ def make_simulator(run: Path | str, world: World = "learned", *, episodes: int =
     require_choice(world, get_args(World), "world")
     require(
         world == "learned" or options.get("rate", "model") == "model",
-        "a step of the true simulator is a frame of the model: rate='native' is of the learned one alone",
+        "rate='native' is supported only by the learned simulator; a step of the true simulator is a frame of the "
+        "model",
     )
     learned = load_simulator(run, episodes=episodes, **options)
     return learned if world == "learned" else true_simulator(learned, tuple(learned.robots.values()), episodes)
@@ -103,7 +104,8 @@ def true_worlds(robots: Sequence[Robot], **options: Any) -> TrueSimulator:
     mixed = not physics and any(robot.name in PHYSICS for robot in robots)
     require(
         not mixed,
-        f"robots of the suite and of physics simulators have no common one: {', '.join(r.name for r in robots)}",
+        "no single simulator has both robots of the suite and of physics simulators: "
+        f"{', '.join(r.name for r in robots)}",
     )
     return (PhysicsSimulator if physics else SuiteSimulator)(robots, **options)
 

@@ -230,10 +230,10 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
     )
     if args.actions is None:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in recorded)
-        require(not recorded, f"{options}: of recordings, which --actions DATASET names")
+        require(not recorded, f"{options}: only for recordings; give these with --actions DATASET")
         settings = Settings(**vars(training), robot=args.robot or Settings.robot, **scripted)
         return ScriptedSource(settings, simulator.robot(settings.robot), simulator.tokenizer.image_size)
-    require(not scripted, f"--{', --'.join(scripted)}: of the suite's tasks, not of recordings (--actions)")
+    require(not scripted, f"--{', --'.join(scripted)}: only for tasks of the suite, not with recordings (--actions)")
     use_entries(args.registry)
     robot = simulator.robot(args.robot) if args.robot else None
     place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(args.run).store
@@ -282,7 +282,8 @@ def main() -> None:
     second = out / SECOND
     require(
         bool(args.without_actions) or not second.exists(),
-        f"{second} says that policies of a model without actions are here: give --without-actions again, or another --out",
+        f"{second} shows that --out already has policies of a model without actions: give --without-actions again, or "
+        "another --out",
     )
     settings, passive = source.settings, args.without_actions and load_passive(args.without_actions, source.robot)
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)

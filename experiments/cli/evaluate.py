@@ -72,7 +72,7 @@ def evaluate_model(
     require_local("--to", to)
     require(
         to is None or not (to / JOB).is_file(),
-        f"--to {to}: a trial is there, whose result vouches for the windows that it was made from; choose another --to",
+        f"--to {to} is the directory of a trial, whose results must not be changed; choose another --to",
     )
     trained = load_model(run, setting.study.execution, weights).run
     # Before the work: that its results can be written, and by nobody else.
@@ -92,20 +92,24 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     masking = trained.train.masking
     if not masking.predicts_frames:
         console.print(
-            f"note: the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: "
-            "its actions alone are judged",
+            f"note: the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames, "
+            "so only its actions are evaluated",
             soft_wrap=True,
         )
     left_out = [name for name in trained.table.names if name not in frozen]
     if left_out:
-        console.print(f"note: not evaluated, for want of windows here: {', '.join(left_out)}", soft_wrap=True)
+        console.print(
+            f"note: not evaluated, because the study has no windows of them: {', '.join(left_out)}", soft_wrap=True
+        )
     if untrained:
-        console.print(f"note: not evaluated, for it was not trained on: {', '.join(untrained)}", soft_wrap=True)
+        console.print(
+            f"note: not evaluated, because the model was not trained on them: {', '.join(untrained)}", soft_wrap=True
+        )
     names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
     besides = [name for name in names if setting.data and name not in setting.study.dataset_names()]
     if besides:
         console.print(
-            f"note: all windows that are frozen in {short(setting.workspace.root)} are judged, also those of "
+            f"note: all windows that are frozen in {short(setting.workspace.root)} are evaluated, also those of "
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
@@ -145,7 +149,7 @@ def table_of(summary: Summary, title: str) -> TidyTable:
         table.add_row(name, *(plus_minus(stats[m].mean, stats[m].sem) if m in stats else "" for m in metrics))
     judged = {name: stats for name, stats in summary.datasets.items() if stats}
     if alone := [name for name, stats in judged.items() if all(s.clusters == 1 for s in stats.values())]:
-        table.caption = f"No error of {few(alone)}: one held-out episode does not say how they differ."
+        table.caption = f"No standard error for {few(alone)}: there is only one held-out episode."
     return table
 
 
@@ -166,9 +170,9 @@ def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore)
     """Prints a note where a model may have been trained on episodes that are held out in `store` (data leakage)."""
     if elsewhere := trained_on_other_tokens(trained, names, store):
         console.print(
-            f"note: {few(elsewhere)}: of the tokens that the model was trained on not all lie here as they were, so that it "
-            "may have seen episodes that are held out here; the --out that it was trained in holds out those that it has "
-            "not",
+            f"note: {few(elsewhere)}: the model was trained on other tokens than those of this study, so it may have "
+            "been trained on episodes that are held out here; in the --out that it was trained in, held-out episodes "
+            "are new to it",
             soft_wrap=True,
         )
 
@@ -205,12 +209,12 @@ def check_fits(trained: Run, prepared: PreparedData) -> None:
     check_tokenizer(trained, prepared.tokenizer, tokens)
     if frames != manifest.frames:
         raise ConfigError(
-            f"the model sees windows of {frames} frames, those frozen for evaluation here have "
+            f"the model has windows of {frames} frames, but those frozen for evaluation here have "
             f"{manifest.frames}{windows}"
         )
     if not set(trained.table.names) & {d.dataset for d in manifest.datasets}:
         raise ConfigError(
-            f"the model was trained on {', '.join(trained.table.names)}, of which the study here has no windows{data}"
+            f"the model was trained on {', '.join(trained.table.names)}, but the study has no windows of these{data}"
         )
 
 
@@ -220,8 +224,8 @@ def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
         raise ConfigError(why + advice)
     if _converted(trained):
         console.print(
-            f"note: the model was read in the official release's format, which does not say on which tokens it was "
-            f"trained; taken for those of the tokenizer here, {tokenizer.identity}",
+            "note: the model was read in the official release's format, which does not say on which tokens it was "
+            f"trained; it is assumed that they are those of the tokenizer here, {tokenizer.identity}",
             soft_wrap=True,
         )
 
@@ -231,7 +235,7 @@ def tokenizer_mismatch(trained: Run, tokenizer: Tokenizer) -> str:
     know its own: then the form of its tokens decides."""
     if not _converted(trained):
         own, here = trained.provenance.get("tokenizer"), tokenizer.identity
-        return "" if own == here else f"the model was trained on tokens of tokenizer {own}, the study here uses {here}"
+        return "" if own == here else f"the model was trained on tokens of tokenizer {own}, but the study uses {here}"
     model = trained.model
     if model.diffusion:
         takes = (model.tokens, 0, 0, model.diffusion.token_channels)
@@ -241,7 +245,7 @@ def tokenizer_mismatch(trained: Run, tokenizer: Tokenizer) -> str:
     words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
     if takes == makes:
         return ""
-    return f"the model takes {words.format(*takes)}, the tokenizer here makes {words.format(*makes)}"
+    return f"the model needs {words.format(*takes)}, but the tokenizer makes {words.format(*makes)}"
 
 
 def _converted(trained: Run) -> bool:

@@ -55,7 +55,10 @@ def _show(root: Path) -> None:
 
     numbers = read_numbers(Workspace(root.absolute()))
     if not numbers.fits and numbers.isoflop is None:
-        say(f"{short(root)} has no axis along which a loss may fall as a power, such as width: there is nothing to fit")
+        say(
+            f"{short(root)} has no axis along which the loss may follow a power law, such as width, so there is "
+            "nothing to fit"
+        )
         return
     table = Table(box=None, header_style="bold")
     for name in ("curve", "over", "L, nats per token", "exponents", "remarks"):
@@ -102,7 +105,7 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
         sweeps = plan_sweeps(study, (*record.axes, axis), workspace.root)
     sweep = next((s for s in sweeps if s.name == axis), None)
     if sweep is None or not sweep.fittable:
-        raise ConfigError(f"--predict {target}: {axis} is no axis over a number")
+        raise ConfigError(f"--predict {target}: {axis} is not an axis with numbers as positions")
     own = next((a for a, s in zip(record.axes, sweeps, strict=False) if s is sweep and is_file(a)), None)
     how = f"in {short(workspace.root / own)}" if own else "with --set"
     curve, held = _held_out(sweep, record.provenance, target, x, how)
@@ -114,7 +117,7 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
         what = f"exists already ({state.event})" if exists else f"has run, says {workspace.ledger.name}"
         require(
             not exists and id not in ran,
-            f"--predict {target}: trial {id} {what}; a prediction is made before its trial runs",
+            f"--predict {target}: trial {id} {what}; a prediction must be made before its trial runs",
         )
     results, windows = read_results(workspace, unique_trials(sweeps, record.provenance))
     prediction = predict(curve, held, windows, result_hashes(results))
@@ -138,8 +141,8 @@ def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: 
     name, _, text = target.rpartition("=")
     require(
         not sweep.interior_minimum,
-        f"--predict {target}: along {sweep.name} the loss is lowest within, where no power law holds; `hma fit STUDY` "
-        "says which size is best for a budget (isoflop)",
+        f"--predict {target}: along {sweep.name} the loss has a minimum inside the range, so it is not a power law; "
+        "`hma fit STUDY` says which size is best for a budget (isoflop)",
     )
     curves = {curve.name: curve for curve in curves_of([sweep], provenance)}
     if name == sweep.name and len(curves) == 1:

@@ -112,7 +112,7 @@ def plan(
             say(f"{name}: {made.refusal}")
         counts = ", ".join(f"{n} {kind}" for kind, n in count_kinds(made.collectives).items()) or "none"
         console.print(f"[dim]{name}: compiled in {made.compile_seconds:.0f} s; collectives: {counts}[/]")
-    console.print("[dim]collectives as they stand in the program, a loop's body once[/]")
+    console.print("[dim]collectives are counted as in the program; the body of a loop counts once[/]")
 
 
 def read_memory(size: str | None) -> float | None:
@@ -132,7 +132,7 @@ def _choose_model(
         from experiments.bench.models import make_shape
 
         others = replace(arguments, mesh=None) == PlanArguments()
-        require(others, "only a study has these settings; add --preset, or choose by --model, --batch and --robots")
+        require(others, "these settings need a study; add --preset, or use --model, --batch and --robots")
         chosen = DEFAULTS | {name: value for name, value in vars(shape).items() if value is not None}
         config, table = make_shape(chosen["model"], chosen["robots"])
         execution = ExecutionConfig(chosen["dtype"], chosen["remat"], mesh=MeshConfig(*arguments.mesh or (1, -1, 1)))
@@ -142,8 +142,8 @@ def _choose_model(
 
     require(
         shape == Shape(),
-        "--model, --batch, --robots, --dtype and --remat are for a model without --preset; of a study --set says them: "
-        "model.*, train.batch, datasets, execution.dtype and execution.remat",
+        "--model, --batch, --robots, --dtype and --remat cannot be used with --preset; set model.*, train.batch, "
+        "datasets, execution.dtype and execution.remat with --set",
     )
     study = make_setting(arguments).study
     trial = reference_trial(study, study.seeds[0])
@@ -157,7 +157,8 @@ def _print_layouts(name: str, made: Plan) -> None:
 
     sizes = " x ".join(f"{axis} {size}" for axis, size in made.mesh.items())
     _print_lines(
-        f"{name}: parameters on a mesh of {sizes}, and what one device stores", describe_sharding(made.decisions)
+        f"{name}: sharding of the sharding of the parameters on a mesh of {sizes}, and what one device stores",
+        describe_sharding(made.decisions),
     )
 
 
@@ -169,7 +170,7 @@ def _print_sent(name: str, made: Plan) -> None:
         f"over {c.over or 'groups not told'}: {c.purpose}"
         for c, sent in made.collectives.items()
     ]
-    _print_lines(f"{name}: what one device is sent in a step", "\n".join(lines) or "nothing")
+    _print_lines(f"{name}: collectives, and what one device receives per step", "\n".join(lines) or "nothing")
 
 
 def _print_lines(title: str, lines: str) -> None:

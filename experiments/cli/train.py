@@ -131,7 +131,7 @@ def train_model(
     if initial is not None:
         kept = [name for name in initial.table.names if name not in known_datasets(initial, setting)]
         if kept:
-            console.print(f"note: kept as they are, for want of data here: {', '.join(kept)}", soft_wrap=True)
+            console.print(f"note: unchanged, because the study has no data of them: {', '.join(kept)}", soft_wrap=True)
         start = {"table": initial.table, "initial": initial.params, "origin": origin}
     _train(setting, _single_trial(setting, trajectories), run, options, **start)
 
@@ -162,7 +162,7 @@ def adapt_model(
     )
     require(
         not study.train.only,
-        "train.only: leave it out; the new robots alone are trained, or, with --everything, all",
+        "leave out train.only: `hma adapt` trains only the new robots' parameters, or all with --everything",
     )
     run = run or setting.workspace.root / "model"
     require_other_directory(source, run)

@@ -92,8 +92,9 @@ def _of_robot(
     recorded = frames_under(spec, seeds, own, times, size) * valid[..., None, None, None]
     if not np.array_equal(recorded, np.stack(images)):
         raise DataError(
-            f"{name}: the simulator does not give back the recorded frames under the recorded actions; the suite was made "
-            "by another version of it. --replace suite makes it again, and what follows from it."
+            f"{name}: with the recorded actions, the simulator does not reproduce the recorded frames, because the "
+            "suite was made by another version of it. --replace suite makes the suite again, and everything that "
+            "depends on it."
         )
     seen = frames_under(spec, seeds, changed, times, size) * valid[..., None, None, None]
     return seen[:, prompt:].astype(np.uint8)

@@ -118,9 +118,9 @@ def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | 
     raise ConfigError(
         f"{place} holds {IN_WORDS[step]}, made from other inputs (there -> asked for):\n  "
         + "\n  ".join(lines)
-        + "\nNothing was changed. Choose another --out, or give the settings that it was made with"
+        + "\nNothing was changed. Choose another --out, or use the settings that it was made with"
         + (f", or {otherwise}" if otherwise else "")
-        + f"; or add --replace {step}, which makes {IN_WORDS[step]} again in place of what is there{follows}."
+        + f"; or add --replace {step}, which makes {IN_WORDS[step]} again, overwriting the existing ones{follows}."
     )
 
 
@@ -129,6 +129,6 @@ def say_recorded(what: str, place: Path, existing: Mapping[str, Any], now: Mappi
     lines = [line for name in existing.keys() & now.keys() for line in diff(existing[name], now[name], name)]
     if lines:
         say(
-            f"note: {what} in {place} was made with other {'; '.join(lines)}. It stays in use; remove it to have "
-            "it made again"
+            f"note: {what} in {place} was made with other {'; '.join(lines)}. It is still used; remove it to make it "
+            "again"
         )

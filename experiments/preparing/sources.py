@@ -28,8 +28,8 @@ def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
         name = source_name(place)
         require(
             name not in places,
-            f"--data: {places.get(name)} and {place} are both the dataset {name!r}, by the name that their files give; "
-            "a study reads one directory of each: leave one out",
+            f"--data: {places.get(name)} and {place} are both the dataset {name!r}, by the name in their files; a "
+            "study reads one directory per dataset: leave one out",
         )
         places[name] = place
     return tuple(places)

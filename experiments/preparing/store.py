@@ -45,7 +45,7 @@ def make_store(
 
     def make(i: int, wait: bool) -> bool:
         (spec, path), eta = sources[i], Eta()
-        note = f"{spec.name} ({i + 1} of {len(sources)}{', the rest of it by other processes' if wait else ''})"
+        note = f"{spec.name} ({i + 1} of {len(sources)}{', the rest is made by other processes' if wait else ''})"
         manifest = tokenize_dataset(
             spec, path, made_with, workspace.store, **settings, **how, rate=study.rate,
             overwrite=may_replace("tokens", replace), wait=wait,
@@ -66,8 +66,8 @@ def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
         own = None if find_format(path) == "rlds" else open_source((spec, path), study.store).hz  # RLDS says none
         if own not in (None, spec.hz):
             say(
-                f"note: {spec.name}: its files say {own:g} Hz, its entry {spec.hz:g} Hz, which is what counts; if the "
-                "files are right, correct the entry"
+                f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "
+                "if the files are right, correct the entry"
             )
 
 

@@ -58,7 +58,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     if kept:
         say(
             f"note: {few(kept)} in {workspace.suite}: made by an earlier version of the simulator, and still used; "
-            "--replace suite makes them again, and what follows from them"
+            "--replace suite makes them again, and everything that depends on them"
         )
     return [(spec, workspace.suite / spec.name / VERSION) for spec in specs]
 
@@ -85,7 +85,7 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
     made_as, seed = metadata.get(FINGERPRINT), metadata.get("seed")
     episodes, held_out = (sum(shard_lengths(directory, split)) for split in ("train", "val"))
     if made_as is None or seed is None or not episodes or not held_out:
-        return ["what is there says nothing of what it was made from"]
+        return ["the existing datasets do not say how they were made"]
     wanted = episode_count(spec, suite.scale, suite.fewest)
     lines = [f"suite.seed: {seed} -> {suite.seed}"] if seed != suite.seed else []
     lines += [f"suite.scale or suite.fewest: {episodes} -> {wanted} episodes"] if episodes != wanted else []

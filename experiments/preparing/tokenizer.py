@@ -100,7 +100,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
     config, train, settings = study.tokenizer, study.tokenizer_train, study.store
     require(
         isinstance(config, TokenizerConfig),
-        "the study's tokenizer is not one that is trained here; give its directory with --tokenizer",
+        "the study's tokenizer cannot be trained here; give the directory of an imported one with --tokenizer",
     )
     sources = [(spec, path) for spec, path in sources if spec.name not in study.unseen]
     made_from = tokenizer_made_from(study, sources)
@@ -136,10 +136,10 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
         return False
     existing = read_stamp(place)
     if existing is None:
-        lines = ["it is not written down there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
+        lines = ["it is not recorded there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
     else:
         lines = differences(existing.inputs, made_from.inputs)
-    require_same("tokenizer", place, lines, replace, f"use it as it is with --tokenizer {place}")
+    require_same("tokenizer", place, lines, replace, f"use it unchanged with --tokenizer {place}")
     if lines:
         return False
     say_recorded("the tokenizer", place, existing.recorded, made_from.recorded)
@@ -191,8 +191,8 @@ def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None
     names = [name for name in study.all_names() if name in inputs.get("data", {})]
     if names and more:
         say(
-            f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it may "
-            "have seen frames that are held out here"
+            f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it "
+            "may have been trained on frames that are held out here"
         )
 
 

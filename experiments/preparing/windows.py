@@ -85,12 +85,12 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
     summary = json.loads(workspace.data_summary.read_text())
     names = study.all_names()
     unjudged = [name for name in names if name in empty and name in judged]
-    lines = [f"{name} is judged and has no held-out window: {empty[name]}" for name in unjudged]
+    lines = [f"{name} is to be evaluated, but has no held-out window: {empty[name]}" for name in unjudged]
     lines += [f"{name} has no training window" for name in names if not summary[name]["windows"]]
     require(
         not lines,
-        f"{'; '.join(lines)}. Leave it out of the study (of --data, or with --set datasets=...), or change what a window "
-        f"is: rate={study.rate}, eval.prompt_frames={study.eval.prompt_frames} and one more, "
+        f"{'; '.join(lines)}. Leave it out of the study (of --data, or with --set datasets=...), or change the "
+        f"settings of windows: rate={study.rate}, eval.prompt_frames={study.eval.prompt_frames} and one more, "
         f"store.min_val={study.store.min_val}",
     )
 
@@ -165,8 +165,8 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
             many.append(f"{held_out} of {episodes} episodes of {name}")
     if many:
         say(
-            f"note: held out, not trained on: {few(many)}. At least store.min_val={settings.min_val} are, but no more "
-            f"than store.max_val_fraction={settings.max_val_fraction:g} of a dataset, or one episode"
+            f"note: a large part is held out: {few(many)}. At least store.min_val={settings.min_val} episodes are "
+            f"held out, but at most store.max_val_fraction={settings.max_val_fraction:g} of a dataset, or one episode"
         )
 
 
@@ -193,8 +193,8 @@ def say_alone(summary: dict[str, dict[str, int]]) -> None:
     ]
     if alone:
         say(
-            f"note: one training episode to cut windows of: {few(alone)}. A control, trained on shuffled actions, gets those "
-            "of the same episode there, of a single window its own, so that it may follow them"
+            f"note: only one training episode has windows: {few(alone)}. A control, trained on shuffled actions, then "
+            "gets actions of the same episode, or of the same window if there is only one, so it may follow them"
         )
 
 

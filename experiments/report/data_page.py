@@ -82,11 +82,11 @@ def draw_page(datasets: Sequence[DatasetView], frames: int, command: str) -> str
     body = [_summary(datasets, frames)]
     body += [part for i, dataset in enumerate(datasets) for part in _dataset(i, dataset, frames)]
     return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Robot data: {html.escape(title)}</title><style>{CSS}{PAGE_CSS}</style></head>\n"
-        f"<body><main><header><h1>Robot data <em>{html.escape(title)}</em></h1></header>{''.join(body)}"
-        f"<section><h2>How to make it again</h2><pre>{html.escape(command)}</pre></section></main></body></html>\n"
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+        'content="width=device-width, initial-scale=1"><title>Robot data: '
+        f"{html.escape(title)}</title><style>{CSS}{PAGE_CSS}</style></head>\n<body><main><header><h1>Robot data "
+        f"<em>{html.escape(title)}</em></h1></header>{''.join(body)}<section><h2>Command that makes this "
+        f"page</h2><pre>{html.escape(command)}</pre></section></main></body></html>\n"
     )
 
 
@@ -98,11 +98,11 @@ def _summary(datasets: Sequence[DatasetView], frames: int) -> str:
     for i, d in enumerate(datasets):
         f, windows = d.facts, _windows(d, frames)
         errors, warnings = (sum(r.severity == severity for r in d.issues) for severity in ("error", "warning"))
-        stands = [f'<span class="failed">{errors} wrong</span>'] * bool(errors)
-        stands += [f"{warnings} to decide"] * bool(warnings)
+        stands = [f'<span class="failed">{errors} error(s)</span>'] * bool(errors)
+        stands += [f"{warnings} warning(s)"] * bool(warnings)
         lines.append([
             f'<a href="#d{i}">{html.escape(f.name)}</a>',
-            ", ".join(stands) or '<span class=fine>nothing stands out</span>',
+            ", ".join(stands) or "<span class=fine>no issues found</span>",
             f"{f.episodes:,}",
             f"{f.lengths.median:g}",
             f"{d.hz:g}" if d.hz else "?",
@@ -120,12 +120,10 @@ def _dataset(i: int, d: DatasetView, frames: int) -> list[str]:
     sampled = "all" if f.sampled == f.episodes else f"{f.sampled} of {f.episodes:,}"
     where = f"{f.version} · split {f.split} · {sampled} episodes read ({f.bytes_read / 1e6:,.1f} MB) · {f.directory}"
     issues = [f"<p class={r.severity}><b>{html.escape(r.title)}</b>: {html.escape(r.text)}.</p>" for r in d.issues] or [
-        "<p class=fine>Nothing stands out.</p>"
+        "<p class=fine>No issues found.</p>"
     ]
     if f.sampled < f.episodes:
-        issues.append(
-            "<p class=fine>Recordings that occur twice are found among the episodes that were read alone.</p>"
-        )
+        issues.append("<p class=fine>Duplicate recordings are searched only among the episodes that were read.</p>")
     return [
         f'<section id="d{i}"><h2>{html.escape(f.name)}</h2><p class=meta>{html.escape(where)}</p>{"".join(issues)}',
         _read_as(d),
@@ -143,9 +141,9 @@ def _part(title: str, *parts: str) -> str:
 
 def _read_as(d: DatasetView) -> str:
     if d.entry is None:
-        return "<p>There is no way to read it without its rate, or it has no camera.</p>"
-    whose = "The registry's entry" if d.registered else "Not in the registry; its contents suggest an entry that"
-    action = " + ".join(d.entry.action_keys) or "no action: video alone"
+        return "<p>It cannot be read, because its rate is unknown or it has no camera.</p>"
+    whose = "The registry's entry" if d.registered else "Not in the registry; the suggested entry"
+    action = " + ".join(d.entry.action_keys) or "no action: video only"
     form = ""
     if d.entry.angle_form != "as_recorded":
         numbers = ", ".join(map(str, d.entry.angles))
@@ -217,7 +215,7 @@ def _lengths(d: DatasetView, frames: int) -> str:
         )  # fmt: skip
         lines.append([f"{mark[0]}{cell}{mark[1]}" for cell in cells])
     head = [
-        "frames T", "stride", "Hz of frames", "steps", "seconds", "episodes with a whole one", "with any",
+        "frames T", "stride", "Hz of frames", "steps", "seconds", "episodes with a full window", "with any",
         "windows in the split",
     ]  # fmt: skip
     return words + drawn + table(head, lines, text=0)
@@ -231,7 +229,7 @@ def _actions(d: DatasetView) -> list[str]:
     if others:
         inside = "".join(_action(field) for field in others)
         parts.append(f"<details><summary>{len(others)} more fields, not in use</summary>{inside}</details>")
-    return parts or ["<p>No numeric field of actions: video alone.</p>"]
+    return parts or ["<p>No numeric action field: video only.</p>"]
 
 
 def _action(field: ActionFacts) -> str:
@@ -260,7 +258,7 @@ def _cameras(d: DatasetView) -> str:
         remark = remark if c.frames else "cannot be decoded"
         sizes = ", ".join(f"{h}x{w}" for h, w in c.sizes)
         lines.append([f"<code>{html.escape(c.key)}</code>", remark, sizes, f"{c.frames}", f"{c.blank}"])
-    return table(["camera", "remark", "height x width", "frames looked at", "blank"], lines, text=2)
+    return table(["camera", "remark", "height x width", "frames read", "blank"], lines, text=2)
 
 
 def _splits(f: Facts) -> str:

@@ -124,5 +124,7 @@ def draw_again(out: Path) -> None:
         return
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     draw_figures(workspace, sweeps, read_rows(workspace))
-    console.print(f"no trials in {short(workspace.root)}: drawn from its table, as it is; the page stays as it is")
+    console.print(
+        f"no trials in {short(workspace.root)}: figures are drawn from the existing table; the page is not changed"
+    )
     wrote(workspace.figures)

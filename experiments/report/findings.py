@@ -43,7 +43,7 @@ def read_findings(path: Path, axes: Sequence[str]) -> Findings:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not UTF-8 ({error}); save it as such") from error
+        raise ConfigError(f"{path} is not UTF-8 ({error}); save it in this encoding") from error
     before, *parts = re.split(r"^## ", text, flags=re.MULTILINE)
     if before := re.sub(r"\A\s*# .*", "", before).strip():
         rest.append(section("Findings", f"<div class=findings>{_as_html(before)}</div>"))

@@ -42,7 +42,7 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
                 actual_id = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise ConfigError(
-                    f"{directory}: the finished trial does not say what it is ({error}). Copy it "
+                    f"{directory}: the description of the finished trial cannot be read ({error}). Copy the trial "
                     "again from where it ran, or remove the directory to run it again"
                 ) from error
             require(
@@ -72,11 +72,13 @@ def require_one_closure(trials: Path, ids: Iterable[str], now: Closure | None, a
         groups.append(Sources(closure_hash(now), dict(now), [], []))
     if len(groups) > 1 and not accept:
         raise CodeChanged(
-            "trials of this study would stand beside each other that ran different sources:\n  "
+            "this study would contain trials that ran different versions of the code:\n  "
             + "\n  ".join(describe(groups))
-            + "\nNothing was run. If the change alters no result, add --accept-code: the page then counts the "
-            "sources. If it does, raise RESULTS_VERSION (experiments/running/results_version.py): trials of the "
-            "earlier version then run again. Or go back to the earlier sources"
+            + (
+                "\nNothing was run. If the change alters no result, add --accept-code: the report then says how many "
+                "versions ran. If it does, raise RESULTS_VERSION (experiments/running/results_version.py): trials of "
+                "the earlier version then run again. Or go back to the earlier code"
+            )
         )
 
 

@@ -52,9 +52,9 @@ class Ledger:
             try:
                 record = json.loads(line)
             except ValueError as error:
-                raise ConfigError(f"{where}: not JSON ({error}); delete that line to go on") from error
+                raise ConfigError(f"{where}: not JSON ({error}); delete that line to continue") from error
             named = isinstance(record, dict) and all(isinstance(record.get(key), str) for key in ("trial", "event"))
-            require(named, f"{where}: it names no trial and what happened to it; delete that line to go on")
+            require(named, f"{where}: it has no trial with an event; delete that line to continue")
             records.append(record)
         return records
 

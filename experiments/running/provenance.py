@@ -77,7 +77,7 @@ def trial_closure() -> dict[str, str]:
     try:
         return trace(ROOTS)
     except (OSError, SyntaxError, ValueError) as error:  # in the middle of a `git pull`, say
-        raise CodeChanged(f"the sources cannot be read ({error}); try again when they are whole") from error
+        raise CodeChanged(f"the source files cannot be read ({error}); try again when they are complete") from error
 
 
 def load_sources(given: Closure | None) -> dict[str, str]:

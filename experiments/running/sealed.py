@@ -50,8 +50,8 @@ def read_result(directory: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"no {error} in {RESULT}" if isinstance(error, KeyError) else error
         raise ConfigError(
-            f"{directory / RESULT}: the finished trial is not whole: {reason}. Copy it again from where it ran, or remove "
-            "its directory to run it again"
+            f"{directory / RESULT}: the finished trial is damaged: {reason}. Copy it again from where it ran, or "
+            "remove its directory to run it again"
         ) from error
     return values
 

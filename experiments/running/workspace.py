@@ -161,7 +161,8 @@ class Workspace:
                 stack.enter_context(exclusive(self.root / lock))
             except Held as held:
                 raise Busy(
-                    f"another command is at work in {self.root} ({held.who}); wait for it or choose another --out",
+                    f"another command is using {self.root} ({held.who}); wait until it has finished, or choose "
+                    "another --out",
                     held.holder,
                 ) from None
             except OSError as error:
@@ -214,7 +215,10 @@ def load_record(workspace: Workspace) -> Record:
             f"no study in {workspace.root} (it has no {workspace.record.name}); start one with "
             f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
         )
-    require(bool(record.axes), f"{workspace.record}: axes is empty; name those that it had, or run `{record.command}`")
+    require(
+        bool(record.axes),
+        f"{workspace.record}: axes is empty; restore the axes that the study had, or run `{record.command}`",
+    )
     if workspace.registry.exists():
         from data_pipelines.registry import register
         from data_pipelines.registry.toml_file import load_entries

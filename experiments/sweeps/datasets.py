@@ -26,8 +26,8 @@ def plan(study: Study) -> Sweep:
     names = study.dataset_names()
     require(
         study.dataset_counts[-1] == len(names),
-        f"the last of dataset_counts {study.dataset_counts} must be the number of datasets, "
-        f"{len(names)}; add --set dataset_counts=...,{len(names)}",
+        f"the last of dataset_counts {study.dataset_counts} must be the number of datasets, {len(names)}; add --set "
+        f"dataset_counts=...,{len(names)}",
     )
     fewest = study.dataset_counts[0]
     first = names[:fewest]

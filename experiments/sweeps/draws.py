@@ -27,7 +27,8 @@ def draw_judged(study: Study, seed: int, count: int | None = None) -> tuple[str,
         found.append(name)
     wanted = study.designs.judged if count is None else count
     require(
-        len(found) >= wanted, f"{wanted} robots are to be judged, each of another family; {len(found)} can be drawn"
+        len(found) >= wanted,
+        f"{wanted} judged robots are needed, each of another family, but only {len(found)} can be drawn",
     )
     return _in_order(names, found[:wanted])
 
@@ -45,7 +46,9 @@ def draw_mixture(
     if kinship != "any":
         families = _families()
         missing = [name for name in names if name not in families]
-        require(not missing, f"only robots of the suite have families, and {', '.join(missing[:3])} is none of it")
+        require(
+            not missing, f"only robots of the suite have families, but {', '.join(missing[:3])} is not in the suite"
+        )
         kin = {families[name][0] for name in own}
         newcomers = [name for name in newcomers if (families[name][0] in kin) == (kinship == "siblings")]
     added = count - len(own)

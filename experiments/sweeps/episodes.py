@@ -27,8 +27,8 @@ def plan(study: Study) -> Sweep:
     cutting = [cap for cap in study.designs.caps if count_episodes(study, cap) < count_episodes(study, cap + 1)]
     require(
         bool(cutting),
-        f"the axis episodes needs a cap that takes trajectories from some robot; none of designs.caps {study.designs.caps} "
-        "does: --set designs.caps=...",
+        "the axis episodes needs a cap below the number of trajectories of some robot, but none of designs.caps "
+        f"{study.designs.caps} is: --set designs.caps=...",
     )
     caps = (*cutting, None)
     budgets = sorted({study.train.steps // 4, study.train.steps // 2, study.train.steps} - {0})
@@ -68,8 +68,8 @@ def count_episodes(study: Study, cap: int | None) -> int:
     unknown = [name for name, n in episodes.items() if not n]
     require(
         not unknown,
-        f"the axis episodes counts trajectories, and nobody says how many there are of {few(unknown)}: write `episodes` into "
-        "the entries of your registry (`hma data inspect DIR --entry FILE` counts them), or leave the axis out",
+        f"the axis episodes needs the number of trajectories, which is unknown for {few(unknown)}: write `episodes` "
+        "into the entries of your registry (`hma data inspect DIR --entry FILE` counts them), or leave the axis out",
     )
     most = study.trajectory_counts[-1]
     return sum(min(n, most, cap or most) for n in episodes.values())

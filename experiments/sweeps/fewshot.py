@@ -26,7 +26,7 @@ def plan(study: Study) -> Sweep:
     """Every model adapts to all unseen robots at once. Raises ConfigError for a study without any, or without numbers
     of trajectories or of robots that are known."""
     designs, unseen = study.designs, study.unseen
-    require(bool(unseen), "the axis fewshot needs robots to adapt to; name them with --set unseen=...")
+    require(bool(unseen), "the axis fewshot needs robots to adapt to; set them with --set unseen=...")
     for name in ("shots", "shots_after"):
         empty = not getattr(designs, name)
         require(not empty, f"designs.{name} is empty; the axis fewshot needs at least one: --set designs.{name}=...")

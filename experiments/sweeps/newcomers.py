@@ -32,8 +32,8 @@ def plan(study: Study) -> Sweep:
     alone, some, everyone = designs.judged, designs.kinship, len(names)
     require(
         alone < some < everyone,
-        f"designs.kinship {some} robots, siblings or strangers, have to be more than the {alone} judged and fewer than all "
-        f"{everyone}: --set designs.kinship=..., or leave the axis newcomers out",
+        f"designs.kinship {some} robots, siblings or strangers, must be more than the {alone} judged robots and fewer "
+        f"than all {everyone}: --set designs.kinship=..., or leave the axis newcomers out",
     )
     labels = {
         "alone": (alone, "any", most * alone // everyone),

@@ -96,7 +96,7 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
             require(sweep.name not in AXES, f"{where}: the name {sweep.name!r} is taken; choose another")
             require(
                 sweep.name.isidentifier(),
-                f"{where}: the name {sweep.name!r} becomes that of files; write it with letters, digits and _",
+                f"{where}: the name {sweep.name!r} is used in file names; use letters, digits and _",
             )
     names = [sweep.name for sweep in sweeps]
     require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
@@ -108,32 +108,33 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
     trial would fail once it is trained, and for one whose number would be of other robots, or of another position, than
     it says."""
     listed = isinstance(sweep.points, Sequence)
-    require(listed, f"{where}: points has to be a tuple of Point, and is a {type(sweep.points).__name__}")
+    require(listed, f"{where}: points must be a tuple of Point, got a {type(sweep.points).__name__}")
     _require_kinds(replace(sweep, points=()), f"{where}: the sweep")
     for number, p in enumerate(sweep.points, start=1):
         of_trial = isinstance(p, Point) and isinstance(p.trial, Trial)
         what = type(p.trial if isinstance(p, Point) else p).__name__
-        require(of_trial, f"{where}: point {number} has to be a Point with a Trial, and has a {what}")
+        require(of_trial, f"{where}: point {number} must be a Point with a Trial, got a {what}")
         numbered = isinstance(p.x, int | float) and math.isfinite(p.x)
-        require(numbered, f"{where}: position {p.x!r} of point {number} is no number; names are for make_ablation")
+        require(
+            numbered,
+            f"{where}: position {p.x!r} of point {number} is not a number; for named positions use make_ablation",
+        )
         named = not sweep.labels or p.x in range(len(sweep.labels))
         require(named, f"{where}: position {p.x:g} has no label; x counts into the {len(sweep.labels)} labels, from 0")
         known = (POINT, CONTROL, STANDARD)
-        require(p.role in known, f"{where}: the role of point {number} has to be one of {known}, and is {p.role!r}")
+        require(p.role in known, f"{where}: the role of point {number} must be one of {known}, got {p.role!r}")
         at = f"{where}: the trial at {p.x:g}"
         shuffled = p.role != CONTROL or p.trial.shuffle_actions
-        require(shuffled, f"{at} is a control and is not trained on shuffled actions; make it by control_of(trial)")
+        require(shuffled, f"{at} is a control, but is not trained on shuffled actions; make it with control_of(trial)")
         same = _require_kinds(p, at) == p
-        require(same, f"{at} has a setting of a wrong kind: a list where a tuple belongs, or a number that is none")
+        require(same, f"{at} has a setting of a wrong type: a list instead of a tuple, or a value that is not a number")
         _require_trial(study, p.trial, p.scope or sweep.scope, at)
     drawn = {bool(p.series) for p in sweep.points if p.role != CONTROL}
-    require(
-        len(drawn) < 2, f"{where}: some points have a series and others none, which no figure shows beside each other"
-    )
+    require(len(drawn) < 2, f"{where}: some points have a series and others have none, but a figure cannot show both")
     require(
         not (sweep.labels and sweep.has_series),
-        f"{where} has labels and several series: an axis of names has one point a name and seed, so put what differs "
-        "into the names",
+        f"{where} has labels and several series, but an axis with labels has one point per label and seed; put the "
+        "series into the labels",
     )
     places: dict[tuple[str, str, str], float] = {}
     for p in sweep.points if not sweep.labels else ():
@@ -151,26 +152,26 @@ def _require_kinds(given: Any, where: str) -> Any:
     try:
         return from_dict(type(given), json.loads(json.dumps(to_dict(given))))
     except (TypeError, ValueError) as error:  # ConfigError is a ValueError
-        raise ConfigError(f"{where} has a setting of a wrong kind ({error})") from error
+        raise ConfigError(f"{where} has a setting of a wrong type ({error})") from error
 
 
 def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str) -> None:
     for one in trial.with_source():
         _require_fits(study, one, where)
-    require(bool(scope), f"{where} is averaged over no robot; name those that it judges in `scope`")
+    require(bool(scope), f"{where} is averaged over no robot; list those that it evaluates in `scope`")
     known = {name for one in trial.with_source() for name in one.datasets}
     for names, of, what in (
         (known, study.all_names(), "is trained on {}, which the study does not have"),
-        (trial.evaluated, known, "judges {} and is not trained on it; leave it out of `evaluated`"),
-        (scope, trial.evaluated, "does not judge {}, over which the axis averages; leave it out of `scope`"),
-        (trial.capped, trial.datasets, "caps trajectories of {} and is not trained on it; leave it out of `capped`"),
+        (trial.evaluated, known, "evaluates {}, but is not trained on it; remove it from `evaluated`"),
+        (scope, trial.evaluated, "does not evaluate {}, over which the axis averages; remove it from `scope`"),
+        (trial.capped, trial.datasets, "caps trajectories of {}, but is not trained on it; remove it from `capped`"),
     ):
         without = [name for name in names if name not in of]
         require(not without, f"{where} {what.format(few(without))}")
     twice = [name for name, count in Counter(scope).items() if count > 1]
     require(
         not twice,
-        f"{where} is averaged over {few(twice)} more than once; robots count equally: name each once in `scope`",
+        f"{where} is averaged over {few(twice)} more than once, but robots count equally: list each once in `scope`",
     )
     most = trial.max_trajectories
     require(most is None or most >= 1, f"{where}: max_trajectories must be at least 1, or None for all, got {most}")

@@ -19,8 +19,8 @@ def require_uniform(study: Study, axis: str) -> None:
     """Raises ConfigError unless every robot has the same share of the windows, whatever others there are."""
     require(
         study.tau >= UNIFORM,
-        f"the axis {axis} holds each robot's windows fixed, which takes a uniform mixture: tau is {study.tau:g}; add "
-        f"--set tau=1000",
+        f"the axis {axis} keeps the number of windows per robot fixed, which needs a uniform mixture, but tau is "
+        f"{study.tau:g}; add --set tau=1000",
     )
 
 

@@ -38,7 +38,8 @@ def plan(study: Study) -> Sweep:
     default = study.train.masking.setting
     require(
         default in NAMES,
-        f"train.masking.setting is {default!r}, which predicts no frames to judge; use one of {', '.join(NAMES)}",
+        f"train.masking.setting is {default!r}, which predicts no frames, so they cannot be evaluated; use one of "
+        f"{', '.join(NAMES)}",
     )
     released = replace(study.train, masking=replace(study.train.masking, teacher_forcing=False))
     return make_ablation(

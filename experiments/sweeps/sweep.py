@@ -150,11 +150,11 @@ def make_sweep(
     the study's reference trial does not stand at `reference_x`: `change` has to leave it there as it is, but for whom
     it is judged on.
     """
-    require(len(values) > 0, f"axis {name}: values is empty, so that its control alone would run; give it positions")
+    require(len(values) > 0, f"axis {name}: values is empty, so only its control would run; give it positions")
     seeds = study.seeds if seeds is None else seeds
     unchanged = reference_trial(study, seeds[0], steps)
     changed = change(unchanged, reference_x)
-    require(isinstance(changed, Trial), f"axis {name}: change has to return a trial, and returned {changed!r}")
+    require(isinstance(changed, Trial), f"axis {name}: change must return a trial, but returned {changed!r}")
     lines = diff(unchanged, replace(changed, evaluated=unchanged.evaluated))
     require(
         not lines,

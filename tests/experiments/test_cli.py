@@ -60,7 +60,7 @@ def test_help_needs_no_jax():
         (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
-        (["study", "--preset", "smoke", "--dry-run", "--launcher-set", "bogus=1"], 2, "no such setting, but none"),
+        (["study", "--preset", "smoke", "--dry-run", "--launcher-set", "bogus=1"], 2, "no such setting; it has none"),
         (
             ["study", "--preset", "smoke", "--dry-run", "--set", "axes="],
             2,
@@ -179,7 +179,7 @@ def test_a_study_whose_axes_were_taken_out_of_its_record_is_told_so(command, tmp
     workspace = finished_study(tmp_path)
     save_record(workspace, record_of(axes=()))
     assert main([command, str(tmp_path)]) == 2
-    said = f"{workspace.record}: axes is empty; name those that it had, or run `hma study`"
+    said = f"{workspace.record}: axes is empty; restore the axes that the study had, or run `hma study`"
     assert said in capsys.readouterr().err and not workspace.report.exists()
 
 
@@ -189,7 +189,7 @@ def test_a_study_of_named_axes_alone_has_nothing_to_fit(tmp_path, capsys):
     save_record(workspace, record_of(axes=("settings",)))
     assert main(["fit", str(tmp_path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "has no axis along which a loss may fall as a power" in said and "exponents" not in said
+    assert "has no axis along which the loss may follow a power law" in said and "exponents" not in said
 
 
 @pytest.fixture
@@ -209,12 +209,12 @@ def instant_trials(monkeypatch):
 
 def test_a_place_without_its_engine_is_refused_before_anything_is_prepared(monkeypatch, tmp_path, capsys):
     def nowhere(*_):
-        raise ConfigError("no Slurm here")
+        raise ConfigError("Slurm is not available")
 
     monkeypatch.setattr(LauncherOptions, "launcher", nowhere)
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: pytest.fail("hours were spent on preparing"))
     assert main(["study", "--preset", "smoke", "--out", str(tmp_path / "out")]) == 2
-    assert "no Slurm here" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert "Slurm is not available" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_the_place_where_trials_run_is_entered_once(instant_trials, tmp_path, monkeypatch):
@@ -391,4 +391,4 @@ def test_sigterm_ends_like_an_interruption_with_a_last_word(tmp_path):
     process.terminate()
     out, said = process.communicate(timeout=60)
     assert (process.returncode, out) == (143, "saved\n")
-    assert said == "stopped by SIGTERM; the same command goes on from here\n"
+    assert said == "stopped by SIGTERM; the same command continues from here\n"

@@ -302,7 +302,7 @@ def test_a_judged_dataset_without_windows_stops_the_study(study, refused):
     """Each point would say of two datasets what was made with one."""
     out, data = study
     message = refused(2, "study", *SMOKE, "--out", out, *data)
-    assert f"{BASE.name} is judged and has no held-out window: a window has at least 3 frames" in message
+    assert f"{BASE.name} is to be evaluated, but has no held-out window: a window has at least 3 frames" in message
     assert f"{BASE.name} has no training window" in message and "Leave it out of the study" in message
     assert not list(out.glob("trials/*/result.json"))
 
@@ -334,7 +334,9 @@ def test_run_directory_that_cannot_be_made(study, tmp_path, refused):
 def test_what_would_be_written_to_a_bucket_is_refused(arguments, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     message = refused(2, *arguments, *SMOKE)
-    assert "only a directory of a file system can be written to" in message and not list(tmp_path.iterdir())
+    assert "results cannot be written to a bucket, only to a directory of a file system" in message and not list(
+        tmp_path.iterdir()
+    )
 
 
 def test_processes_that_do_not_know_each_other_are_refused(refused):
@@ -444,11 +446,16 @@ def test_evaluation_on_windows_of_another_length(study, tmp_path, refused):
         (
             {"S": 64},
             ARM.name,
-            "the model takes 64 tokens",
+            "the model needs 64 tokens",
             "--tokenizer and the directory of the one that it was trained",
         ),
-        ({"T": 3}, ARM.name, "windows of 3 frames, those frozen for evaluation here have 4", "--set model.frames=3"),
-        ({}, "push2", "trained on push2, of which the study here has no windows", "--data of one of them"),
+        (
+            {"T": 3},
+            ARM.name,
+            "windows of 3 frames, but those frozen for evaluation here have 4",
+            "--set model.frames=3",
+        ),
+        ({}, "push2", "trained on push2, but the study has no windows of these", "--data of one of them"),
     ],
     ids=["tokens", "frames", "data"],
 )
@@ -467,7 +474,7 @@ def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tm
     other = prepared_otherwise(study, tmp_path, data=(option, arm))
     assert main(["evaluate", str(study[0] / "model"), *SMOKE, "--out", str(other), option, base]) == 0
     said = capsys.readouterr().out
-    assert f"not evaluated, for want of windows here: {BASE.name}" in said
+    assert f"not evaluated, because the study has no windows of them: {BASE.name}" in said
     assert f"also those of {ARM.name}, which --data does not name" in said
 
 

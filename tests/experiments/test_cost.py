@@ -121,7 +121,7 @@ def test_the_plan_prices_the_devices_that_trials_run_on(capsys):
     for more, said in (
         ("", "priced for 1 device at 100.0 EFLOP/s each (flops_per_second); 5.0 device-hours"),
         ("--workers 5", "priced for 5 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
-        ("--launcher slurm --launcher-set gpus=8", "if the cluster runs all at a time"),
+        ("--launcher slurm --launcher-set gpus=8", "if the cluster runs all at the same time"),
         ("--launcher slurm --launcher-set gpus=8", "for 8 devices at 100.0 EFLOP/s each (flops_per_second); 40.0 dev"),
     ):
         assert main([*plan, *more.split()]) == 0
@@ -175,7 +175,7 @@ def test_robots_that_are_to_be_trained_alone_and_are_not_there_are_refused_befor
         only = "rover_mud" if command == ["train"] else SMOKE.dataset_names()[-1]  # not in the first point
         given = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--set", f"train.only={only}"]
         assert main([*command, *given]) == 2
-        assert f"train.only: there is no robot {only} to train, but " in capsys.readouterr().err
+        assert f"train.only: the study has no robot {only}, but " in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
 
 
@@ -186,7 +186,7 @@ def test_robots_without_actions_that_are_to_be_trained_alone_are_refused_before_
     only = ["--set", f"datasets={video},picker_sand,arm_sky", "--set", f"train.only={video}"]
     nothing = f"train.only: {video} would have no parameters to train"
     for command, words in (
-        (fewshot, f"{video}: no model can be adapted to robots without actions"),
+        (fewshot, f"{video}: a model cannot be adapted to robots without actions"),
         (["study", *only], nothing),
         (["train", *only], nothing),
     ):
@@ -203,11 +203,11 @@ def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     assert words.startswith("unknown for 38 of 40 datasets")
     assert f"{before.seconds:.0f} s with the other 2 alone" in words
     assert describe(replace(before, unknown=("a", "b"), datasets=2), str) == (
-        "unknown for 2 of 2 datasets, whose frames the registry does not say"
+        "unknown for 2 of 2 datasets, because the registry does not have their number of frames"
     )
     assert main(["sweep", "width", "--preset", "paper", "--dry-run"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "and what it takes to prepare: unknown for 38 of 40" in said and " in all" not in said
+    assert "and the preparation: unknown for 38 of 40" in said and " in all" not in said
 
 
 def test_what_is_prepared_is_paid_for():

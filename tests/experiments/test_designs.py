@@ -153,7 +153,9 @@ def test_trajectories_that_nobody_counted_are_not_counted_as_none(monkeypatch):
     # 256 takes none of the 200 that the reference has.
     assert found == [(8, 4), (32, 16), (104, 64), (240, 200)]
     counts["yours"] = 0
-    with pytest.raises(ConfigError, match="nobody says how many there are of yours: write `episodes` into"):
+    with pytest.raises(
+        ConfigError, match="needs the number of trajectories, which is unknown for yours: write `episodes` into"
+    ):
         find_axis("episodes")(study)
 
 

@@ -33,9 +33,9 @@ def test_finished_trials_are_not_priced_again_and_begun_ones_from_their_step(set
     assert whole > 0 and {plan.seconds for plan in plan_trials(STUDY, sweeps, done=done).values()} == {0.0}
     count = len(done.finished)
     said = plan_table(STUDY, sweeps, done=done).caption
-    assert said.startswith(f"There already, and not counted: {count} of {count} trials. About 31 s to prepare: ")
+    assert said.startswith(f"Already done, and not counted: {count} of {count} trials. About 31 s to prepare: ")
     said = plan_table(STUDY, sweeps, done=replace(done, tokens=True)).caption
-    assert said == f"There already, and not counted: tokens, {count} of {count} trials. "
+    assert said == f"Already done, and not counted: tokens, {count} of {count} trials. "
 
     first, second, *_ = sorted(done.finished)
     for id in (first, second):

@@ -87,13 +87,13 @@ def test_a_point_that_is_not_there_is_refused(rows):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("width,,8,,cross_entropy,five,4,6,abc", "line 2: no prediction"),
-        ("width,,8,,cross_entropy,5,4,6", "line 2: no prediction .it has too few columns"),
-        ("width,,8,,cross_entropy,5,4,6,abc,more", "line 2: no prediction"),
-        ("width,,8,,cross_entropy,7,4,6,abc", "line 2: low, mean and high do not ascend"),
-        ("width,,8,,cross_entropy,7,4,inf,abc", "line 2: an interval without an end holds more"),
-        ("width,,8,8.0,cross_entropy,0,-1,1,abc", "line 2: x has to name a point, and against, .* another one"),
-        ("width,,,,cross_entropy,5,4,6,abc", "line 2: x has to name a point"),
+        ("width,,8,,cross_entropy,five,4,6,abc", "line 2: not a prediction"),
+        ("width,,8,,cross_entropy,5,4,6", "line 2: not a prediction .it has too few columns"),
+        ("width,,8,,cross_entropy,5,4,6,abc,more", "line 2: not a prediction"),
+        ("width,,8,,cross_entropy,7,4,6,abc", "line 2: low must not be above mean, and mean not above high"),
+        ("width,,8,,cross_entropy,7,4,inf,abc", "line 2: low and high must be finite"),
+        ("width,,8,8.0,cross_entropy,0,-1,1,abc", "line 2: x must name a point, and against, .* another point"),
+        ("width,,,,cross_entropy,5,4,6,abc", "line 2: x must name a point"),
     ],
 )
 def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
@@ -118,7 +118,9 @@ def test_a_number_is_expected_once(tmp_path, again):
     path.write_text("\n".join(lines))
     assert len(read_expected(path)) == 2
     path.write_text("\n".join([*lines, f"width,,{again}"]))
-    with pytest.raises(ConfigError, match=f"{FILE}, line 4: of the same number as line 2, which would count twice"):
+    with pytest.raises(
+        ConfigError, match=f"{FILE}, line 4: it predicts the same number as line 2, which would count twice"
+    ):
         read_expected(path)
 
 
@@ -127,13 +129,13 @@ def test_the_table_may_come_from_a_spreadsheet_in_utf_8_alone(tmp_path):
     (tmp_path / FILE).write_text(line, encoding="utf-8-sig")
     assert read_expected(tmp_path / FILE) == [WIDTH]
     (tmp_path / FILE).write_bytes(line.encode().replace(b"abc", b"\xe4bc"))
-    with pytest.raises(ConfigError, match=f"{FILE} is not UTF-8 .*; save it as such"):
+    with pytest.raises(ConfigError, match=f"{FILE} is not UTF-8 .*; save it in this encoding"):
         read_expected(tmp_path / FILE)
 
 
 def test_columns_are_checked(tmp_path):
     (tmp_path / FILE).write_text("sweep,x,mean\nwidth,8,5\n")
-    with pytest.raises(ConfigError, match="columns have to be"):
+    with pytest.raises(ConfigError, match="columns must be"):
         read_expected(tmp_path / FILE)
 
 

@@ -195,7 +195,9 @@ def test_results_of_other_windows_or_settings_are_kept_unless_told_otherwise(whe
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     assert main(["evaluate", str(run), *where, *other]) == Exit.REFUSED
     said = capsys.readouterr().err
-    assert "eval.perplexity_group: 1 -> 2\n" in said and "--to DIR, or add --replace" in said
+    assert (
+        "eval.perplexity_group: 1 -> 2\n" in said and "--to DIR, or overwrite the existing ones with --replace" in said
+    )
     assert main(["evaluate", str(run), *where, *other, "--to", str(tmp_path / "beside")]) == 0
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
     assert {"evaluation.json", "windows.parquet", "samples.npz"} < {p.name for p in (tmp_path / "beside").iterdir()}

@@ -298,10 +298,10 @@ def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):
     ("said", "words"),
     [
         (("slurm", 1, ("partition",)), "--launcher-set partition: write it as key=value"),
-        (("slurm", 1, ("part=x",)), "the slurm launcher has no such setting, but partition, account"),
+        (("slurm", 1, ("part=x",)), "the slurm launcher has no such setting; it has partition, account"),
         (("slurm", 1, ("gpus=two",)), "--launcher-set gpus=two: expected a number"),
         (("slurm", 1, ("minutes=0",)), "--launcher-set minutes=0: it must be at least 1"),
-        (("slurm", 1, ("minutes=2",)), "--launcher-set grace=120: a job of 2 minutes"),
+        (("slurm", 1, ("minutes=2",)), "--launcher-set grace=120: must be shorter than the job's 2 minutes"),
         (("slurm", 1, ("memory_gb=-1",)), "--launcher-set memory_gb=-1: it must be positive"),
         (("ray", 1, ("gpus=-1",)), "--launcher-set gpus=-1: it must be 0 or more"),
         (("ray", 1, ("gpus=1.5",)), "--launcher-set gpus=1.5: it must be 0 or more, above 1 a whole number"),
@@ -309,7 +309,7 @@ def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):
         (("ray", 1, ("memory_gb=0",)), "--launcher-set memory_gb=0: it must be positive"),
         (("ray", 1, ("resources=fast_disk",)), "--launcher-set resources=fast_disk: write it as resources=NAME=AMOUNT"),
         (("slurm", 1, ("gpus=1.5",)), "gpus: expected int, got 1.5"),
-        (("local", 1, ("gpus=1",)), "the local launcher has no such setting, but none"),
+        (("local", 1, ("gpus=1",)), "the local launcher has no such setting; it has none"),
         (("mpi", 1, ()), "--launcher mpi: choose one of local, slurm, ray"),
     ],
 )

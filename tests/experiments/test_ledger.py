@@ -66,7 +66,7 @@ def test_torn_only_line(ledger):
 @pytest.mark.parametrize("line", ["garbage", "null", "[1]", '{"event": "failed"}', '{"trial": "b", "event": null}'])
 def test_damage_before_the_end_is_reported_with_its_line(ledger, line):
     ledger.path.write_text(f'{{"trial": "a", "event": "started"}}\n{line}\n{{"trial": "b", "event": "started"}}\n')
-    with pytest.raises(ConfigError, match=r"ledger.jsonl, line 2: .*; delete that line to go on"):
+    with pytest.raises(ConfigError, match=r"ledger.jsonl, line 2: .*; delete that line to continue"):
         ledger.states()
 
 

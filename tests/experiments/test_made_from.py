@@ -181,7 +181,7 @@ def test_a_given_tokenizer_that_may_have_seen_what_is_held_out_is_told(min_val, 
     there, data = made
     given = ["--tokenizer", str(there / "tokenizer"), "--set", f"store.min_val={min_val}"]
     assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "new"), *data, *given]) == 0
-    said = " with fewer episodes held out (store.min_val: 2 -> 3): it may have seen frames that are held out here"
+    said = " with fewer episodes held out (store.min_val: 2 -> 3): it may have been trained on frames that are held out here"
     assert (said in capsys.readouterr().out) == told
 
 

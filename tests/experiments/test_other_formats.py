@@ -38,7 +38,7 @@ def test_lerobot_and_robomimic_go_from_inspection_and_view_to_tokens(tmp_path, c
     assert main(["tokenize", *common, "--set", "model.frames=4"]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
     assert notes == [
-        "note: robomimic_lift: its files say 20 Hz, its entry 4 Hz, which is what counts; if the files are right, correct the "
+        "note: robomimic_lift: its files say 20 Hz, but its registry entry 4 Hz, which is used; if the files are right, correct the "
         "entry"
     ]
     for name, keys in (("toy_arm", "observation/top"), ("robomimic_lift", "observation/agentview")):

@@ -50,7 +50,9 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     workspace.counterfactual.unlink()
     seed_of = counterfactual._seed_of
     monkeypatch.setattr(counterfactual, "_seed_of", lambda *args: seed_of(*args) + 1)
-    with pytest.raises(DataError, match="does not give back the recorded frames .* --replace suite makes it again"):
+    with pytest.raises(
+        DataError, match="does not reproduce the recorded frames, .* --replace suite makes the suite again"
+    ):
         counterfactual.make_counterfactual(study, workspace)
     assert not workspace.counterfactual.exists()
 
@@ -73,7 +75,8 @@ def test_robots_of_which_a_control_has_no_other_episode_are_named(capsys):
     windows.say_alone(facts)
     (line,) = capsys.readouterr().out.splitlines()
     assert (
-        "one training episode to cut windows of: bridge_dataset. A control, trained on shuffled actions, gets" in line
+        "only one training episode has windows: bridge_dataset. A control, trained on shuffled actions, then gets"
+        in line
     )
     windows.say_alone({name: facts[name] for name in ("rover_slate", "arm_sand")})
     assert capsys.readouterr().out == ""

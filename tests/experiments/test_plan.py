@@ -207,9 +207,9 @@ def test_the_plan_of_a_study_is_of_the_model_that_it_trains(planned):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--preset", "paper", "--batch", "64"], "of a study --set says them: model.*, train.batch"),
-        (["--preset", "paper", "--model", "base"], "are for a model without --preset"),
-        (["--set", "model.width=768"], "only a study has these settings; add --preset"),
+        (["--preset", "paper", "--batch", "64"], "set model.*, train.batch"),
+        (["--preset", "paper", "--model", "base"], "cannot be used with --preset"),
+        (["--set", "model.width=768"], "these settings need a study; add --preset"),
     ],
 )
 def test_a_study_and_a_fixed_model_are_not_mixed(arguments, words, capsys):

@@ -136,7 +136,7 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
     with pytest.raises(study_runs.TrialsFailed) as failed:
         study_runs.require_results(jobs, states, "hma study")
     for line in ("missing: trial 1", "missing: trial 2"):
-        assert f"  {line}: not started, since another trial was refused\n" in str(failed.value)
+        assert f"  {line}: not started, because another trial was refused\n" in str(failed.value)
     assert not (tmp_path / "trials" / "t0" / "run").exists()
     (tmp_path / "trials" / "t0" / "failure.json").unlink()
     assert subprocess.run(command(tmp_path / "trials" / "t0")).returncode == Exit.REFUSED
@@ -243,9 +243,12 @@ TAMPERING = {
     "other sources": (lambda d: edit(d / "provenance.json", "c0de", "c0da"), "provenance.json was changed"),
     "another seed": (lambda d: edit(d / "job.json", '"seed": 0', '"seed": 5'), "job.json describes trial"),
     "other tokens": (lambda d: edit(d / "job.json", "5708e", "5708f"), "job.json describes trial"),
-    "no job": (lambda d: (d / "job.json").unlink(), "does not say what it is"),
-    "a job of nothing": (lambda d: edit(d / "job.json", '"provenance": {', '"provenance": 3, "p": {'), "what it is"),
-    "cut off": (lambda d: (d / "result.json").write_text((d / "result.json").read_text()[:300]), "not whole"),
+    "no job": (lambda d: (d / "job.json").unlink(), "the description of the finished trial cannot be read"),
+    "a job of nothing": (
+        lambda d: edit(d / "job.json", '"provenance": {', '"provenance": 3, "p": {'),
+        "cannot be read",
+    ),
+    "cut off": (lambda d: (d / "result.json").write_text((d / "result.json").read_text()[:300]), "is damaged"),
     "of an earlier version": (lambda d: edit(d / "result.json", '"hash"', '"hush"'), "no 'hash' in result.json"),
 }
 

@@ -98,7 +98,7 @@ def test_findings_of_another_encoding_are_named_and_a_mark_of_utf_8_is_none_of_t
     path.write_text("## `width`\n\nΔPSNR falls\n", encoding="utf-8-sig")
     assert "ΔPSNR falls" in read_findings(path, ("width",)).of_axes["width"]
     path.write_text("## `width`\n\ndéjà\n", encoding="latin-1")
-    with pytest.raises(ConfigError, match="findings.md is not UTF-8 .*; save it as such"):
+    with pytest.raises(ConfigError, match="findings.md is not UTF-8 .*; save it in this encoding"):
         read_findings(path, ("width",))
 
 

@@ -125,7 +125,9 @@ def test_a_decoding_that_every_trained_trial_would_fail_at_is_refused(preset, se
 
 def test_the_seed_of_a_study_s_trials_is_one_of_its_seeds():
     """`train.seed` would be replaced by each of them without a word."""
-    with pytest.raises(ConfigError, match="train.seed: a trial has one of seeds; set seeds=3"):
+    with pytest.raises(
+        ConfigError, match="train.seed cannot be set, because trials take their seeds from seeds; set seeds=3"
+    ):
         override(SMOKE, ["train.seed=3"])
     assert override(SMOKE, ["seeds=3"]).seeds == (3,)
     with pytest.raises(ConfigError, match="a seed of seeds and ablation_seeds must lie in"):

@@ -153,7 +153,7 @@ def test_store_of_an_older_format_is_made_again_when_asked_for(data, tmp_path, c
     capsys.readouterr()
     assert main(arguments) == 2
     said = capsys.readouterr().err
-    assert "manifest format 1, but only 2 can be read" in said and "--replace tokens" in said
+    assert "manifest format 1, but only 2 and 3 can be read" in said and "--replace tokens" in said
     assert main([*arguments, "--replace", "tokens"]) == 0
     assert contents(tmp_path / "tokens") == before
 

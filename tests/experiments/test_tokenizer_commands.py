@@ -64,7 +64,8 @@ def test_released_model_is_evaluated_on_ids_of_an_imported_tokenizer(arm, tmp_pa
     assert hma("evaluate", tmp_path / "run", *common) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert (
-        f"taken for those of the tokenizer here, {load_tokenizer(tokenizer).identity}" in said and ", step" not in said
+        f"assumed that they are those of the tokenizer here, {load_tokenizer(tokenizer).identity}" in said
+        and ", step" not in said
     )
     evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert evaluation[ARM.name]["perplexity"]["mean"] == pytest.approx(64, rel=0.3)

@@ -129,7 +129,7 @@ def test_a_dry_run_counts_nothing_that_is_there(train):
     train()
     said, *_ = train("--set", "train.steps=6", "--dry-run")
     said = " ".join(said.split())
-    assert "There already, and not counted: the tokenizer, tokens, 3 steps of training. About" in said
+    assert "Already done, and not counted: the tokenizer, tokens, 3 steps of training. About" in said
     assert "to prepare" not in said
 
 
@@ -317,7 +317,7 @@ def released(tmp_path_factory) -> Path:
 def test_a_converted_run_is_fine_tuned_as_the_model_that_it_is(released, train, tmp_path, capsys):
     train()  # there is a tokenizer
     said, trial, _ = train("--from", str(released), "--run", str(tmp_path / "tuned"))
-    assert "note: kept as they are, for want of data here: push2" in said
+    assert "note: unchanged, because the study has no data of them: push2" in said
     before, after = load_run(released), load_run(tmp_path / "tuned")
     assert trial.model == after.model == before.model and before.model.width == 8
     assert after.table == before.table and set(trial.datasets) == {ARM.name, BASE.name}
@@ -348,7 +348,11 @@ def test_what_a_trial_keeps_is_not_written_over(command, train, where, tmp_path,
     asked = ["--run", str(trial / "run"), "--set", "train.steps=5"] if command == "train" else ["--to", str(trial)]
     asked = [*([str(tmp_path / "run")] if command == "evaluate" else []), *asked]
     assert main([command, *asked, *where]) == 2
-    said = f"train --from {trial / 'run'}" if command == "train" else "a trial is there, whose result vouches"
+    said = (
+        f"train --from {trial / 'run'}"
+        if command == "train"
+        else "is the directory of a trial, whose results must not be changed"
+    )
     assert said in capsys.readouterr().err
     assert sorted(trial.rglob("*")) == there
 
@@ -391,7 +395,7 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     )
     only = ("--set", f"train.only={BASE.name}")
     said = refused("adapt", str(beside), "--data", *data, *only)
-    assert "train.only: leave it out; the new robots alone are trained" in said
+    assert "leave out train.only: `hma adapt` trains only the new robots' parameters" in said
     said = refused("adapt", str(beside), "--data", *data, "--set", "train.masking.setting=passive")
     assert f"train.only: {BASE.name} would have no parameters to train" in said
     arguments, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)

@@ -70,7 +70,7 @@ def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int
     for name, starts in found.items():
         require(
             len(starts) == count,
-            f"--starts {count}: {name} has {len(starts)} starts that the true simulator can begin at, too; give fewer",
+            f"--starts {count}: {name} has only {len(starts)} starts that the true simulator supports; give fewer",
         )
     return found
 
@@ -106,8 +106,8 @@ def main() -> None:
     require(args.starts >= 1, f"--starts must be at least 1, got {args.starts}")
     require(
         0 < args.every < 120 * args.minutes,
-        f"--every {args.every:g}: a row of the table needs at least half as many seconds, and --minutes "
-        f"{args.minutes:g} are {60 * args.minutes:g}; give fewer",
+        f"--every {args.every:g}: a row of the table needs at least half as many seconds, but --minutes "
+        f"{args.minutes:g} are {60 * args.minutes:g}; give a smaller --every",
     )
     detector, simulator, rows = Detector.load(args.detector), load_simulator(args.run), []
     robots = select_robots(native_robots(simulator.robots), args.robots)

@@ -63,7 +63,10 @@ class Drive:
 def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
     """The suite's robots that the model runs at their native rate (stride 1). Raises ConfigError if there are none."""
     native = {name: robot for name, robot in suite_robots(robots).items() if robot.stride == 1}
-    require(bool(native), "no robot of the suite at its native rate: drives have an action for every frame")
+    require(
+        bool(native),
+        "the model needs a robot of the suite at its native rate, since a drive has an action for every frame",
+    )
     return native
 
 

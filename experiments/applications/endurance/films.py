@@ -98,7 +98,7 @@ def _resume(
 ) -> tuple[int, list[list[Mapping[str, np.ndarray]]]]:
     """(frames done, measures of each film) as `_save_progress` wrote them; restores the simulator, which has been
     reset. ConfigError for a damaged file."""
-    with reading_arrays(path, "remove it, the same command films from the start") as arrays:
+    with reading_arrays(path, "remove it; the same command then films from the start") as arrays:
         parts = [[{f.name: arrays[f"film/{i}/{f.name}"] for f in fields(Film)}] for i in range(len(drives))]
         simulator.restore(from_arrays(arrays, simulator.snapshot()))
         return int(arrays["made"]), parts
@@ -139,6 +139,6 @@ def save_films(films: Mapping[str, Film], path: Path) -> None:
 
 def load_films(path: Path) -> dict[str, Film]:
     """Raises ConfigError for a damaged file."""
-    with reading_arrays(path, "remove it, the same command makes it again") as arrays:
+    with reading_arrays(path, "remove it; the same command then makes it again") as arrays:
         robots = list(dict.fromkeys(name.split("/")[0] for name in arrays))
         return {robot: Film(**{f.name: arrays[f"{robot}/{f.name}"] for f in fields(Film)}) for robot in robots}

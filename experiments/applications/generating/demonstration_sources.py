@@ -33,8 +33,11 @@ class Training:
 
     def __post_init__(self) -> None:
         """Raises ConfigError."""
-        require(self.given >= 1, f"given = {self.given}: a generated trajectory begins with at least 1 recorded frame")
-        require(bool(self.seeds), "no seed: at least 1 is needed")
+        require(
+            self.given >= 1,
+            f"--given must be at least 1, got {self.given}: a generated trajectory begins with recorded frames",
+        )
+        require(bool(self.seeds), "no seed was given: at least 1 is needed")
         require(self.steps >= 1, f"--steps must be at least 1, got {self.steps}")
 
 
@@ -55,7 +58,8 @@ class Settings(Training):
         require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
         require(
             self.given < self.frames,
-            f"--given {self.given}: an episode has {self.frames} frames, of which at least the last must be generated",
+            f"--given {self.given} must be below the {self.frames} frames of an episode, so that at least one frame "
+            "is generated",
         )
 
     def make_task(self) -> Task:
@@ -105,7 +109,7 @@ class ScriptedSource:
         made = record(task, count, seed=seed, **how)
         far = np.flatnonzero(start_distances(task, made.seeds) >= settings.least)[: settings.trajectories]
         enough = len(far) == settings.trajectories
-        require(enough, f"{task.robot}: hardly an episode begins {settings.least:g} from its goal")
+        require(enough, f"{task.robot}: too few episodes begin at least {settings.least:g} away from the goal")
         return made.take(far)
 
     def judge(self, policy: Policy) -> dict[str, list[float]]:
@@ -122,13 +126,13 @@ class RecordedSource:
         """Raises ConfigError for too few recordings, and for a split that would be judged on itself."""
         require(
             (recorded.fingerprint, recorded.split) != (held_out.fingerprint, held_out.split),
-            f"{recorded.name}: policies would be judged on what they were trained on, split {recorded.split}; name "
-            "another one with --held-out",
+            f"{recorded.name}: policies would be evaluated on their training data, split {recorded.split}; give "
+            "another split with --held-out",
         )
         require(
             len(recorded) >= training.trajectories,
-            f"{recorded.name}, split {recorded.split}, has {len(recorded)} trajectories, {training.trajectories} are "
-            "needed; name another --split or DATASET",
+            f"{recorded.name}, split {recorded.split}, has {len(recorded)} trajectories, but {training.trajectories} "
+            "are needed; give another --split or DATASET",
         )
         self.robot, self._recorded, self._held_out = robot, recorded, held_out
         about = {"recordings": describe(recorded), "held_out": describe(held_out)}
@@ -139,13 +143,17 @@ class RecordedSource:
         require(
             len(longer) == self.settings.trajectories,
             f"{self._recorded.name}, split {self._recorded.split}, has {len(longer)} trajectories longer than "
-            f"{self.settings.given} frame(s), {self.settings.trajectories} are needed; name another --split or DATASET",
+            f"{self.settings.given} frame(s), but {self.settings.trajectories} are needed; give another --split or "
+            "DATASET",
         )
         return as_demonstrations([confined(t, self.robot) for t in longer])
 
     def record_held_out(self) -> Demonstrations:
         longer = self._first(self._held_out, self.settings.trajectories)
-        require(bool(longer), f"{self._held_out.name}, split {self._held_out.split}, has no trajectory to judge on")
+        require(
+            bool(longer),
+            f"{self._held_out.name}, split {self._held_out.split}, has no trajectory to evaluate policies on",
+        )
         return as_demonstrations(longer)
 
     def _first(self, trajectories: Trajectories, count: int) -> list[Trajectory]:

@@ -127,13 +127,13 @@ class StoredTrajectories(Trajectories):
         made_by = manifest.tokenizer.identity
         require(
             made_by == tokenizer.identity,
-            f"{store.root / name} has tokens of tokenizer {made_by}, the model's is {tokenizer.identity}; give the "
-            "RLDS directory that the tokens were made of",
+            f"{store.root / name} has tokens of tokenizer {made_by}, but the model's tokenizer is "
+            f"{tokenizer.identity}; give the RLDS directory that the tokens were made from",
         )
         require(
             robot.stride % manifest.frame_step == 0,
-            f"{store.root / name} keeps every {manifest.frame_step} frames, {robot.name} is shown every "
-            f"{robot.stride}; give the RLDS directory that the tokens were made of",
+            f"{store.root / name} keeps one of {manifest.frame_step} frames, but {robot.name} needs one of "
+            f"{robot.stride}; give the RLDS directory that the tokens were made from",
         )
         self._store, self._tokenizer, self._robot = store, tokenizer, robot
         self._every = robot.stride // manifest.frame_step
@@ -190,7 +190,9 @@ def open_trajectories(
     chosen = robot or robots.get(name)
     if chosen is None:
         known = ", ".join(robots)
-        raise ConfigError(f"{place} is called {name!r}, but the model's robots are {known}; name one with --robot")
+        raise ConfigError(
+            f"the dataset of {place} is called {name!r}, but the model's robots are {known}; choose one with --robot"
+        )
     if stored:
         return StoredTrajectories(TokenStore(path.parent), name, split, tokenizer, chosen), chosen
     return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size), chosen
@@ -202,21 +204,21 @@ def describe_reconstruction(recorded: Trajectories) -> str:
     if not recorded.reconstructed:
         return ""
     return (
-        f"note: the token store keeps no frames of {recorded.name}, split {recorded.split}: what the tokenizer makes of "
-        "its tokens stands for the recording, and hides the tokenizer's own error; give the directory of the recordings "
-        "instead"
+        f"note: the token store has no frames of {recorded.name}, split {recorded.split}. PSNR is computed against "
+        "frames decoded from tokens, so it does not contain the error of the tokenizer; to avoid this, give the "
+        "directory of the recordings"
     )
 
 
 def _require_fit(spec: DatasetSpec, robot: Robot) -> None:
     require(
         spec.action_dim == robot.action_dim,
-        f"{spec.name} has {spec.action_dim} action values, {robot.name} takes {robot.action_dim}; name the robot whose "
-        "actions they are with --robot",
+        f"{spec.name} has {spec.action_dim} action values, but {robot.name} needs {robot.action_dim}; give the robot "
+        "whose actions they are with --robot",
     )
     require(
         not robot.hz or robot.hz == spec.hz,
-        f"{spec.name} was recorded at {spec.hz:g} Hz, the model knows {robot.name} at {robot.hz:g} Hz",
+        f"{spec.name} was recorded at {spec.hz:g} Hz, but the model was trained with {robot.name} at {robot.hz:g} Hz",
     )
 
 

@@ -89,9 +89,9 @@ def write_blind(judged: Judgement, out: Path, clips: int = 60) -> Path:
         f'content="width=device-width, initial-scale=1"><title>Success or not?</title>'
         f'<style>{STYLE}</style></head><body data-page="{page}">'
         f"<h1>Is the task done?</h1><p>The goal: {html.escape(judged.config.task.goal)}, for "
-        f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows back and on.</p>"
+        f"{judged.config.task.hold} consecutive frames at any time. Keys: S success, F failure, arrow keys previous and next clip.</p>"
         f"{''.join(pictures)}<p id=where></p><button id=success>success</button><button id=failure>failure</button>"
-        "<button id=back>back</button><button id=on>on</button><button id=save>save labels.json</button>"
+        "<button id=back>previous</button><button id=on>next</button><button id=save>save labels.json</button>"
         f"<script>{SCRIPT}</script></body></html>\n"
     )
     write_file(out / "blind.json", json.dumps({"page": page, "clips": chosen}) + "\n")
@@ -123,7 +123,8 @@ def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
         saved.get("page") == key["page"], f"{path} has labels of another page ({saved.get('page')}, not {key['page']})"
     )
     require(
-        bool(labels) and all(0 <= n < len(clips) for n in labels), f"{path} labels clips that the page has not, or none"
+        bool(labels) and all(0 <= n < len(clips) for n in labels),
+        f"{path} has labels of clips that are not on the page, or no labels",
     )
     return {(clips[n][0], clips[n][1], int(clips[n][2])): value for n, value in labels.items()}
 

@@ -39,4 +39,4 @@ class JudgeConfig:
         require(0 <= self.seed <= last, f"--seed must lie in 0..{last}, got {self.seed}")
         fewest = 2  # with one at a time the control has no other episode to take actions from
         require(self.batch >= fewest, f"--batch must be at least {fewest}, got {self.batch}")
-        require(self.starts % self.batch == 0, f"{self.starts} starts cannot be run {self.batch} at a time")
+        require(self.starts % self.batch == 0, f"--starts {self.starts} is not a multiple of --batch {self.batch}")

@@ -72,7 +72,7 @@ class SimulatedTruth:
 
     def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator, step: Step):
         """Raises ConfigError for a robot that has none."""
-        require(has_truth(robot), f"{robot.name} has no true simulator here; give --recordings of it")
+        require(has_truth(robot), f"{robot.name} has no true simulator here; give recordings of it with --recordings")
         self.config, self._robot, self._learned, self._step = config, robot, learned, step
         self._size = learned.tokenizer.image_size
 
@@ -124,8 +124,8 @@ def describe_rare_success(demos: Demonstrations, task: Task) -> str:
     if not task.in_suite or task.name != OWN or done >= OFTEN:
         return ""
     return (
-        f"The expert of {task.robot} does its own task in {done:.0%} of the demonstrations ({task.frames} frames each). What it "
-        "does not do, no policy learns from it; reaching the mark, --task reach, is easier."
+        f"The scripted expert of {task.robot} succeeds in only {done:.0%} of the demonstrations ({task.frames} frames "
+        "each), so policies cannot learn the task well from it; reaching the mark, --task reach, is easier."
     )
 
 

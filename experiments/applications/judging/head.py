@@ -60,7 +60,7 @@ class HeadConfig:
     threshold: float = 0.5
 
     def __post_init__(self):
-        require(0 < self.threshold < 1, f"a threshold lies between 0 and 1, got {self.threshold}")
+        require(0 < self.threshold < 1, f"a threshold must lie between 0 and 1, got {self.threshold}")
 
 
 def init_head(config: HeadConfig, seed: int) -> Params:
@@ -163,7 +163,7 @@ def fit_heads(
     From n pairs of frames uint8 [n, 2, size, size, 3], the episode's first and the present one, and whether the goal is
     reached in the latter, bool [n]. Each time that a pair is seen both are moved by up to `shift` pixels, alike: of few
     recordings it would otherwise learn by heart where things were. Raises ConfigError where all have one label."""
-    require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
+    require(bool(labels.any()) and not labels.all(), "a success head needs training frames with success and without")
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
     data = {"images": pairs, "label": labels.astype(np.float32), "weight": weight}
 

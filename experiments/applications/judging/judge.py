@@ -107,7 +107,7 @@ def judge_recorded(
 def _require_policy(simulator: Simulator, given: bool | int) -> None:
     """Raises ConfigError where neither are policies given nor is the model one."""
     some = given or _predicts_actions(simulator)
-    require(bool(some), "there is no policy to judge but the random one: give --policies FILE")
+    require(bool(some), "there is no policy to evaluate except the random one: give --policies FILE")
 
 
 def _predicts_actions(simulator: Simulator) -> bool:
@@ -147,7 +147,8 @@ def _judge(
     policies += user_policies
     others = [name for name in counted if name not in policies]
     require(
-        not others, f"counted on the real robot: {few(others)}; judged here: {', '.join(policies)}; use the same names"
+        not others,
+        f"--real has policies {few(others)}, but the policies here are {', '.join(policies)}; use the same names",
     )
     pin_settings(out, run_directory, simulator, {"config": to_dict(config), **about}, file="judge.json")
     if user_file is not None:

@@ -31,7 +31,11 @@ def read_real(path: Path) -> dict[str, Count]:
         raise ConfigError(f"{path} cannot be read as counts of the real robot ({error})") from error
     columns = list(rows[0][1]) if rows else []
     missing = [name for name in COLUMNS if name not in columns]
-    require(not missing, f"{path}: no column {', '.join(missing)}, or no row; a row has {', '.join(COLUMNS)}")
+    require(
+        not missing,
+        f"{path}: column {', '.join(missing)} is missing, or there are no rows; the columns must be "
+        f"{', '.join(COLUMNS)}",
+    )
     counts: dict[str, Count] = {}
     for line, row in rows:
         name = row["policy"]
@@ -39,11 +43,11 @@ def read_real(path: Path) -> dict[str, Count]:
             count = Count(int(row["successes"]), int(row["episodes"]))
         except (TypeError, ValueError) as error:
             raise ConfigError(
-                f"{path}, line {line}: successes and episodes of {name} are whole numbers ({error})"
+                f"{path}, line {line}: successes and episodes of {name} must be whole numbers ({error})"
             ) from error
         fits = 0 <= count.successes <= count.episodes and count.episodes >= 1
         require(fits, f"{path}, line {line}: {name} cannot succeed in {count.successes} of {count.episodes} episodes")
-        require(name not in counts, f"{path}, line {line}: {name} has a line before this one; add them up")
+        require(name not in counts, f"{path}, line {line}: {name} is already in an earlier line; add the two up")
         counts[name] = count
-    require(len(counts) >= FEWEST, f"{path} has {len(counts)} policies; an order to compare needs at least {FEWEST}")
+    require(len(counts) >= FEWEST, f"{path} has {len(counts)} policies, but a comparison needs at least {FEWEST}")
     return counts

@@ -90,9 +90,9 @@ class RecordedTruth:
         require(
             min(map(len, kinds)) >= FEWEST,
             f"{recorded.name}, split {recorded.split}: of {len(outlines)} recordings {len(kinds[0])} succeeded and "
-            f"{len(kinds[1])} failed ({self._left_out['unknown']:.0f} do not say, {self._left_out['too short']:.0f} have less "
-            f"than the {BEFORE + task.hold + 1} frames at the model's rate that --hold {task.hold} needs). A success head "
-            f"needs at least {FEWEST} of each",
+            f"{len(kinds[1])} failed ({self._left_out['unknown']:.0f} do not say whether they did, "
+            f"{self._left_out['too short']:.0f} have fewer than the {BEFORE + task.hold + 1} frames at the model's "
+            f"rate that --hold {task.hold} needs). A success head needs at least {FEWEST} of each kind",
         )
         self.held_out = sorted((i for kind in kinds for i in kind[: len(kind) // HELD_OUT]), key=usable.index)
         self.learnt = [i for i in usable if i not in set(self.held_out)]
@@ -102,8 +102,9 @@ class RecordedTruth:
         self._begun_from = [i for i in self.held_out if self._reached is None or not self._reached[i][0]]
         require(
             len(self._begun_from) >= 2,
-            f"{recorded.name}: {len(self._begun_from)} of {len(self.held_out)} recordings that are held out have not reached "
-            f"their goal (--reward {task.reward}) by frame {BEFORE} at the model's rate, from which policies act",
+            f"{recorded.name}: {len(self._begun_from)} of {len(self.held_out)} held-out recordings have not yet "
+            f"reached the goal (--reward {task.reward}) at frame {BEFORE} of the model's rate, where policies start; "
+            "at least 2 are needed",
         )
         starts = min(config.starts, len(self._begun_from))
         batch = min(config.batch, starts)
@@ -127,8 +128,9 @@ class RecordedTruth:
                 rewards = self._recorded.rewards(i)
                 require(
                     rewards is not None and len(rewards) == frames[i] and bool(np.isfinite(rewards[1:]).all()),
-                    f"{self._recorded.origin(i)}: no reward of every step, which --reward asks for; leave it out, and the ends "
-                    "of recordings say which succeeded (tokens have no rewards: give the dataset that they were made of)",
+                    f"{self._recorded.origin(i)}: it has no reward for every step, which --reward needs. Leave out "
+                    "--reward, so that success is taken from the end of each recording; if DATASET is a token store, "
+                    "which has no rewards, give the dataset that it was made from",
                 )
                 reached.append(rewards[BEFORE:] >= least)
         return reached
@@ -137,7 +139,9 @@ class RecordedTruth:
         return {"recordings": describe(self._recorded)}
 
     def demonstrations(self) -> Demonstrations:
-        raise ConfigError("recordings have no expert that the ladder could learn from: --cloned 0 --diffusion 0")
+        raise ConfigError(
+            "with --recordings there is no scripted expert to train policies on: use --cloned 0 --diffusion 0"
+        )
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
         config, fit = self.config.head, self.config.head.fit

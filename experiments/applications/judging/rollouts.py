@@ -53,7 +53,7 @@ def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
                     chosen.append(start)
                 if len(chosen) == count:
                     return chosen
-    raise ConfigError(f"{task.robot}: hardly a held-out episode begins without its goal reached")
+    raise ConfigError(f"{task.robot}: in too many held-out episodes the goal is already reached at the start")
 
 
 def run(
@@ -72,7 +72,7 @@ def run(
     should succeed no more often than chance.
     """
     parts, batch = [], len(simulator)
-    require(len(starts) % batch == 0, f"{len(starts)} starts cannot be run {batch} at a time")
+    require(len(starts) % batch == 0, f"the number of starts, {len(starts)}, is not a multiple of the batch, {batch}")
     for first in range(0, len(starts), batch):
         part = slice(first, first + batch)
         parts.append(_run(simulator, policy, starts[part], seeds[part], task, shuffled))
@@ -118,5 +118,5 @@ def save_rollout(rollout: Rollout, path: Path) -> None:
 
 def load_rollout(path: Path) -> Rollout:
     """Raises ConfigError for a damaged file."""
-    with reading_arrays(path, "remove it, the same command makes it again") as arrays:
+    with reading_arrays(path, "remove it; the same command then makes it again") as arrays:
         return Rollout(**{f.name: arrays[f.name] for f in fields(Rollout)})

@@ -52,16 +52,21 @@ class CheckedPolicy:
     def act(self, images: np.ndarray) -> np.ndarray:
         """Raises ConfigError for actions of another shape or type, and for such that are not finite."""
         shape, given = (len(images), self.robot.action_dim), self.policy.act(images.copy())
-        wanted = f"{self.where}: act(images) must give float32 {list(shape)}, a raw action of {self.robot.name} for each image"
+        wanted = (
+            f"{self.where}: act(images) must return float32 {list(shape)}, an unnormalised action of "
+            f"{self.robot.name} for each image"
+        )
         try:
             actions = np.asarray(given)
         except ValueError as error:  # lists of different lengths
-            raise ConfigError(f"{wanted}; it gave what is no array ({error})") from error
+            raise ConfigError(f"{wanted}; it returned something that is not an array ({error})") from error
         good = actions.shape == shape and np.issubdtype(actions.dtype, np.floating)
-        require(good, f"{wanted}; it gave {actions.dtype} {list(actions.shape)}")
+        require(good, f"{wanted}; it returned {actions.dtype} {list(actions.shape)}")
         actions = np.array(actions, np.float32)
         for b in np.flatnonzero(~np.isfinite(actions).all(1))[:1]:
-            raise ConfigError(f"{wanted}; what it gave for image {b} is not finite: {actions[b].tolist()}")
+            raise ConfigError(
+                f"{wanted}; the action that it returned for image {b} is not finite: {actions[b].tolist()}"
+            )
         return actions
 
 
@@ -82,20 +87,20 @@ def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolic
     require(
         isinstance(policies, dict), f"{where} must return a dict of policies by name, got {type(policies).__name__}"
     )
-    require(bool(policies), f"{where} returned no policy")
+    require(bool(policies), f"{where} returned an empty dict")
     for name in policies:
         fits = isinstance(name, str) and NAME.fullmatch(name)
         require(
             bool(fits),
-            f"{where}: {name!r} becomes the name of files; write it with at most 100 letters, digits, '.', '_' and '-', a "
-            "letter or digit first",
-        )
-        require(
-            not TAKEN.fullmatch(name), f"{where}: {name!r} is the name of a policy that is made here; choose another"
+            f"{where}: {name!r} is used in file names; use at most 100 letters, digits, '.', '_' and '-', a letter or "
+            "digit first",
         )
     lower = [name.lower() for name in policies]
     twice = [name for name in policies if lower.count(name.lower()) > 1]
-    require(not twice, f"{where}: {', '.join(twice)} would be the same files where case does not count; rename one")
+    require(
+        not twice,
+        f"{where}: {', '.join(twice)} differ only in upper and lower case, so their files could collide; rename one",
+    )
     checked = {name: CheckedPolicy(policy, robot, f"{path}: policy {name!r}") for name, policy in policies.items()}
     return checked, success_of(file)
 

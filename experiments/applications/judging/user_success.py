@@ -42,18 +42,20 @@ class UserSuccess:
     def _call(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         given = self._function(images.copy(), first.copy())
         wanted = (
-            f"{self._where}: {SIGNATURE} must give [{len(images)}], for each image how probable it is that the "
-            "goal is reached, or whether it is"
+            f"{self._where}: {SIGNATURE} must return an array [{len(images)}]: for each image the probability that "
+            "the goal is reached, or true or false"
         )
         try:
             returned = np.asarray(given)
         except ValueError as error:  # lists of different lengths
-            raise ConfigError(f"{wanted}; it gave what is no array ({error})") from error
+            raise ConfigError(f"{wanted}; it returned something that is not an array ({error})") from error
         kind = np.issubdtype(returned.dtype, np.floating) or returned.dtype == bool
-        require(returned.shape == (len(images),) and kind, f"{wanted}; it gave {returned.dtype} {list(returned.shape)}")
+        require(
+            returned.shape == (len(images),) and kind, f"{wanted}; it returned {returned.dtype} {list(returned.shape)}"
+        )
         values = returned.astype(np.float32)
         inside = (values >= 0) & (values <= 1)  # of what is no number, too
-        require(bool(inside.all()), f"{wanted}, in [0, 1]; it gave {values[~inside][:1]}")
+        require(bool(inside.all()), f"{wanted}, in [0, 1]; it returned {values[~inside][:1]}")
         return values
 
 

@@ -62,7 +62,7 @@ class BestPlan:
 
     def update(self, candidates: np.ndarray, costs: np.ndarray) -> None:
         """Raises ConfigError for costs that are not finite."""
-        require(bool(np.isfinite(costs).all()), "the score of a candidate is not finite")
+        require(bool(np.isfinite(costs).all()), "the cost of a candidate is not finite")
         i = int(costs.argmin())
         self.costs.append(float(costs[i]))
         if costs[i] < self.cost:

@@ -98,7 +98,7 @@ def _start(simulator: Simulator, truth: Truth, session: Session, values: Message
     robot = simulator.robot(text(values.get("robot")))
     starts = [start for start in simulator.starts if start.robot == robot.name]
     number, seed = whole(values.get("start", 0)), whole(values.get("seed", 0))
-    require(number < len(starts), f"{robot.name} has {len(starts)} starts, no {number}")
+    require(number < len(starts), f"{robot.name} has {len(starts)} starts; there is no start {number}")
     true = (
         None if session.truth is None else _begin_truth(truth, robot, starts[number])
     )  # may fail: before anything changes
@@ -220,5 +220,5 @@ def whole(value: Any) -> int:
 
 
 def text(value: Any) -> str:
-    require(isinstance(value, str), f"{value!r:.80} is no name")
+    require(isinstance(value, str), f"{value!r:.80} is not a name")
     return value

@@ -128,7 +128,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
         visitor = sessions.connect(request.query.get("token"))
         await _serve_connection(sessions, visitor, socket, request.transport)
     except NoFreeSession:
-        await socket.send_str(json.dumps({"type": "full", "message": "all seats are taken; try again later"}))
+        await socket.send_str(json.dumps({"type": "full", "message": "all places are taken; try again later"}))
         await socket.close(code=1013)
     finally:
         sockets.discard(socket)
@@ -158,7 +158,7 @@ async def _receive(sessions: SessionManager, visitor: Visitor, socket: web.WebSo
             return
         if message.type != WSMsgType.TEXT or not sessions.submit(visitor, _parsed(message.data)):
             faults += 1
-            visitor.tell({"type": "error", "message": "that message makes no sense"})
+            visitor.tell({"type": "error", "message": "this message is not valid"})
             if faults >= MAX_INVALID_MESSAGES:
                 await socket.close(code=1008)
                 return

@@ -49,7 +49,7 @@ IDLE_SECONDS = 900.0
 MAX_INVALID_MESSAGES = 20
 """Invalid messages of one connection, after which it is closed."""
 
-FAILED = "the simulator failed, as the server's log says; start again if it no longer moves"
+FAILED = "the simulator failed (see the server's log); start the episode again if it no longer moves"
 """The reply to requests that were lost by a fault of the server."""
 
 
@@ -120,7 +120,7 @@ class SessionManager:
         if token in self.visitors:
             visitor = self.visitors[token]
             # The same page in a second window takes over. The first is told, or it would come back and take over again.
-            self._disconnect(visitor, "this goes on in another window")
+            self._disconnect(visitor, "this session continues in another window")
             visitor.active = now
             return visitor
         if not self._free:
@@ -147,7 +147,7 @@ class SessionManager:
         if not away:
             raise NoFreeSession
         gone = min(away, key=lambda v: (v.socket is not None, v.active))
-        self._disconnect(gone, "your seat was given to another visitor; reload the page")
+        self._disconnect(gone, "your place was given to another visitor; reload the page")
         self.remove(gone)
 
     def connection_lost(self, visitor: Visitor, socket: web.WebSocketResponse) -> None:

@@ -44,9 +44,10 @@ class BcConfig:
     light: float = 0.03  # standard deviation by which the light of a training example differs, in [-1, 1]
 
     def __post_init__(self):
-        require(self.frames >= 1, f"a policy sees at least 1 frame, got {self.frames}")
+        require(self.frames >= 1, f"a policy must see at least 1 frame, got {self.frames}")
         require(
-            1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed"
+            1 <= self.execute <= self.chunk,
+            f"execute must lie in 1..{self.chunk}, the actions of a chunk, got {self.execute}",
         )
 
 

@@ -34,7 +34,7 @@ def start_seeds(task: Task, count: int, least: float = 0.0) -> np.ndarray:
     ones. Raises ConfigError where there are hardly any."""
     seeds = episode_seeds(task.spec, MOST_TRIED * count, 0, SPLIT)
     far = seeds[start_distances(task, seeds) >= least][:count]
-    require(len(far) == count, f"{task.robot}: hardly a start is {least:g} away from its goal")
+    require(len(far) == count, f"{task.robot}: too few starts are at least {least:g} away from the goal")
     return far
 
 

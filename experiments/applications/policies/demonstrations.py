@@ -38,7 +38,7 @@ class Demonstrations:
         require(
             self.images.dtype == np.uint8 and self.actions.shape[:2] == shape and self.reached.shape == shape
             and len(self.lengths) == len(self.successes) == len(self.seeds) == shape[0],
-            f"demonstrations of different numbers or lengths: images {self.images.shape}, "
+            f"the arrays of demonstrations have different numbers of episodes or frames: images {self.images.shape}, "
             f"actions {self.actions.shape}, reached {self.reached.shape}",
         )  # fmt: skip
 
@@ -91,7 +91,7 @@ def record(
             found += len(parts[-1])
         require(
             found >= wanted,
-            f"{task.robot}: the expert with noise {level:g} succeeds too rarely to record {wanted} episodes",
+            f"{task.robot}: the scripted expert with noise {level:g} succeeds too rarely to record {wanted} episodes",
         )
     return join(parts)
 

@@ -55,9 +55,13 @@ class DiffusionConfig:
 
     def __post_init__(self):
         require(
-            1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed"
+            1 <= self.execute <= self.chunk,
+            f"execute must lie in 1..{self.chunk}, the actions of a chunk, got {self.execute}",
         )
-        require(1 <= self.samples <= self.levels, f"{self.samples} denoising steps do not fit {self.levels} levels")
+        require(
+            1 <= self.samples <= self.levels,
+            f"the number of denoising steps must lie in 1..{self.levels}, the noise levels, got {self.samples}",
+        )
 
 
 def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:

@@ -55,7 +55,7 @@ def load_policy(directory: Path) -> ChunkPolicy:
     except (OSError, ValueError, SafetensorError) as error:
         raise ConfigError(f"{directory} cannot be read as a policy ({error}); train it again") from error
     kind = description.get("kind")
-    require(kind in KINDS, f"{directory}: a policy of kind {kind!r} is not known; there are {', '.join(KINDS)}")
+    require(kind in KINDS, f"{directory}: unknown kind of policy {kind!r}; known: {', '.join(KINDS)}")
     cls, config_type, init = KINDS[kind]
     config = from_dict(config_type, description["config"], f"{directory}: config")
     scale = from_dict(Scale, description["scale"], f"{directory}: scale")
@@ -72,5 +72,5 @@ def unnamed(arrays: Mapping[str, np.ndarray], like: Any, where: Path) -> Any:
     """The tree of `like` with these arrays. Raises ConfigError for others than it has."""
     shapes = {jax.tree_util.keystr(path): x.shape for path, x in jax.tree.leaves_with_path(like)}
     found = {name: x.shape for name, x in arrays.items()}
-    require(shapes == found, f"{where}: the weights are of another network than its description says; train it again")
+    require(shapes == found, f"{where}: the weights do not fit the network in its description; train the policy again")
     return jax.tree.map_with_path(lambda path, _: jnp.asarray(arrays[jax.tree_util.keystr(path)]), like)

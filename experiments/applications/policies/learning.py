@@ -32,7 +32,7 @@ class FitConfig:
     keep: tuple[int, ...] = ()
 
     def __post_init__(self):
-        require(self.steps >= 1 and self.batch >= 1, "training needs steps and a batch of at least 1")
+        require(self.steps >= 1 and self.batch >= 1, "steps and batch of training must be at least 1")
         require(
             all(0 <= k <= self.steps for k in self.keep), f"steps to keep must lie in 0..{self.steps}, got {self.keep}"
         )
@@ -92,5 +92,8 @@ def fit(
 def log_spaced_steps(steps: int, count: int, first: int = 20) -> tuple[int, ...]:
     """`count` steps of training from `first` to `steps`, evenly spaced in the logarithm."""
     require(count >= 2, f"checkpoints from {first} to {steps} steps are at least 2, got {count}")
-    require(steps > first, f"the first checkpoint is that of {first} steps: training must be longer, not {steps} steps")
+    require(
+        steps > first,
+        f"the first checkpoint is at {first} steps, so training must be longer than that, got {steps} steps",
+    )
     return tuple(sorted({round(first * (steps / first) ** (i / (count - 1))) for i in range(count)}))

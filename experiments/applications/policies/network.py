@@ -111,8 +111,8 @@ def require_multiples(height: int, width: int, size: int) -> None:
     """Raises ConfigError for images that cannot be averaged down to `size`."""
     require(
         height % size == 0 == width % size,
-        f"images of {height} x {width} pixels cannot be averaged down to the {size} x {size} that policies and success "
-        "heads see here; take a model whose frames are multiples of that",
+        f"policies and success heads need images of {size} x {size} pixels, but {height} x {width} is not a multiple "
+        "of this; use a model with other frames",
     )
 
 

@@ -29,8 +29,8 @@ class OwnHeadPolicy:
         setting = model.run.train.masking.setting
         require(
             predicts_actions(model.config, setting) and setting != "inverse",
-            f"the model was trained with train.masking.setting {setting!r}, so it is no policy; train one with policy or "
-            "full and model.action_heads=true",
+            f"the model was trained with train.masking.setting {setting!r}, so it cannot act as a policy; train one "
+            "with setting policy or full and model.action_heads=true",
         )
         self.tokenizer, self.robot, self.frames = tokenizer, robot, model.config.frames
         self.width = model.table.action_width

@@ -78,12 +78,16 @@ class Task:
     def __post_init__(self):
         require(
             self.robot in SPECS or self.robot in EXPERTS,
-            f"no task of a robot {self.robot!r}: a task needs a true simulator that says when it is done, and an expert "
-            f"in it, as there are of {', '.join([*SPECS, *EXPERTS])}; of others `hma judge` takes --recordings",
+            f"robot {self.robot!r} has no task: a task needs a true simulator, which says when it is done, and a "
+            f"scripted expert. These exist for {', '.join([*SPECS, *EXPERTS])}; for other robots use `hma judge "
+            "--recordings`",
         )
         known = TASKS if self.in_suite else (OWN,)
-        require(self.name in known, f"no task {self.name!r} of {self.robot}; there are {', '.join(known)}")
-        require(1 <= self.hold <= self.frames, f"a goal held for {self.hold} frames does not fit {self.frames} frames")
+        require(self.name in known, f"{self.robot} has no task {self.name!r}; it has {', '.join(known)}")
+        require(
+            1 <= self.hold <= self.frames,
+            f"the goal cannot be held for {self.hold} frames in an episode of {self.frames} frames",
+        )
 
     @property
     def in_suite(self) -> bool:
@@ -93,7 +97,7 @@ class Task:
     @property
     def spec(self) -> EmbodimentSpec:
         """The suite's robot with this task. Only what counts as done differs from its own: frames look the same."""
-        require(self.in_suite, f"{self.robot} is of a physics simulator: `hma judge` knows its task, nothing else does")
+        require(self.in_suite, f"{self.robot} is a robot of a physics simulator, whose task only `hma judge` supports")
         spec = SPECS[self.robot]
         if self.name == OWN:
             return spec
@@ -131,7 +135,7 @@ class RecordedTask:
         longest = self.frames or self.hold
         require(
             1 <= self.hold <= longest,
-            f"a goal held for {self.hold} frames does not fit {longest} frames (--hold, --frames)",
+            f"--hold {self.hold} is more than the {longest} frames of an episode (--frames)",
         )
 
 

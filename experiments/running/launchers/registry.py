@@ -75,7 +75,7 @@ def parse_settings(name: str, kind: type, settings: Sequence[str]) -> Any:
         key, separator, text = setting.partition("=")
         flag = f"--launcher-set {setting}"
         require(bool(separator), f"{flag}: write it as key=value; the {name} launcher has {known}")
-        require(key in hints, f"{flag}: the {name} launcher has no such setting, but {known}")
+        require(key in hints, f"{flag}: the {name} launcher has no such setting; it has {known}")
         if typing.get_origin(hints[key]) is tuple:
             values[key] = [*values.get(key, ()), text]
         elif str in (hints[key], *typing.get_args(hints[key])):

@@ -64,7 +64,7 @@ class SlurmSettings:
         require(0 < memory < math.inf, f"--launcher-set memory_gb={memory:g}: it must be positive")
         require(
             self.grace < 60 * self.minutes,
-            f"--launcher-set grace={self.grace}: a job of {self.minutes} minutes would be told to save before it begins",
+            f"--launcher-set grace={self.grace}: must be shorter than the job's {self.minutes} minutes",
         )
 
 
@@ -185,7 +185,9 @@ def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -
     try:
         executor = SlurmExecutor(folder, max_num_timeout=TIMEOUTS)
     except RuntimeError:
-        raise ConfigError("no Slurm here: srun is not on the PATH; start this where jobs are submitted") from None
+        raise ConfigError(
+            "Slurm is not available: srun is not on the PATH; run this command where jobs are submitted"
+        ) from None
     options = {
         "partition": settings.partition,
         "account": settings.account,

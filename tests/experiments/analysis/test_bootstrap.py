@@ -153,11 +153,11 @@ def test_what_does_not_belong_together_is_refused():
     rng = np.random.default_rng(0)
     table = judged(rng, robots=2)
     other = judged(np.random.default_rng(1), robots=2)
-    with pytest.raises(NotComparable, match=r"window \(r0, episode 100, frame 0\) is not the same one in both"):
+    with pytest.raises(NotComparable, match=r"window \(r0, episode 100, frame 0\) differs between the two"):
         make_panel([{0: table, 1: other}], LOSS)
-    with pytest.raises(NotComparable, match="not judged in every trial: r1"):
+    with pytest.raises(NotComparable, match="not evaluated in every trial: r1"):
         make_panel([{0: table, 1: table.of("r0")}], LOSS)
-    with pytest.raises(NotComparable, match="not judged: r9"):
+    with pytest.raises(NotComparable, match="not evaluated: r9"):
         make_panel([{0: table}], LOSS, ["r9"])
     with pytest.raises(ConfigError, match="a trial has no ssim"):
         make_panel([{0: table}], "ssim")
@@ -170,7 +170,7 @@ def test_what_does_not_belong_together_is_refused():
         one.minus(Panel(one.robot, one.episode + 1, one.points, one.seeds))
     with pytest.raises(NotComparable, match="or points"):
         one.minus(make_panel([{0: table}] * 2, LOSS))
-    with pytest.raises(ConfigError, match="seeds repeat"):
+    with pytest.raises(ConfigError, match="seeds must be given, each once"):
         Panel(one.robot, one.episode, one.points, ((),))
-    with pytest.raises(ConfigError, match="seeds repeat"):
+    with pytest.raises(ConfigError, match="seeds must be given, each once"):
         Panel(one.robot, one.episode, (np.repeat(one.points[0], 2, axis=0),), ((0, 0),))

@@ -88,5 +88,5 @@ def test_nats_of_other_tokens_are_not_compared():
 def test_other_windows_are_refused():
     a, b = sides()
     table = b.seeds[0]
-    with pytest.raises(NotComparable, match=r"window \(r0, episode 100, frame 0\) is not the same one"):
+    with pytest.raises(NotComparable, match=r"window \(r0, episode 100, frame 0\) differs between the two"):
         compare(a, Side("b", {0: replace(table, frames=table.frames - 1)}, "t"))

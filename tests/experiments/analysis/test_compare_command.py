@@ -128,7 +128,7 @@ def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path,
     (tmp_path / "nothing").mkdir()
     for b, why in (
         (shorter, "only one of the two evaluations has window ('r0', 100, 0)"),
-        (tmp_path / "nothing", "neither a study, nor a finished trial, nor a model that was evaluated"),
+        (tmp_path / "nothing", "neither a study, nor a finished trial, nor an evaluated model"),
     ):
         assert main(["compare", str(a), str(b), "--to", str(tmp_path / "c.csv")]) == Exit.REFUSED == 2
         assert why in capsys.readouterr().err and not (tmp_path / "c.csv").exists()

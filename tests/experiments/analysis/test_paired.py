@@ -67,7 +67,7 @@ def test_robots_that_one_model_alone_was_judged_on_are_left_out():
     table = judged(np.random.default_rng(0), robots=3)
     part = table.rows(np.flatnonzero(table.dataset != "r1"))
     assert list(paired(part, table)) == [OVERALL, "r0", "r2"]
-    with pytest.raises(NotComparable, match="no robot was judged in both: r1 and r0, r2$"):
+    with pytest.raises(NotComparable, match="no robot was evaluated in both: r1 and r0, r2$"):
         paired(table.of("r1"), part)
 
 
@@ -87,13 +87,13 @@ def changed(table, column: str, row: int, value):
     [
         ("episode", 999, r"r1: only one of the two evaluations has window \('r1', 103, 0\) \(and 1 others\)"),
         ("start", 7, r"only one of the two evaluations has window \('r1', 103, 0\)"),
-        ("frames", 5, r"window \(r1, episode 103, frame 0\) is not the same one in both: 5 and 12 real frames"),
+        ("frames", 5, r"window \(r1, episode 103, frame 0\) differs between the two: 5 and 12 real frames"),
         (
             "psnr_copy",
             3.0,
-            r"window \(r1, episode 103, frame 0\) is not the same one in both: 3 and .* dB of psnr_copy",
+            r"window \(r1, episode 103, frame 0\) differs between the two: 3 and .* dB of psnr_copy",
         ),
-        ("psnr_copy", np.nan, "is not the same one in both: nan and"),
+        ("psnr_copy", np.nan, "differs between the two: nan and"),
     ],
 )
 def test_other_windows_are_refused_by_the_name_of_the_first(column, value, why):

@@ -97,13 +97,13 @@ def test_nothing_is_predicted_of_a_trial_that_ran_and_was_removed(root, capsys):
         if trial.model.width == HELD:
             Ledger(Workspace(root).ledger).append(id, FINISHED)
     assert predict(root) == 2
-    assert "has run, says ledger.jsonl; a prediction is made before its trial runs" in capsys.readouterr().err
+    assert "has run, says ledger.jsonl; a prediction must be made before its trial runs" in capsys.readouterr().err
     assert not (root / "predictions").exists()
 
 
 def test_a_prediction_is_not_made_twice(root, capsys):
     assert predict(root) == 0 and predict(root) == 2
-    assert "was made before; it stays" in capsys.readouterr().err
+    assert "is an earlier prediction, which is not overwritten" in capsys.readouterr().err
 
 
 def test_a_prediction_that_was_edited_is_refused(root, capsys):
@@ -116,7 +116,7 @@ def test_a_prediction_that_was_edited_is_refused(root, capsys):
     for other in ("null", "[]", "{}"):
         path.write_text(other)
         assert command(root) == 2
-        assert f"{path}: no prediction can be read" in capsys.readouterr().err
+        assert f"{path}: the prediction cannot be read" in capsys.readouterr().err
 
 
 def test_what_was_made_from_other_results_is_marked(root):
@@ -156,11 +156,11 @@ def test_a_copy_of_a_prediction_counts_once(root):
     [
         (("--predict", "width"), "write it as AXIS=X"),
         (("--predict", "width=50"), "plans no trial there"),
-        (("--predict", "lr=0.1"), "no axis over a number"),
+        (("--predict", "lr=0.1"), "not an axis with numbers as positions"),
         (("--out", "x.json"), "give --predict"),
         (
             ("--predict", f"width={HELD}", "--set", f"widths=8,16,24,32,48,{HELD}", "--set", "seeds=0"),
-            "width: one seed per point: the interval of a prediction needs their noise; run the trials",
+            "width: every point has one seed, but the interval of a prediction needs the noise between seeds; run the trials",
         ),
     ],
 )
@@ -237,4 +237,6 @@ def test_of_several_curves_one_is_chosen(root, capsys):
 def test_nothing_is_predicted_where_the_lowest_loss_is_within(root, capsys):
     with_own_axis(root, "replace(sweep, interior_minimum=True)")
     assert predict_own(root, "own") == 2
-    assert "along own the loss is lowest within, where no power law holds" in " ".join(capsys.readouterr().err.split())
+    assert "along own the loss has a minimum inside the range, so it is not a power law" in " ".join(
+        capsys.readouterr().err.split()
+    )

@@ -104,7 +104,7 @@ def test_seeds_of_other_robots_without_a_common_position_are_no_curve_yet():
     curve, windows = robots_of_their_own()
     few = {p.trial: windows[p.trial] for p in curve.positions if (p.x[0] > 10) == (p.seed == 0)}
     fitted = fit_curve(curve, few, draws=10)
-    assert fitted.measured is None and "no position has a finished trial of each" in fitted.fit.refused
+    assert fitted.measured is None and "no position has a finished trial of every seed" in fitted.fit.refused
 
 
 @pytest.mark.parametrize("seeds", [(0,), (0, 1), (0, 1, 2)])

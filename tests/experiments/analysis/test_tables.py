@@ -56,7 +56,9 @@ def test_one_digit_of_the_windows_of_a_trial_cannot_be_changed(tmp_path):
 def test_a_trial_that_does_not_say_what_it_is_is_named(tmp_path, job):
     (directory, _), _ = two_seeds(tmp_path)
     (directory / "job.json").write_text(job)
-    with pytest.raises(ConfigError, match=f"{directory}: the finished trial does not say what it is .*; copy it again"):
+    with pytest.raises(
+        ConfigError, match=f"{directory}: the description of the finished trial cannot be read .*; copy the trial again"
+    ):
         read_trial(directory)
 
 

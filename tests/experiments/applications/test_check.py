@@ -18,16 +18,17 @@ from tests.experiments.applications.runs import make_run
 @pytest.mark.parametrize(
     ("episodes", "min_val", "frozen", "windows", "said"),
     [
-        (16, 2, 9, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 2 of 16 are held out, by "
-                   "store.min_val=2, store.val_fraction=0.05 and at most store.max_val_fraction=0.25. It is judged on "
-                   "episodes that it was not trained on: tokenise and train in another --out, with --set store.min_val=8 "
-                   "from the first command on (4 of 16 are held out then)"),
-        (9, 8, 9, 64, "--set store.min_val=8 --set store.max_val_fraction=0.5 from the first command on (4 of 9 are held "),
-        (7, 8, 9, 64, "No setting holds out 4 of 7, half of them at most: record more, or name the dataset's own "),
-        (20, 5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, and the "
-                   "2 frozen windows are of 2 of them: eval.windows_per_dataset took no more, or the others are too "
-                   "short. Freeze more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace windows`"),
-        (20, 5, 9, 2, "--windows 2 takes 2 of the 5 episodes that the 9 windows there are of; give more"),
+        (16, 2, 9, 64, "toy has 2 held-out episodes with windows, but the check needs at least 4. 2 of 16 are held out, by "
+                   "store.min_val=2, store.val_fraction=0.05 and at most store.max_val_fraction=0.25. To hold out more, "
+                   "tokenise and train again in another --out, with --set store.min_val=8 in every command (4 of 16 are "
+                   "then held out)"),
+        (9, 8, 9, 64, "--set store.min_val=8 --set store.max_val_fraction=0.5 in every command (4 of 9 are then held "),
+        (7, 8, 9, 64, "At most half of the 7 can be held out, which is fewer than 4: record more, or, if the dataset has "),
+        (20, 5, 2, 64, "toy has 2 held-out episodes with windows, but the check needs at least 4. 5 are held out, but the "
+                   "2 frozen windows come from 2 of them: eval.windows_per_dataset is too small, or the other episodes are "
+                   "too short. Freeze more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace "
+                   "windows`"),
+        (20, 5, 9, 2, "--windows 2 uses 2 of the 5 episodes that the 9 frozen windows come from; use more windows"),
         (20, 5, 25, 4, ""),
         (20, 5, 25, 64, ""),
     ],
@@ -51,11 +52,13 @@ def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path
 
     chosen, left_out = choose()
     assert chosen == ["many"] and list(left_out) == ["few", "none"]
-    assert left_out["few"].startswith("few has 1 episodes") and left_out["none"].startswith("none has 0 episodes")
+    assert left_out["few"].startswith("few has 1 held-out episodes") and left_out["none"].startswith(
+        "none has 0 held-out episodes"
+    )
     assert choose("many", "few") == (["many"], {"few": left_out["few"]})
-    with pytest.raises(ConfigError, match=r"^few has 1 episodes .*\. Nor are there enough of none$"):
+    with pytest.raises(ConfigError, match=r"^few has 1 held-out episodes .*\. The same holds for none$"):
         choose("few", "none")
-    with pytest.raises(ConfigError, match="no windows of other here; there are few, many, none"):
+    with pytest.raises(ConfigError, match="no windows of other; it has windows of few, many, none"):
         choose("many", "other")
 
 
@@ -75,9 +78,7 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
         monkeypatch.setattr("experiments.applications.check.open_study", lambda _, found=prepared: found)
         check(tmp_path, tmp_path)
         said = " ".join(capsys.readouterr().out.split())
-        assert (
-            "toy: of the tokens that the model was trained on not all lie here as they were, so that it" in said
-        ) == told
+        assert ("toy: the model was trained on other tokens than those of this study, so it" in said) == told
 
 
 def test_a_policy_has_no_frames_to_be_judged(tmp_path):

@@ -162,9 +162,7 @@ def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path, caps
         asked = ["--actions", str(tmp_path / "pusher_sand"), "--split", split, "--episodes", "1", "--clips", "0"]
         assert main(["generate", str(run), *asked, "--out", str(tmp_path / split)]) == 0
         said = " ".join(capsys.readouterr().out.split())
-        assert (f"keeps no frames of pusher_sand, split {split}: what the tokenizer makes" in said) == (
-            split == "train"
-        )
+        assert (f"has no frames of pusher_sand, split {split}: what the tokenizer makes" in said) == (split == "train")
     with pytest.raises(ConfigError, match=f"pusher: no such directory, and {tmp_path} has tokens of pusher_sand$"):
         open_trajectories("pusher", "val", None, robots, tokenizer, tmp_path)
 
@@ -172,9 +170,9 @@ def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path, caps
 def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
     tokenizer = load_tokenizer(run.parent / "tokenizer")
     gripper = Robot.of(TABLE.entries[1])
-    with pytest.raises(ConfigError, match="2 action values, gripper_wood takes 4"):
+    with pytest.raises(ConfigError, match="2 action values, but gripper_wood needs 4"):
         open_trajectories(str(recorded), "val", gripper, {}, tokenizer, tmp_path)
-    with pytest.raises(ConfigError, match="name one with --robot"):
+    with pytest.raises(ConfigError, match="choose one with --robot"):
         open_trajectories(str(recorded), "val", None, {gripper.name: gripper}, tokenizer, tmp_path)
 
 
@@ -183,7 +181,7 @@ def test_a_run_outside_a_study_begins_with_the_recordings_it_is_given(recorded, 
     """As one that was converted: there are neither starts beside it nor held-out frames of its robot."""
     mine = EmbodimentTable((replace(TABLE.entries[0], name="my_robot"),))
     run = make_run(tmp_path / "converted", table=mine)
-    with pytest.raises(ConfigError, match="to start from; move the run into the directory of a study"):
+    with pytest.raises(ConfigError, match="Move the run into the directory of a study"):
         load_simulator(run)
     assert generate(run, recorded, tmp_path / "out", "--robot", "my_robot", "--episodes", "2") == 0
     assert "2 episodes. PSNR against the recording" in " ".join(capsys.readouterr().out.split())

@@ -74,7 +74,7 @@ def test_a_part_of_the_robots_is_watched_by_name():
     robots = {name: object() for name in ("arm_sand", "pusher_sand")}
     assert select_robots(robots, ()) == robots
     assert list(select_robots(robots, ["pusher_sand"])) == ["pusher_sand"]
-    with pytest.raises(ConfigError, match="--robots: pusher_sad cannot be watched; there are arm_sand, pusher_sand"):
+    with pytest.raises(ConfigError, match="--robots: pusher_sad cannot be used; choose from arm_sand, pusher_sand"):
         select_robots(robots, ["pusher_sad"])
 
 
@@ -122,10 +122,10 @@ def test_where_all_episodes_are_too_short_that_is_said(tmp_path, monkeypatch, ca
     monkeypatch.setattr(in_place_module, "measure_ends", lambda *_: [])
     monkeypatch.setattr(sys, "argv", ["in_place", "RUN", "--out", str(tmp_path)])
     (tmp_path / "detector.npz").touch()
-    with pytest.raises(ConfigError, match="no robot is left to look at"):
+    with pytest.raises(ConfigError, match="no robot is left"):
         in_place_module.main()
     said = capsys.readouterr().out
-    assert f"left out, their episodes are too short or nothing is seen at the end: {ROBOTS[0].name}" in said
+    assert f"left out, since their episodes are too short or show no object at the end: {ROBOTS[0].name}" in said
 
 
 @pytest.fixture
@@ -161,11 +161,13 @@ def test_a_detector_takes_no_other_one_s_place(ask, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(detector_module, "make_detector", lambda *_: pytest.fail("it is made again"))
     ask("RUN")
     said = capsys.readouterr().out
-    assert "runs/detector/detector.npz of this run is there already; remove it to" in said and "wrote" not in said
+    assert "runs/detector/detector.npz of this run exists already; remove it to" in said and "wrote" not in said
     with pytest.raises(ConfigError, match="runs/detector holds .*.run: 'RUN' -> 'OTHER'.; choose another --out"):
         ask("OTHER")
     (tmp_path / "runs/detector/settings.json").unlink()  # as an earlier version left it
-    with pytest.raises(ConfigError, match="detector.npz is there already, and nothing says of which run; choose"):
+    with pytest.raises(
+        ConfigError, match="detector.npz exists, but it is not known for which run it was trained; choose"
+    ):
         ask("RUN")
 
 
@@ -204,8 +206,8 @@ def test_what_a_stop_leaves_is_said_as_it_is(monkeypatch, capsys):
     monkeypatch.setenv("HMA_DEBUG", "1")  # the test's process is not the program's own
     monkeypatch.setattr(simulators, "load_simulator", stopped)
     for program, words in (
-        ("in_place", "begins anew, but keeps what there is of the detector"),
-        ("detector", "goes on from here"),
+        ("in_place", "starts again from the beginning, but keeps what there is of the detector"),
+        ("detector", "continues from here"),
     ):
         monkeypatch.setattr(sys, "argv", [program, "RUN"])
         with pytest.raises(SystemExit) as end:

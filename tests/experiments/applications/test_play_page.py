@@ -219,7 +219,7 @@ def test_two_visitors_do_not_mix_and_a_third_is_told(browsing):
         third = await (await browser.new_context(bypass_csp=True)).new_page()
         await third.goto(address)
         await third.wait_for_function(
-            "document.getElementById('status').textContent.includes('seats')", timeout=PATIENCE
+            "document.getElementById('status').textContent.includes('all places')", timeout=PATIENCE
         )
 
     browsing(test)
@@ -308,7 +308,7 @@ def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_rob
             for _ in range(5):  # the first presses it, the others are repeats
                 await page.keyboard.down(key)
             await page.keyboard.up(key)
-        assert await page.inner_text("#run") == "Go on"
+        assert await page.inner_text("#run") == "Resume"
         await until(lambda: "start" in talk)
         await page.wait_for_function("!state.pending.length")
         await page.wait_for_timeout(100)
@@ -326,10 +326,10 @@ def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_rob
 def test_the_page_says_that_a_model_without_actions_follows_none(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
-        assert "it goes back to rest" in await page.inner_text("#holds")
+        assert "the action returns to rest" in await page.inner_text("#holds")
         await page.evaluate("state.robots.forEach(robot => { robot.deaf = true; })")
         await page.click("#robots button[data-name=arm]")
-        assert "trained without actions: they change nothing" in await page.inner_text("#holds.bad")
+        assert "trained without actions, so they have no effect" in await page.inner_text("#holds.bad")
         assert not page.faults
 
     browsing(test)

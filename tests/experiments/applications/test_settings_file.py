@@ -63,7 +63,7 @@ def test_results_that_do_not_say_how_frames_were_filled_are_not_gone_on_with(tmp
     known = json.loads(file.read_text())
     del known["simulator"]
     file.write_text(json.dumps(known))
-    with pytest.raises(ConfigError, match="settings.json does not say how frames were filled.*or remove that file"):
+    with pytest.raises(ConfigError, match="settings.json does not contain the decoding of frames.*remove this file"):
         pin_settings(tmp_path, run, simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="search.candidates: 4 -> 5"):
         pin_settings(tmp_path, run, simulator(), SETTINGS | {"search": {"candidates": 5}})

@@ -101,7 +101,7 @@ def test_true_and_learned_are_exchanged_by_one_word(run):
 
 def test_the_truth_does_not_take_native_actions_one_by_one_and_says_so(run):
     """Each was held for a whole frame, where the learned one made a frame of as many as its stride."""
-    with pytest.raises(ConfigError, match="rate='native' is of the learned one alone"):
+    with pytest.raises(ConfigError, match="rate='native' is supported only by the learned simulator"):
         make_simulator(run, "true", rate="native")
 
 
@@ -136,7 +136,7 @@ def test_what_is_shipped_stands_alone_and_does_the_same(run, tmp_path):
 
 def test_what_is_too_large_is_not_shipped(run, tmp_path, monkeypatch):
     monkeypatch.setattr(ship_module, "LARGEST", 1000)
-    with pytest.raises(ConfigError, match="more than the 1,000 that a repository should carry"):
+    with pytest.raises(ConfigError, match="more than the 1,000 bytes allowed for the repository"):
         ship(run, tmp_path / "simulator")
     assert not list(tmp_path.iterdir())
 
@@ -161,14 +161,14 @@ def test_what_was_not_shipped_is_not_replaced(run):
     """The run itself, the study that it is in."""
     before = sorted(run.parent.rglob("*"))
     for out in (run, run.parent):
-        with pytest.raises(ConfigError, match=r"holds no report.json, .* all of it would be removed"):
+        with pytest.raises(ConfigError, match=r"has no report.json, so .* it would be overwritten"):
             ship(run, out)
     assert sorted(run.parent.rglob("*")) == before
 
 
 def test_a_robot_without_a_truth_to_be_compared_with_is_not_shipped(tmp_path):
     table = EmbodimentTable((*TABLE.entries, Embodiment("stranger", 2, 1, (0.0, 0.0), (1.0, 1.0))))
-    with pytest.raises(ConfigError, match="stranger: not of the suite"):
+    with pytest.raises(ConfigError, match="stranger: not robots of the suite"):
         ship(make_run(tmp_path / "study", table=table), tmp_path / "simulator")
     assert [path.name for path in tmp_path.iterdir()] == ["study"]
 

@@ -182,27 +182,29 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
     run, out = make_run(tmp_path / "study"), tmp_path / "out"
     asked = ["synthetic", str(run), "--actions", recordings, "--out", str(out)]
     for more, said in (
-        ([], "split train, has [0-9]+ trajectories, 100 are needed; name another"),
-        (["--given", "0"], "given = 0: a generated trajectory begins with at least 1"),
+        ([], "split train, has [0-9]+ trajectories, but 100 are needed; give another"),
+        (["--given", "0"], "--given must be at least 1, got 0: a generated trajectory begins with"),
         (["--seeds", "0"], "no seed"),
-        (["--held-out", "train"], "judged on what they were trained on, split train"),
-        (["--starts", "3"], "--starts: of the suite's tasks, not of recordings"),
-        (["--robot", "gripper_wood"], "2 action values, gripper_wood takes 4"),
+        (["--held-out", "train"], "evaluated on their training data, split train"),
+        (["--starts", "3"], "--starts: only for tasks of the suite, not with recordings"),
+        (["--robot", "gripper_wood"], "2 action values, but gripper_wood needs 4"),
     ):
         monkeypatch.setattr(sys, "argv", [*asked, *more])
         with pytest.raises(ConfigError, match=said):
             synthetic.main()
         assert not out.exists()
     monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(out), "--split", "train", "--held-out", "a"])
-    with pytest.raises(ConfigError, match="--split, --held-out: of recordings, which --actions"):
+    with pytest.raises(ConfigError, match="--split, --held-out: only for recordings; give these with --actions"):
         synthetic.main()
     out.mkdir()
     (out / "without_actions.json").write_text("{}")
     monkeypatch.setattr(sys, "argv", asked[:2] + asked[4:])
-    with pytest.raises(ConfigError, match="policies of a model without actions are here: give --without-actions again"):
+    with pytest.raises(
+        ConfigError, match="already has policies of a model without actions: give --without-actions again"
+    ):
         synthetic.main()
     monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(tmp_path / "small")])
-    with pytest.raises(ConfigError, match="8 x 8 pixels cannot be averaged down to the 32 x 32 that policies"):
+    with pytest.raises(ConfigError, match="policies and success heads need images of 32 x 32 pixels, but 8 x 8"):
         synthetic.main()
     assert not (tmp_path / "small").exists()
 

@@ -86,7 +86,7 @@ def test_malicious_checkpoint_is_refused_and_not_run(tmp_path):
     write_torch(alone, Malicious(victim), {})
     hidden = checkpoint(tmp_path / "hidden", {"hyper_parameters": Malicious(victim)})
     for path in (alone, hidden):
-        with pytest.raises(ConfigError, match=rf"{path}.* asks for (posix|nt)\.system"):
+        with pytest.raises(ConfigError, match=rf"{path}.* needs (posix|nt)\.system"):
             small(path)
     assert not victim.exists()
 

@@ -59,7 +59,9 @@ def test_films_that_a_kill_cut_short_go_on_and_come_out_the_same(slide, tmp_path
         for f in dataclasses.fields(Film):
             np.testing.assert_array_equal(getattr(again[name], f.name), getattr(film, f.name), err_msg=f.name)
     killed.write_bytes(killed.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match="a.npz.unfinished cannot be read .* remove it, the same command films from"):
+    with pytest.raises(
+        ConfigError, match="a.npz.unfinished cannot be read .* remove it; the same command then films from"
+    ):
         make(killed)
 
 

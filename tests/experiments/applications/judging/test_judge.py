@@ -97,7 +97,7 @@ def test_the_random_policy_alone_is_not_judged(tmp_path, monkeypatch):
     assert model.config.action_heads and model.run.train.masking.setting == "forward"
     monkeypatch.setattr(judge, "load_simulator", lambda *_, **__: SimpleNamespace(model=model))
     alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
-    with pytest.raises(ConfigError, match="no policy to judge but the random one: give --policies FILE"):
+    with pytest.raises(ConfigError, match="no policy to evaluate except the random one: give --policies FILE"):
         judge_run(tmp_path / "model", tmp_path / "out", alone, step)
 
 
@@ -165,7 +165,7 @@ def test_actions_in_other_units_are_told():
 def test_a_policy_without_right_actions_is_refused_before_anything_is_made(judged, tmp_path):
     root, file = judged[0], tmp_path / "mine.py"
     file.write_text(OWN.format(value="0"))
-    with pytest.raises(ConfigError, match=r"mine.py: policy 'still': .*float32 \[2, 4\].* it gave int64 \[2, 4\]"):
+    with pytest.raises(ConfigError, match=r"mine.py: policy 'still': .*float32 \[2, 4\].* it returned int64 \[2, 4\]"):
         judge_run(root / "model", tmp_path / "out", ASKED, step, file)
     file.write_text(OWN.format(value="images.widht"))
     with pytest.raises(
@@ -179,7 +179,7 @@ def test_frames_that_no_policy_could_look_at_are_refused_before_anything_is_reco
     root = judged[0]
     for part in ("ladder", "head"):
         larger = replace(ASKED, **{part: replace(getattr(ASKED, part), encoder=EncoderConfig())})
-        with pytest.raises(ConfigError, match="8 x 8 pixels cannot be averaged down to the 32 x 32 that policies"):
+        with pytest.raises(ConfigError, match="policies and success heads need images of 32 x 32 pixels, but 8 x 8"):
             judge_run(root / "model", root / "small", larger, step)
     assert not (root / "small").exists()
 

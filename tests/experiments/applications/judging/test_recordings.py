@@ -149,13 +149,16 @@ def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp
             "no scripted expert to train policies on: remove --demonstrations, --steps,",
         ),
         (("--split", "val"), "no split 'val'"),
-        (("--hold", "7"), "of 20 recordings 0 succeeded and 0 failed (0 do not say, 20 have less than the 10 frames"),
+        (
+            ("--hold", "7"),
+            "of 20 recordings 0 succeeded and 0 failed (0 do not say whether they did, 20 have fewer than the 10 frames",
+        ),
         (("--frames", "0"), "--frames must be at least 1, got 0"),
         (("--head-episodes", "15"), "A success head needs at least 8 of each"),
-        (("--frames", "1"), "a goal held for 2 frames does not fit 1 frames"),
+        (("--frames", "1"), "--hold 2 is more than the 1 frames of an episode"),
         (("--real", "nowhere.csv"), "nowhere.csv cannot be read as counts"),
         (("--batch", "1"), "--batch must be at least 2"),
-        (("--reward", "1"), "berkeley_gnm_cory_hall/train/0: no reward of every step, which --reward asks for"),
+        (("--reward", "1"), "berkeley_gnm_cory_hall/train/0: it has no reward for every step, which --reward needs"),
     ],
 )
 def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_path, capsys, more, message):
@@ -175,19 +178,21 @@ def test_counts_of_policies_that_are_not_judged_are_refused(study, tmp_path, cap
     counts = tmp_path / "real.csv"
     counts.write_text("policy,successes,episodes\nlow,1,10\nhihg,9,10\nrandom,0,8\n")
     assert judge(study, tmp_path / "out", "--real", str(counts)) == 2
-    assert "counted on the real robot: hihg; judged here: random, hma, low, high, wild" in said(capsys, error=True)
+    assert "--real has policies hihg, but the policies here are random, hma, low, high, wild" in said(
+        capsys, error=True
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no column policy, successes, episodes"),
-        ("policy,successes\na,1\n", "no column episodes"),
-        ("policy,successes,episodes\na,1,\n", "line 2: successes and episodes of a are whole numbers"),
-        ("policy,successes,episodes\na,0.5,1\n", "line 2: successes and episodes of a are whole numbers"),
+        ("", "column policy, successes, episodes is missing"),
+        ("policy,successes\na,1\n", "column episodes is missing"),
+        ("policy,successes,episodes\na,1,\n", "line 2: successes and episodes of a must be whole numbers"),
+        ("policy,successes,episodes\na,0.5,1\n", "line 2: successes and episodes of a must be whole numbers"),
         ("policy,successes,episodes\na,1,2\nb,3,2\n", "line 3: b cannot succeed in 3 of 2"),
-        ("policy,successes,episodes\na,1,2\n\na,1,2\n", "line 4: a has a line before"),
-        ("policy,successes,episodes\na,1,2\nb,1,2\n", "has 2 policies; an order to compare needs at least 3"),
+        ("policy,successes,episodes\na,1,2\n\na,1,2\n", "line 4: a is already in an earlier line"),
+        ("policy,successes,episodes\na,1,2\nb,1,2\n", "has 2 policies, but a comparison needs at least 3"),
     ],
 )
 def test_counts_that_are_none_are_named_to_the_line(tmp_path, text, message):
@@ -269,9 +274,7 @@ def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp
     assert "of 20 recordings 0 succeeded and 20 failed" in said(capsys, error=True)
     always = write_rlds(tmp_path / "all", SPEC, [9] * 20, rewards=lambda i: np.r_[np.ones(3), np.full(6, i < 10)])
     assert judge(study, tmp_path / "none", "--recordings", str(always), *asked[2:], "1") == 2
-    assert "0 of 4 recordings that are held out have not reached their goal (--reward 1.0) by frame" in said(
-        capsys, True
-    )
+    assert "0 of 4 held-out recordings have not yet reached the goal (--reward 1.0) at frame" in said(capsys, True)
 
 
 def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():

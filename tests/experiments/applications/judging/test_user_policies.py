@@ -64,14 +64,14 @@ def test_success_of_a_file_is_asked_of_frames_beside_the_first_of_their_episodes
     [
         ("0.5", r"float64 \[\]"),
         ("[1, 0]", r"int64 \[2\]"),
-        ("[0.5, float('nan')]", r"in \[0, 1\]; it gave \[nan\]"),
-        ("[0.5, 1.5]", r"in \[0, 1\]; it gave \[1.5\]"),
-        ("[[0.5], [0.5, 0.5]]", "it gave what is no array"),
+        ("[0.5, float('nan')]", r"in \[0, 1\]; it returned \[nan\]"),
+        ("[0.5, 1.5]", r"in \[0, 1\]; it returned \[1.5\]"),
+        ("[[0.5], [0.5, 0.5]]", "it returned something that is not an array"),
     ],
 )
 def test_success_that_is_no_probability_of_each_image_is_refused(given, said):
     success = UserSuccess(lambda images, first: eval(given), "mine.py")
-    with pytest.raises(ConfigError, match=rf"mine.py: success\(images, first\) must give \[2\].*{said}"):
+    with pytest.raises(ConfigError, match=rf"mine.py: success\(images, first\) must return an array \[2\].*{said}"):
         try_out({}, success, 2, (8, 8))
 
 
@@ -93,13 +93,13 @@ def test_the_policies_of_the_page_are_some(tmp_path):
         (None, r"no such file; policies of your own are a Python file with policies\(robot\)"),
         ("policy = 1", r"has no function policies\(robot\)"),
         ("def policies(robot): return [1]", r"policies\(robot\) must return a dict of policies by name, got list"),
-        ("def policies(robot): return {}", "returned no policy"),
-        ("def policies(robot): return {'a/b': 1}", "'a/b' becomes the name of files"),
-        ("def policies(robot): return {'..': 1}", "'..' becomes the name of files"),
-        ("def policies(robot): return {7: 1}", "7 becomes the name of files"),
-        ("def policies(robot): return {'cloned-60': 1}", "'cloned-60' is the name of a policy that is made here"),
-        ("def policies(robot): return {'random': 1}", "'random' is the name of a policy"),
-        ("def policies(robot): return {'Net': 1, 'net': 1}", "Net, net would be the same files"),
+        ("def policies(robot): return {}", "returned an empty dict"),
+        ("def policies(robot): return {'a/b': 1}", "'a/b' is used in file names"),
+        ("def policies(robot): return {'..': 1}", "'..' is used in file names"),
+        ("def policies(robot): return {7: 1}", "7 is used in file names"),
+        ("def policies(robot): return {'cloned-60': 1}", "'cloned-60' is the name of a built-in policy"),
+        ("def policies(robot): return {'random': 1}", "'random' is the name of a built-in policy"),
+        ("def policies(robot): return {'Net': 1, 'net': 1}", "Net, net differ only in upper and lower case"),
         ("def policies(robot): return {'net': 1}", r"policy 'net' is of type int and has no reset\(episodes=None"),
         (
             "class P:\n def reset(self): ...\n def act(self, images): ...\ndef policies(robot): return {'net': P()}",
@@ -151,11 +151,11 @@ class Gives:
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros((2, 4), np.float32), r"it gave float32 \[2, 4\]"),
-        (np.zeros(3, np.float32), r"it gave float32 \[3\]"),
-        (np.zeros((2, 3), int), r"it gave int64 \[2, 3\]"),
-        (None, r"it gave object \[\]"),
-        ([[0.0], [0.0, 1.0]], "it gave what is no array"),
+        (np.zeros((2, 4), np.float32), r"it returned float32 \[2, 4\]"),
+        (np.zeros(3, np.float32), r"it returned float32 \[3\]"),
+        (np.zeros((2, 3), int), r"it returned int64 \[2, 3\]"),
+        (None, r"it returned object \[\]"),
+        ([[0.0], [0.0, 1.0]], "it returned something that is not an array"),
         (np.array([[0, 0, 0], [0, np.nan, 0]]), r"for image 1 is not finite: \[0.0, nan, 0.0\]"),
         (np.full((2, 3), 1e300), "for image 0 is not finite"),
     ],
@@ -165,7 +165,9 @@ def test_actions_that_are_none_are_refused_by_policy_and_shape(actions, message)
     policy = CheckedPolicy(Gives(actions), ROBOT, "mine.py: policy 'net'")
     with pytest.raises(ConfigError, match=message) as error:
         policy.act(np.zeros((2, 8, 8, 3), np.uint8))
-    assert "mine.py: policy 'net': act(images) must give float32 [2, 3], a raw action of arm" in str(error.value)
+    assert "mine.py: policy 'net': act(images) must return float32 [2, 3], an unnormalised action of arm" in str(
+        error.value
+    )
 
 
 def test_a_policy_may_write_into_images_and_into_what_it_gave():

@@ -55,13 +55,16 @@ def test_robots_of_the_suite_and_of_physics_simulators_have_no_common_truth():
         Robot(TASK.robot, 5, (-1.0,) * 4, (1.0,) * 4, (0.0,) * 4),
         Robot("pusher_sand", 1, (-1.0,) * 2, (1.0,) * 2, (0.0,) * 2),
     ]
-    with pytest.raises(ConfigError, match="have no common one: metaworld_drawer, pusher_sand"):
+    with pytest.raises(
+        ConfigError,
+        match="no single simulator has both robots of the suite and of physics simulators: metaworld_drawer, pusher_sand",
+    ):
         true_worlds(robots, image_size=8)
 
 
 def test_a_physics_simulator_knows_its_own_task_alone():
     assert TASK.goal == "drawer open"
-    with pytest.raises(ConfigError, match="no task 'reach' of metaworld_drawer; there are own"):
+    with pytest.raises(ConfigError, match="metaworld_drawer has no task 'reach'; it has own"):
         find_task("metaworld_drawer", "reach")
-    with pytest.raises(ConfigError, match="no task of a robot 'metaworld_sawyer': a task needs a true simulator"):
+    with pytest.raises(ConfigError, match="robot 'metaworld_sawyer' has no task: a task needs a true simulator"):
         find_task("metaworld_sawyer")

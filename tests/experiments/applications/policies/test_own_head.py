@@ -38,5 +38,5 @@ def test_a_model_that_was_not_trained_to_act_is_no_policy(heads, setting):
     model, tokenizer = parts()
     train = TrainConfig(masking=MaskingConfig(setting=setting))
     other = replace(model, run=replace(model.run, train=train, model=replace(model.config, action_heads=heads)))
-    with pytest.raises(ConfigError, match=f"'{setting}', so it is no policy; .* and model.action_heads=true"):
+    with pytest.raises(ConfigError, match=f"'{setting}', so it cannot act as a policy; .* and model.action_heads=true"):
         OwnHeadPolicy(other, tokenizer, ROBOTS[0])

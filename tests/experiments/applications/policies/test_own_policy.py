@@ -123,10 +123,10 @@ def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_pa
     assert trials[0] == trials[1] and len(trials[0][RANDOM]) == FEW.starts
     monkeypatch.undo()
     monkeypatch.setattr(own_policy, "load_simulator", lambda _: made)
-    with pytest.raises(ConfigError, match="8 x 8 pixels cannot be averaged down to the 32 x 32 that policies"):
+    with pytest.raises(ConfigError, match="policies and success heads need images of 32 x 32 pixels, but 8 x 8"):
         compare(tmp_path / "run", tmp_path / "small", FEW)
     assert not (tmp_path / "small").exists()
-    with pytest.raises(ConfigError, match="sees 4 frames, an episode here has 3"):
+    with pytest.raises(ConfigError, match="has a window of 4 frames, but an episode here has only 3"):
         compare(tmp_path / "run", tmp_path / "shorter", replace(FEW, frames=3, hold=1))
 
 

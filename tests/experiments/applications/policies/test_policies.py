@@ -175,7 +175,7 @@ def test_denoising_with_the_true_noise_gives_the_chunk(monkeypatch, demos):
 
 def test_a_ladder_has_its_first_and_last_rung():
     assert log_spaced_steps(1000, 4, 1) == (1, 10, 100, 1000)
-    with pytest.raises(ConfigError, match="that of 60 steps: training must be longer, not 50 steps"):
+    with pytest.raises(ConfigError, match="at 60 steps, so training must be longer than that, got 50 steps"):
         log_spaced_steps(50, 4, 60)
 
 
