@@ -95,6 +95,7 @@ def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolic
             f"{where}: {name!r} is used in file names; use at most 100 letters, digits, '.', '_' and '-', a letter or "
             "digit first",
         )
+        require(not TAKEN.fullmatch(name), f"{where}: {name!r} is the name of a built-in policy; choose another")
     lower = [name.lower() for name in policies]
     twice = [name for name in policies if lower.count(name.lower()) > 1]
     require(
