@@ -136,6 +136,15 @@ def test_muon_moves_every_matrix_by_as_much_in_every_direction_and_all_else_as_a
         assert not second.any(), path
         matrices += len(found)
     assert matrices == 2 * (3 + 1) + 2 + 4 * TABLE.size  # q, k, v, out, twice; MLP; of each robot modulation and stem
+    # The next step looks ahead: the momentum has the new gradient in it, and then once more.
+    again, _ = update(muon, after, here, seed=1, config=MUON)
+    first, second = (jax.tree.leaves(gradients(params, seed)) for seed in (0, 1))
+    specs = list(declared.leaves().values())
+    at = next(i for i, spec in enumerate(specs) if spec.role == "hidden")
+    momentum = 0.95 * 0.05 * first[at] + 0.05 * second[at]
+    ahead = jax.jit(lambda x: muon_direction(x, specs[at], 1.0))(0.95 * momentum + 0.05 * second[at])
+    was, moved = (np.asarray(jax.tree.leaves(tree)[at]) for tree in (muon, again))
+    np.testing.assert_allclose((was - moved) / 1e-2 - 0.1 * was, ahead, atol=2e-4)
 
 
 def test_under_mup_muon_s_updates_keep_their_spectral_norm_at_every_width():

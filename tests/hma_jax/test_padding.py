@@ -117,14 +117,17 @@ def test_targets_stand_in_real_frames_alone():
     assert int(found[0][1].tokens) < int(of_all[1].tokens)
 
 
-def test_actions_that_are_hidden_in_padding_only_concern_nobody():
-    """Otherwise the weights for hidden actions would decay without a gradient."""
+def test_actions_that_are_hidden_or_shown_in_padding_only_concern_nobody():
+    """Otherwise the weights for these actions would decay without a gradient."""
     batch = random_batch(0, MODEL, len(LENGTHS))
     masked = mask(jax.random.key(0), batch["tokens"], batch["embodiment"], MODEL, MaskingConfig(), TABLE)
     masked = masked._replace(hidden_T=jnp.asarray(~REAL))
     for real, concerned in ((None, True), (jnp.asarray(REAL), False)):
         presence = find_presence(masked, batch["embodiment"], np.ones(TABLE.size, bool), MODEL, real_BT=real)
         assert bool(presence.shared["actions_hidden"]) == concerned
+        shown = masked._replace(hidden_T=jnp.asarray(REAL))
+        presence = find_presence(shown, batch["embodiment"], np.ones(TABLE.size, bool), MODEL, real_BT=real)
+        assert bool(presence.shared["actions_shown"]) == concerned
 
 
 # --- Evaluation ------------------------------------------------------------------------------
