@@ -70,7 +70,7 @@ def _failed(error: Exception, debug: bool, skipping: str) -> int:
 
 
 def _unread() -> bool:
-    """Whether standard output is a pipe, or a socket, that nobody reads any more; other pipes break too."""
+    """Whether standard output is a pipe or socket whose reader is gone; other pipes can break, too."""
     try:
         number = sys.stdout.fileno()
     except (OSError, ValueError):  # a test's

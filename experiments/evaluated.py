@@ -21,7 +21,8 @@ STAMP = "evaluation.made_from.json"
 
 def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedData, config: EvalConfig) -> MadeFrom:
     """The stamp of an evaluation on the windows of the datasets `names`. The step is recorded only: of a run that
-    trains on, later results replace earlier ones. So is the seed, for whoever compares; it names the model as well."""
+    trains on, later results replace earlier ones. So is the seed, for `hma compare`; it is part of the model's hash as
+    well."""
     train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
     chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {

@@ -1,4 +1,4 @@
-"""The table of a dry run: every trial of a study once, with what it costs, and what all of them come to."""
+"""The table of a dry run: every trial of a study once, with its cost, and the totals."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _describe_done(done: Done, trials: int) -> str:
 
 
 def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool) -> str:
-    """What it all comes to, and of what."""
+    """The totals: time, FLOPs, devices, device-hours and checkpoints."""
     from hma_jax.runtime.audit import size_of
 
     trials, flops, alone = sum(p.seconds for p in plans), sum(p.flops for p in plans), max(p.seconds for p in plans)

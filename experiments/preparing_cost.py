@@ -32,7 +32,7 @@ class PreparingCost:
     simulating: float = 0.0
     tokenizer: float = 0.0
     tokens: float = 0.0
-    unknown: tuple[str, ...] = field(default=())  # datasets of which nobody says how many frames they have
+    unknown: tuple[str, ...] = field(default=())  # datasets whose number of frames the registry does not have
     datasets: int = 0  # those too
 
     @property

@@ -87,7 +87,7 @@ class Eta:
         self._first: tuple[float, int] | None = None
 
     def __call__(self, done: int, total: int) -> str:
-        """', 3 min 20 s left', or nothing as long as it cannot be told.
+        """', 3 min 20 s left', or '' while it is unknown.
 
         What was done before the first call, by an earlier process, does not count.
         """

@@ -48,7 +48,7 @@ def run_study(
 
     `again` is the command that tries failed trials once more. Raises ConfigError, before anything is done, if the
     directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
-    changed, or if trials ran other sources than there are now and nobody accepts that.
+    changed, or if trials ran other sources than today's and `accept_code` is not given.
     """
     from experiments.preparing.pipeline import prepare
     from experiments.preparing.suite import require_simulated

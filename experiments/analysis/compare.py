@@ -56,7 +56,7 @@ def compare(a: Side, b: Side) -> list[Difference]:
     """Every metric, nats first, overall and by robot, of the robots that both were judged on.
 
     Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things; of
-    retrieval those where the true actions were to be told from another number of others.
+    retrieval those where the true actions were ranked among another number of others.
     Raises NotComparable, naming the first window that differs.
     """
     pairs = _pairs(a, b)
@@ -73,7 +73,7 @@ def compare(a: Side, b: Side) -> list[Difference]:
 
 
 def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
-    """Whether the true actions are told from as many others, in every window of `robots`."""
+    """Whether retrieval ranks the true actions among as many others on both sides, in every window of `robots`."""
     if not all("retrieval_chance" in table.metrics for table in (a, b)):
         return True
     of_a, of_b = make_panel([{0: a}, {0: b}], "retrieval_chance", robots).points

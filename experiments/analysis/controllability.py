@@ -47,7 +47,7 @@ class Controllability:
     seeds: int
     n: int
     episodes: int
-    explained: float = float("nan")  # share of the change of its pixels that actions decide; nan: nobody measured
+    explained: float = float("nan")  # share of the change of its pixels that actions decide; nan: not measured
     role: str = POINT  # or CONTROL: a model trained on the actions of other episodes, which has nothing to follow
 
 

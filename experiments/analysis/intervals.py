@@ -30,7 +30,7 @@ NATS = ("cross_entropy", "diffusion_loss", "action_nats")
 class Interval:
     """A mean with its standard error and the interval that holds the truth in `LEVEL` of all samples.
 
-    nan where there is no telling: with one episode, nobody knows how episodes differ.
+    nan where it is unknown: one episode does not show how episodes differ.
     """
 
     mean: float

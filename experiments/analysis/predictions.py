@@ -130,7 +130,7 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def load_predictions(folder: Path) -> dict[str, Prediction]:
-    """By file name; of copies, which would count twice in what came, the first. Raises ConfigError for one that was
+    """By file name; of copies the first, or their outcome would count twice. Raises ConfigError for one that was
     edited or cannot be read."""
     found: dict[str, Prediction] = {}
     for path in sorted(folder.glob("*.json")):

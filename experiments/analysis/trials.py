@@ -6,7 +6,7 @@ Columns:
     config.*                   every setting by its dotted path ("config.train.optimizer.learning_rate"); lists as JSON
     store, manifest, tokenizer, results     what it depends on (`experiments.running.provenance`)
     windows_drawn              in training: steps times batch. Epochs are not one number: robots differ in windows
-    trajectories               that may be drawn from, of all robots; null where nobody has counted them
+    trajectories               that may be drawn from, of all robots; null where unknown
     parameters, train_flops, training_loss  the last is the mean over the last steps
     <metric>, <metric>.sem     over all robots that it was judged on, each counting equally
     windows, episodes, robots  that these are means over

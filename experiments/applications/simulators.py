@@ -43,7 +43,7 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
     those of the study's directory that the run is in, which may be one of its trials. `options` are those of
     `Simulator.load`.
 
-    Raises ConfigError where there is no run, or nothing to start from, unless whoever asks has starts of their own.
+    Raises ConfigError where there is no run, or nothing to start from, unless the caller has its own starts.
     """
     run = Path(run)
     study = Workspace.of_run(run)

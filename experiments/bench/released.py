@@ -1,4 +1,4 @@
-"""A process that runs stages of the official PyTorch release when told to, as `stages` runs ours.
+"""A process that runs stages of the official PyTorch release on request, as `stages` runs ours.
 
 It is started in an environment of its own, which has torch and what the release imports, with a checkout of
 the release (github.com/liruiw/HMA) on its path; nothing of it is part of this project. Its arguments are the examples

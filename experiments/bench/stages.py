@@ -1,4 +1,4 @@
-"""A process that runs stages of our base models when told to: `python -m experiments.bench.stages ROWS DTYPE`.
+"""A process that runs stages of our base models on request: `python -m experiments.bench.stages ROWS DTYPE`.
 
 Reads a stage's name per line, runs it once and answers with the seconds it took; the first time includes
 compilation. `experiments.bench.against_release` lets it take turns with another program.

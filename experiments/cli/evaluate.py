@@ -75,7 +75,7 @@ def evaluate_model(
         f"--to {to} is the directory of a trial, whose results must not be changed; choose another --to",
     )
     trained = load_model(run, setting.study.execution, weights).run
-    # Before the work: that its results can be written, and by nobody else.
+    # Before the work: its results can be written, and by no other process.
     with locked_run(to or run, EVALUATION) if is_writer() else nullcontext():
         _evaluate(setting, run, trained, to or run, replace)
 

@@ -108,7 +108,7 @@ def play(
     def ready(actual: int) -> None:
         shown = "localhost" if host == "127.0.0.1" else host
         say(f"drive it at http://{shown}:{actual} (end with Ctrl-C)")
-        if visitors > 1:  # nobody waits for it: as long as it is not compiled for several, they take turns
+        if visitors > 1:  # in the background: until programs for several visitors are compiled, these take turns
             compiling.start()
 
     try:

@@ -34,7 +34,7 @@ IN_WORDS: dict[Step, str] = {
 
 STAMP = "made_from.json"
 OLD_STAMP = "made_from.txt"
-"""Of earlier versions: a hash, from which nobody can tell what differs."""
+"""The stamp of earlier versions: a hash, which does not show what differs."""
 
 FORMERLY_RECORDED = ("tau", "order")
 """Inputs that stamps of earlier versions have as recorded only."""
@@ -91,7 +91,7 @@ def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[
 
 
 def dataset_differences(existing: Sequence[str], wanted: Sequence[str]) -> list[str]:
-    """One line at most, which names what came and what went."""
+    """At most one line, which names the added and the removed datasets."""
     if list(existing) == list(wanted):
         return []
     gone = [n for n in existing if n not in wanted]

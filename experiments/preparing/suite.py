@@ -31,7 +31,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     """The simulated datasets of the study, written once.
 
     Raises ConfigError where some are there with another seed or size, unless `replace` allows it. Those made by
-    an earlier version of the simulator stay in use, which is said.
+    an earlier version of the simulator stay in use, with a note.
     """
     from data_pipelines.registry import get_spec
     from data_pipelines.sources.rlds.writer import VERSION

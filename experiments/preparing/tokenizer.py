@@ -114,7 +114,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
             corrupt=settings.corrupt, max_skipped=settings.max_skipped,
         )  # fmt: skip
 
-    held_out = frames(0, "val")  # there are some, or it is said before hours of training
+    held_out = frames(0, "val")  # raises before hours of training if there are none
     aside = workspace.root / f"tokenizer.{made_from.id}"  # never resumed with other inputs
     with step("train the tokenizer") as update:
         tokenizer = train_tokenizer(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from data_pipelines.windows.evalset import EvalManifest
 
 HELD_OUT = 0.25
-"""Share of a dataset's episodes: if more are held out, it is said how many and why."""
+"""Share of a dataset's episodes: if more are held out, a note says how many and why."""
 
 
 def require_same_windows(study: Study, workspace: Workspace, replace: Step | None) -> None:

@@ -28,7 +28,7 @@ LONGEST = 6.0
 """Seconds of a clip, as long as FASTEST allows."""
 
 UNKNOWN_HZ = 10.0
-"""Speed of clips whose rate nobody gave."""
+"""Speed of clips whose rate is unknown."""
 
 OTHER_FRAMES = (2, 4, 8, 12, 16)
 """Windows of so many frames are counted beside the one asked for."""

@@ -150,7 +150,7 @@ def _headline(
         over = "s.e. over episodes and seeds" if point and len(point.seeds) > 1 else "s.e. over episodes of one seed"
         cards.append(card(f"{name}, {shown.name}", point, over))
         untrained = _at_default(rows, shown.sweep, metric, UNTRAINED)
-        if untrained or shown.name == REFERENCE:  # of others nobody asks it
+        if untrained or shown.name == REFERENCE:  # of other trials it is not expected
             cards.append(card(f"{name}, untrained", untrained, of_untrained))
     if shown and "delta_psnr" in metrics:
         cards += [

@@ -125,7 +125,7 @@ def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room:
 
 def show_control(panel: Axes, points: list[CurvePoint]) -> None:
     """The trials on shuffled actions, where on the axis they stand, with their standard errors. One seed of them, as
-    there mostly is, stands beside means over several: it is said."""
+    there mostly is, stands beside means over several, so the legend says so."""
     if points:
         alone = all(len(p.seeds) == 1 for p in points)
         panel.errorbar(

@@ -92,7 +92,7 @@ def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) ->
 
 
 def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
-    """{robot: how much there is of it}; {} where nobody has counted. Raises ConfigError for a damaged file."""
+    """{robot: its counts of episodes, windows, ...}; {} without the file. Raises ConfigError for a damaged file."""
     try:
         facts_by_robot = {name: {**facts} for name, facts in json.loads(data_summary.read_text()).items()}
         require(

@@ -150,7 +150,7 @@ def _change(changes: Sequence[Change]) -> str:
 
 
 def _with_interval(estimate: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
-    """'0.31 (`words`0.22 to 0.4)', the mean alone where nobody knows its error; `sign`: "+" for one before every
+    """'0.31 (`words`0.22 to 0.4)', the mean alone where its error is unknown; `sign`: "+" for one before every
     value."""
     low, high = (f"{end:{sign}.3g}" for end in (estimate.low, estimate.high))
     interval = f" ({words}{low} to {high})" if math.isfinite(estimate.low) else ""

@@ -200,7 +200,7 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
             controls[r.trial] = max(controls.get(r.trial, r), r, key=lambda row: row.n)
     if not controls:
         return Check(name, "open", "No control, trained on shuffled actions, is finished.")
-    # What rounding leaves needs no error to be told from an effect, and has hardly one.
+    # What rounding leaves is no effect, though its standard error is as small.
     controls = {id: replace(r, mean=0.0, sem=0.0) if abs(r.mean) < ROUNDING else r for id, r in controls.items()}
     unknown = [r.trial for r in controls.values() if math.isfinite(r.mean) and math.isnan(r.sem)]
     known = [r for id, r in controls.items() if id not in unknown]

@@ -136,6 +136,6 @@ def _state(directory: Path, record: dict[str, Any] | None) -> State:
         return State(RUNNING)
     if record is None or record["event"] == FINISHED:  # its directory was deleted: run it again
         return State(MISSING)
-    if record["event"] == RUNNING:  # whoever started it did not see its end
+    if record["event"] == RUNNING:  # its runner ended before it
         return outcome(directory, AttemptEnd(None, "its process is gone"))
     return State(record["event"], record.get("message", ""))

@@ -83,7 +83,7 @@ def trial_closure() -> dict[str, str]:
 def load_sources(given: Closure | None) -> dict[str, str]:
     """Imports all that a trial runs, and returns the closure that was imported. To be called before any work.
 
-    Raises CodeChanged if it is not the one that was `given` by whoever started the trial (None: nobody did), or if
+    Raises CodeChanged if it is not the one that was `given` by the runner (None: it was started by hand), or if
     files changed meanwhile. From then on nothing but what the trial's record names as `besides` is read from disk.
     """
     closure = trial_closure()

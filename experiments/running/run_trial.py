@@ -84,7 +84,7 @@ def train_trial(
 ) -> FitResult:
     """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
 
-    A model that is not new has a `table` of its own (of which the trial's datasets are part), its
+    A model with trained parameters has its own `table` (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.
     """
     from data_pipelines.loading.loader import describe_batch, make_loader

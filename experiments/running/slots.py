@@ -64,7 +64,8 @@ class Slot:
 
 
 def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerators | None:
-    """GPUs or TPU chips that `environment` lets this process use; None without any, or if JAX is told to use none."""
+    """GPUs or TPU chips that `environment` lets this process use; None without any, or if JAX_PLATFORMS excludes
+    them."""
     platforms = environment.get("JAX_PLATFORMS", "")
     if platforms and not set(platforms.split(",")) & {"cuda", "gpu", "tpu"}:
         return None

@@ -93,7 +93,7 @@ def plan(study: Study) -> Sweep:
             trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
             points.append(Point(len(labels), LONGER[name](trial)))
         labels.append(f"{name}, {counted(steps, 'step')}")
-    # The longest goes on from the first of the best: in that order nobody waits for it at the end.
+    # The longest run goes on from the first seed of BEST: in that order it does not remain alone at the end.
     points.sort(key=lambda point: point.x != sweep.labels.index(BEST))
     return replace(sweep, points=tuple(points), labels=tuple(labels))
 

@@ -78,7 +78,7 @@ def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Arr
 
 
 class Head(Protocol):
-    """Whoever tells from frames whether the goal is reached. `measured` is what it is worth on recorded episodes that
+    """A success detector on frames. `measured` is its accuracy on recorded episodes that
     it was not trained on."""
 
     measured: dict[str, float]

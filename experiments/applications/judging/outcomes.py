@@ -1,4 +1,4 @@
-"""The table of what came of every episode: one row per policy, start, world and judge."""
+"""The table of successes: one row per policy, start, world and judge."""
 
 from __future__ import annotations
 

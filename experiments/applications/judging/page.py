@@ -66,7 +66,7 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
             words = {}
             for name, rates in summary["policies"].items():
                 x, y = rates[across], rates[column]
-                if x["mean"] is None:  # nobody counted it
+                if x["mean"] is None:  # not counted on the real robot
                     continue
                 spread = (
                     [[x["mean"] - x["low"]], [x["high"] - x["mean"]]],
@@ -254,7 +254,7 @@ def describe_recorded_head(measured: dict[str, float]) -> str:
 
 
 def _left_of(judged: Judgement) -> tuple[tuple[tuple[str, str], ...], str]:
-    """Whose clips are shown beside each other, (world, judge) of both, and what the left one is called."""
+    """The worlds and judges of the clips shown side by side, (world, judge) of each, and the name of the left one."""
     if TRUE in judged.worlds:
         return ((TRUE, STATE), (LEARNED, HEAD)), "the true world"
     return ((SHUFFLED, HEAD), (LEARNED, HEAD)), "the control, which executes another episode's actions,"

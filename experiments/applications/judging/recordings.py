@@ -44,7 +44,8 @@ soon knows each by heart."""
 
 LIGHT, SHIFT = 0.15, 1 / 8
 """For the same reason frames are shown in more kinds of light than `HeadConfig` does, and moved by up to this share of
-a side. With 230 recordings of a pusher, half of them successes, that told 54 of 76 held-out ones instead of 39."""
+a side. With 230 recordings of a pusher, half of them successes, 54 of 76 held-out ones were then classified correctly
+instead of 39."""
 
 FIRST, CHECKPOINTS = 50, 12
 """Steps of training after which a head may be best: the fewest, and how many of them."""

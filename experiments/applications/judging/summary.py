@@ -1,4 +1,4 @@
-"""What a judgement comes to: rates with intervals, agreement with intervals, seconds per episode; as JSON."""
+"""The summary of a judgement as JSON: success rates and agreement with intervals, episodes per second."""
 
 from __future__ import annotations
 

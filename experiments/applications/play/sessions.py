@@ -138,7 +138,7 @@ class SessionManager:
             ending.add_done_callback(self._ending.discard)
         visitor.socket = visitor.transport = visitor.replies = None
         visitor.requests.clear()
-        visitor.answered.set()  # whoever listens to that connection waits for this
+        visitor.answered.set()  # wakes `wait_for_capacity` of that connection
 
     def _evict(self, now: float) -> None:
         """Frees the session of the visitor who has been away or idle for the longest. Raises NoFreeSession without

@@ -13,7 +13,7 @@ from experiments.applications.policies.network import as_floats, downsample_uint
 from experiments.applications.policies.policy import Counts
 
 STILL = 1e-4
-"""A dimension that varies less than this in the demonstrations is not told apart from one that does not."""
+"""A dimension with a smaller standard deviation in the demonstrations counts as constant."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def frames_of(examples: Mapping[str, jax.Array], index: jax.Array) -> jax.Array:
 class ChunkPolicy:
     """A policy that looks at the last frames, plans normalised actions and executes the first of them.
 
-    Whoever inherits it says what is planned: `plan(frames [n, frames, H, W, 3], seeds, steps)` gives [n, chunk, A].
+    Subclasses implement the network: `plan(frames [n, frames, H, W, 3], seeds, steps)` gives [n, chunk, A].
     """
 
     kind = ""
