@@ -49,14 +49,21 @@ from hma_jax.objective.losses import frame_diffusion_loss
 from hma_jax.objective.masking import hidden_at_inference
 
 Batch = dict[str, jax.Array]
-"""tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
-embodiment int32 [B], and episode and start, int32 [B], which with the robot's name say what window it is.
-Perhaps real, bool [B, T], False for frames at the end that only fill up a short window: they are neither
-predicted from nor counted, and its last frame is the last real one. Perhaps action_mean and action_std,
-float32 [B, U], of all recorded actions, to draw random ones and judge errors by; otherwise the table's are. Perhaps
-other_actions, float32 [B, N, T, U], of other episodes of the same robot, and other_valid, bool [B, N], which of them
-there are; and then perhaps other_images, uint8 [B, T, H, W, 3], what would have been seen under the first of them from
-the prompt on, and other_seen, bool [B], whether that is known."""
+"""Arrays by name:
+
+    tokens         int32 [B, T, S], or latents [B, T, S, C]
+    actions        float32 [B, T, U], raw, zero-padded
+    embodiment     int32 [B]
+    episode, start int32 [B]; with the robot's name they identify a window
+
+Optional:
+
+    real           bool [B, T]: False for padding frames at the end of a short window, which are ignored action_mean,
+    action_std    float32 [B, U]: of all recorded actions, for random actions and errors (default: the table's)
+    other_actions  float32 [B, N, T, U]: of other episodes of the same robot other_valid    bool [B, N]: which of them
+    exist other_images   uint8 [B, T, H, W, 3]: the true frames under the first of them, from the prompt on other_seen
+    bool [B]: whether these are known
+"""
 
 
 class Predicted(NamedTuple):

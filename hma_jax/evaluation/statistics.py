@@ -1,8 +1,7 @@
-"""Means with standard errors, and what is derived from them: errors count episodes, not windows.
+"""Means with standard errors that are clustered by episode.
 
-Windows of one episode share scene, task and lighting, so that two of them say less than two windows
-of different episodes. Every error here is clustered: the deviations of one episode's windows are
-added up before they are squared. Reference: Cameron and Miller 2015, "A Practitioner's Guide to
+Windows of one episode share scene, task and lighting, so that they are not independent. The deviations of one episode's
+windows are added up before they are squared. Reference: Cameron and Miller 2015, "A Practitioner's Guide to
 Cluster-Robust Inference", for a regression on a constant.
 """
 
@@ -27,7 +26,7 @@ class Stat:
     mean: float
     sem: float
     n: int
-    episodes: int = 0  # that the values are windows of; 0: the values are independent of each other
+    episodes: int = 0  # that the values come from; 0: the values are independent
 
     @property
     def clusters(self) -> int:
@@ -36,10 +35,10 @@ class Stat:
 
 
 class Estimate(NamedTuple):
-    """A statistic of a dataset's windows, and to first order what each window does to it.
+    """A statistic of a dataset's windows, with its influence function: each window's effect on it, to first order.
 
-    Were the windows others, the statistic would be about `value` + mean of their `influence`. Estimates
-    of the same windows can be subtracted: what windows do to both of them then cancels.
+    For another sample of windows the statistic would be about `value` + the mean of their `influence`. Estimates on the
+    same windows can be subtracted: effects of windows that both share cancel.
     """
 
     value: float
@@ -93,7 +92,7 @@ def stat_of(estimate: Estimate, clusters: Clusters | None = None) -> Stat:
     """An estimate with its standard error; `clusters` says which episode each window is of.
 
     sem^2 = G / (G - 1) sum_g (sum_{i in g} u_i)^2 / n^2 over G episodes g, with influences u. G / (G - 1) is
-    the correction for few episodes. nan with one episode: its windows cannot say how episodes differ.
+    the correction for few episodes. nan with one episode, which gives no variance between episodes.
     Without `clusters` every value is an episode of its own, which is the usual standard error.
     """
     u, n = estimate.influence, len(estimate.influence)

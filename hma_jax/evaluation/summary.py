@@ -54,8 +54,8 @@ class Summary:
 def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
     """Means over the windows of each dataset, and its perplexities; errors clustered by episode.
 
-    Of what some windows have not (`controllability.OPTIONAL_METRICS`) the mean is over those that have it; a dataset
-    without any has no such metric.
+    Metrics that some windows lack (`controllability.OPTIONAL_METRICS`) are averaged over the windows that have them; a
+    dataset where no window has one lacks the metric.
     `perplexity_group` is the number of windows per exp(mean loss) of the official perplexity.
     """
     found = {}
@@ -70,9 +70,8 @@ def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
 def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> Summary:
     """`a` minus `b`, window by window, on the datasets and metrics that both have.
 
-    What makes a window hard for both models cancels, so that the error is that of the difference and
-    not of the two means; it is clustered by episode. Raises ConfigError if they share no dataset, or if
-    the windows of one that they share are not the same.
+    Paired by window: what makes a window hard for both models cancels. Errors are clustered by episode. Raises
+    ConfigError if they share no dataset, or if the windows of one that they share are not the same.
     """
     shared = [name for name in a.datasets if name in b.datasets]
     require(len(shared) > 0, "two evaluations without a common dataset cannot be compared")

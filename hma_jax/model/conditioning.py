@@ -23,7 +23,7 @@ from hma_jax.model.params import bias, layouts_of, ones, param, used
 
 
 class ActionFeature(NamedTuple):
-    """What a block sees of the actions of its frames."""
+    """A block's input from actions."""
 
     feature_BTD: jax.Array
     shown_BT: jax.Array | None  # bool; None: all of them
@@ -75,11 +75,11 @@ class CrossAttention(nnx.Module):
 
     DIFFERS: the release's heads attend to each other at one position and its results are
     scrambled over time (reference section 9.1), so a checkpoint of it converts but does not
-    compute what it was trained to. A frame to which no action is shown gets nothing.
+    compute what it was trained to. The output is 0 for a frame that is shown no action.
 
-    Keys carry no time, so the frame's own action is told from earlier ones by its weight: before anything is learned
-    it has as much as all of those together. Even so, models follow actions less than in the other ways (cpu-full's
-    findings).
+    Keys carry no time, so a frame's own action is distinguished from earlier ones by a bonus on its logit: at
+    initialisation its weight equals that of all the others together. Even so, models follow actions less than in the
+    other ways (cpu-full's findings).
     """
 
     def __init__(self, config: ModelConfig, embodiments: int):
@@ -130,8 +130,8 @@ class CrossAttention(nnx.Module):
 
 
 def _own_bonus(allowed_BTs: jax.Array) -> jax.Array:
-    """[B, T, T_past + T] of which actions a frame may see -> what is added to logits: of its own the logarithm of how
-    many others there are, of others 0."""
+    """bool [B, T, T_past + T], the actions that a frame may attend to -> what is added to their logits: for its own
+    action the logarithm of the number of others, for others 0."""
     count, keys = allowed_BTs.shape[1:]
     itself = jnp.eye(count, keys, k=keys - count, dtype=bool)
     others = jnp.sum(allowed_BTs & ~itself, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The embodiment table: what a model must know of each robot's actions.
+"""The embodiment table: each robot's action space and statistics.
 
 It is data, not configuration: made from a token store, saved inside every checkpoint, and
 the only place where the order of the embodiment axis E is decided.
@@ -40,7 +40,7 @@ class Embodiment:
     video_targets: bool = True
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
-    layout: str = ""  # a hash of which values its actions are, in what order; "": not known
+    layout: str = ""  # a hash of the names and order of its action values; "": unknown
 
     def __post_init__(self):
         for name in ("mean", "std", "low", "high"):  # lists and arrays are as good, but have no hash
@@ -69,12 +69,12 @@ class Embodiment:
 
     @property
     def centre(self) -> tuple[float, ...]:
-        """What is 0 to a model, length `action_dim`, in raw units."""
+        """The raw values that are normalised to 0, length `action_dim`."""
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True)) or self.mean
 
     @property
     def unit(self) -> tuple[float, ...]:
-        """What is 1 more, likewise."""
+        """The raw differences that are normalised to 1, length `action_dim`."""
         return tuple((b - a) / 2 for a, b in zip(self.low, self.high, strict=True)) or self.std
 
     @property
@@ -129,7 +129,7 @@ class EmbodimentTable:
         return self._tiled([(e.mean, e.std) for e in self.entries])
 
     def scale(self) -> tuple[np.ndarray, np.ndarray]:
-        """(centre_EU, unit_EU) of what a model is given, float32, with zeros where `statistics` has them."""
+        """(centre_EU, unit_EU) that normalise actions, float32, with zeros where `statistics` has them."""
         return self._tiled([(e.centre, e.unit) for e in self.entries])
 
     def _tiled(self, values: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[np.ndarray, np.ndarray]:
@@ -153,14 +153,14 @@ class EmbodimentTable:
         which turns rounding noise on a constant dimension into values of order 100 (reference
         section 5.6).
         """
-        return normalise(actions, *self._of(embodiment_B, actions.ndim))
+        return normalise(actions, *self._scale_of(embodiment_B, actions.ndim))
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """The inverse of `normalise`: raw units; dead dimensions take their centre."""
-        centre, unit = self._of(embodiment_B, actions.ndim)
+        centre, unit = self._scale_of(embodiment_B, actions.ndim)
         return actions * unit + centre
 
-    def _of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, jax.Array]:
+    def _scale_of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, jax.Array]:
         """(centre, unit) of each example's robot, shaped to meet [B, ..., U]."""
         shape = (-1, *(1,) * (ndim - 2), self.action_width)
         return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.scale())

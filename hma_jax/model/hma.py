@@ -1,7 +1,7 @@
 """HMA: frame embedding -> stems -> trunk -> heads.
 
-Owns the order of things and the views of a window that training, evaluation and generation
-need. Masking and losses are in `objective`, decoding in `generation`.
+Puts the parts together in one forward pass, with the options that training, evaluation and generation need. Masking and
+losses are in `objective`, decoding in `generation`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of arrays (.npz): written whole or not at all, and damage told in words."""
+"""Files of arrays (.npz): atomic writes, and one error for all kinds of damage."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ UNREADABLE = (
     OSError, ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError,
     zipfile.BadZipFile, zlib.error, tokenize.TokenError,
 )  # fmt: skip
-"""What numpy raises for a file that is missing or damaged, and what comes of one that lacks an array: RuntimeError when
-a flipped bit claims encryption or an unknown compression, EOFError for an empty file, TokenError for the header of an
-array."""
+"""What numpy raises for a file that is missing or damaged, or lacks an array: RuntimeError where a flipped bit claims
+encryption or an unknown compression, EOFError for an empty file, TokenError for a damaged header of an array."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = True) -> None:
@@ -34,8 +33,8 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = True)
 
 @contextmanager
 def reading_arrays(path: Path, advice: str) -> Iterator[Mapping[str, np.ndarray]]:
-    """The arrays of a file, for the block that makes something of them. Raises ConfigError, which ends with the
-    `advice`, where the file is missing, damaged or of something else."""
+    """The arrays of a file, while the block runs. Errors of the block in UNREADABLE count as damage too. Raises
+    ConfigError, which ends with `advice`, if the file is missing, damaged or not what the block expects."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             yield arrays

@@ -1,4 +1,4 @@
-"""How every parameter lies on a mesh, for people and for tests; and an audit of what is left whole."""
+"""The layout of every parameter on a mesh, to print and to test, and an audit of large ones that are not split."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Declarations(Protocol):
 
 @dataclass(frozen=True)
 class Decision:
-    """How one parameter lies on a mesh, and why if it is not split."""
+    """The layout of one parameter on a mesh, and the reason if it is not split."""
 
     name: str
     spec: Spec

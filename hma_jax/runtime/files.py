@@ -1,4 +1,4 @@
-"""Files that are never seen half written, nor lost with the power once they are seen."""
+"""Atomic and durable writes: a file is never seen half written, and survives a loss of power once it is seen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def sync(path: Path) -> None:
-    """What was written to a file, or renamed within a directory, survives a loss of power."""
+    """Flushes a file, or the renames within a directory, to disk (fsync)."""
     fd = os.open(path, os.O_RDONLY)
     try:
         os.fsync(fd)
@@ -20,7 +20,7 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """An error of the system that names no file, as that of a full disk, names `path`."""
+    """Adds `path` to an OSError of the block that names no file, such as that of a full disk."""
     try:
         yield
     except OSError as error:
@@ -30,15 +30,16 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, data: bytes | str) -> None:
-    """A reader sees the old content or the new one, also after a crash. Raises OSError; the old content stays then."""
+    """Replaces the file: readers see the old content or the new one, also after a crash. Raises OSError, which keeps
+    the old content."""
     content = data.encode() if isinstance(data, str) else data
-    making = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with naming(path), open(making, "wb") as file:
+        with naming(path), open(temporary, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(making, path)
+        os.replace(temporary, path)
     finally:
-        making.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     sync(path.parent)

@@ -68,8 +68,8 @@ class Processes:
             )
 
     def or_from(self, environment: Mapping[str, str]) -> Processes:
-        """With the environment's values for what is not given. Raises ConfigError for one that is no number, and
-        if only a part of what is needed is known."""
+        """Missing fields taken from the environment. Raises ConfigError for a value that is no number, and if only some
+        of the required fields are known."""
 
         def number(name: str, given: int | None) -> int | None:
             text = environment.get(name)
@@ -98,9 +98,9 @@ class Processes:
 
 
 def start(asked: Processes) -> None:
-    """Joins the other processes; before anything else of JAX is used. A single process needs nothing and gets
-    nothing. Raises ConfigError if they cannot. If not all come in time, or this one is asked to stop meanwhile, it says
-    so and ends here."""
+    """Joins the other processes (`jax.distributed`); must be called before anything else of JAX. Does nothing for a
+    single process. Raises ConfigError if joining fails. If not all processes come in time, or this one is asked to stop
+    while it waits, it prints a message and exits."""
     if not asked.several:
         return
     # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `AgreedMaximum` sees both.
@@ -121,7 +121,7 @@ def start(asked: Processes) -> None:
         except (RuntimeError, ValueError, TypeError) as error:
             failed.append(error)
 
-    # JAX waits in a call that no signal interrupts, and aborts the process when its patience is over.
+    # JAX waits in a call that no signal interrupts, and aborts the process after its own timeout.
     joining = threading.Thread(target=join, name="join", daemon=True)
     try:
         joining.start()

@@ -91,7 +91,7 @@ class Checkpoints:
         except SaveError as error:
             if kind is None:
                 raise
-            log.warning("%s", error)  # what went wrong before is the news
+            log.warning("%s", error)  # the earlier exception is the one to raise
         finally:
             self._background.shutdown()
             self._close_orbax()
@@ -140,7 +140,7 @@ class Checkpoints:
             raise self._failed(step, error) from error
 
     def _writer(self) -> ocp.training.Checkpointer:
-        """Made for the first save: what it finds by then is what this run goes on from."""
+        """Created at the first save: by then the directory holds only checkpoints that this run continues from."""
         if self._orbax is None:
             hush_orbax()
             policies = ocp.training.preservation_policies
@@ -149,7 +149,7 @@ class Checkpoints:
                 preservation_policy=policies.AnyPreservationPolicy(
                     [policies.LatestN(self.keep), policies.CustomSteps(self.keep_steps)]
                 ),
-                # A save cut short by a kill leaves a temporary directory; drop it.
+                # A save that was killed leaves a temporary directory; remove it.
                 cleanup_tmp_directories=True,
             )
         return self._orbax
@@ -250,7 +250,8 @@ class Checkpoints:
 
 
 def _require_writable(directory: Path) -> None:
-    """Raises OSError where nothing can be made. Orbax finds out in a thread, for which others then wait without end."""
+    """Raises OSError if nothing can be created in `directory`. Orbax would fail in a thread that others then wait for
+    without end."""
     if not os.access(directory, os.W_OK | os.X_OK):
         read_only = directory.is_dir() and os.statvfs(directory).f_flag & os.ST_RDONLY
         code = errno.EROFS if read_only else errno.EACCES if directory.is_dir() else errno.ENOENT
@@ -258,13 +259,13 @@ def _require_writable(directory: Path) -> None:
 
 
 def _size(count: int) -> str:
-    """A number of bytes as people say it: '7.34 GB'."""
+    """A number of bytes with a unit: '7.34 GB'."""
     power = min(int(math.log10(max(count, 1)) / 3), 4)
     return f"{count / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB', 'TB')[power]}"
 
 
 def _reason(error: Exception) -> str:
-    """One line: what the operating system said, where that can be told."""
+    """One line: the operating system's message, if there is one."""
     code = re.search(r"os_error_code='(\d+)'", str(error))
     if code:
         return os.strerror(int(code[1]))

@@ -1,6 +1,6 @@
-"""What a run reports: JSON lines, TensorBoard and a progress line.
+"""A run's logs: JSON lines, TensorBoard and a progress line.
 
-A file that a resumed run goes on with is cut after the step that it resumes from.
+Files of a resumed run are truncated after the step that it resumes from.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ def fit(
     the steps do.
     """
     run_dir, clock = Path(run_dir), options.clock
-    # One writer per run: the others of a program with several processes leave lock and log alone.
+    # One writer per run: of several processes only process 0 takes the lock and writes the log.
     with (
         locked_run(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
@@ -163,7 +163,7 @@ def fit(
             barrier("compiled")
 
             began = saved = clock()
-            validation_seconds = 0.0  # seconds
+            validation_seconds = 0.0
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
 

@@ -1,4 +1,4 @@
-"""Checkpoints as they are read: whole, or refused by the name of the file that is damaged.
+"""Reading checkpoints: verified by hash, or refused with the name of the damaged file.
 
 A checkpoint DIRECTORY/<step> holds a folder per item (the fields of a state), Orbax's own files, the
 description of its run, and the list of all of these with their hashes (`training.hashes`). Only the
@@ -33,7 +33,7 @@ class CheckpointError(ConfigError):
 
 
 def find_damage(checkpoint: Path) -> Damaged | None:
-    """The first file that is not as it was written; None where there is none, or no list to tell."""
+    """The first damaged file; None if there is none, or no list of hashes."""
     try:
         verify(checkpoint)
     except Damaged as damage:
@@ -42,7 +42,7 @@ def find_damage(checkpoint: Path) -> Damaged | None:
 
 
 def read_description(checkpoint: Path) -> dict[str, Any]:
-    """What the run said of itself. Raises CheckpointError for damage to the files that tell."""
+    """The description of the run that wrote it. Raises CheckpointError if its files are damaged."""
     with _reading(checkpoint):
         listed = verify(checkpoint, lambda name: "/" not in name)
         if not listed:
@@ -90,7 +90,7 @@ def has_item(checkpoint: Path, name: str) -> bool:
 
 @contextmanager
 def _reading(checkpoint: Path) -> Iterator[None]:
-    """Damage, and whatever Orbax raises for it (types of four libraries), becomes a CheckpointError."""
+    """Turns damage, and whatever Orbax raises for it (types of four libraries), into a CheckpointError."""
     hush_orbax()
     try:
         yield

@@ -1,4 +1,4 @@
-"""Which robots' parameters a step computes with.
+"""The robots whose parameters a step updates.
 
 A batch of B examples has at most B robots, of a model that may know hundreds. Their slices are taken out
 before gradients are computed and put back after the update: no gradient, no moment and no transfer of the

@@ -88,8 +88,7 @@ def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[
 
 
 def require_frames(run: Run, deed: str) -> None:
-    """Raises ConfigError for a policy and for inverse dynamics, whose frames nothing was learnt of: there are none to
-    `deed`."""
+    """Raises ConfigError for a model that was trained to predict actions only; `deed` is the verb for the message."""
     masking = run.train.masking
     require(
         masking.predicts_frames,

@@ -1,4 +1,4 @@
-"""What training carries from step to step, and how it is made: one of it, and no more.
+"""The training state, and how it is initialised without a second copy in memory.
 
 A checkpoint keeps each field of a state as an item of its own (`training.checkpoints`).
 """
@@ -22,7 +22,7 @@ from hma_jax.runtime.sharding import place
 from hma_jax.training.optimizer import init_adam
 
 FINITE = "finite/"
-"""What the names of a step's checks begin with: metrics that are not logged, but stop a run if false."""
+"""Prefix of the names of a step's checks: metrics that are not logged, but stop a run if false."""
 
 
 class TrainState(NamedTuple):
@@ -35,7 +35,7 @@ class TrainState(NamedTuple):
 
     @property
     def weights(self) -> Params:
-        """What evaluation takes: the average where there is one."""
+        """The parameters to evaluate: the average if there is one."""
         return self.params if self.ema is None else self.ema
 
 
