@@ -51,18 +51,20 @@ from hma_jax.objective.masking import hidden_at_inference
 Batch = dict[str, jax.Array]
 """Arrays by name:
 
-    tokens         int32 [B, T, S], or latents [B, T, S, C]
-    actions        float32 [B, T, U], raw, zero-padded
-    embodiment     int32 [B]
-    episode, start int32 [B]; with the robot's name they identify a window
+    tokens          int32 [B, T, S], or latents [B, T, S, C]
+    actions         float32 [B, T, U], raw, zero-padded
+    embodiment      int32 [B]
+    episode, start  int32 [B]; with the robot's name they identify a window
 
 Optional:
 
-    real           bool [B, T]: False for padding frames at the end of a short window, which are ignored action_mean,
-    action_std    float32 [B, U]: of all recorded actions, for random actions and errors (default: the table's)
-    other_actions  float32 [B, N, T, U]: of other episodes of the same robot other_valid    bool [B, N]: which of them
-    exist other_images   uint8 [B, T, H, W, 3]: the true frames under the first of them, from the prompt on other_seen
-    bool [B]: whether these are known
+    real            bool [B, T]: False for padding frames at the end of a short window, which are ignored
+    action_mean     float32 [B, U]: of all recorded actions, for random ones and errors; default: the table's
+    action_std      float32 [B, U]: likewise
+    other_actions   float32 [B, N, T, U]: of other episodes of the same robot
+    other_valid     bool [B, N]: which of them exist
+    other_images    uint8 [B, T, H, W, 3]: true frames under the first of them, from the prompt on
+    other_seen      bool [B]: whether these are known
 """
 
 
@@ -72,7 +74,7 @@ class Predicted(NamedTuple):
     tokens: jax.Array  # under the recorded actions [B, n, S (, C)]
     random_last: jax.Array  # of the last (real) frame, under each random sequence [B, draws, S (, C)]
     random: jax.Array | None  # under the first random one [B, n, S (, C)]; None where only the last frame was made
-    other: jax.Array | None = None  # under the first of another episode; None where nobody knows what is true then
+    other: jax.Array | None = None  # under the first of another episode; None without other_images
 
 
 def predicts_actions(model: ModelConfig, setting: Setting) -> bool:

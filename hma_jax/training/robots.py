@@ -24,8 +24,8 @@ class Active(NamedTuple):
 
 def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
     """The robots of a batch, then as many others as make a fixed number."""
-    # Two at least. What writes a single robot back XLA makes an update of a slice, puts off reading its old moments,
-    # and then has to copy all robots' arrays in each step. The second robot, without an example, stands still.
+    # Two at least: XLA turns the write of a single robot into a slice update, delays reading its old moments, and then
+    # copies all robots' arrays in each step. The second robot, without an example, is not changed.
     count = min(max(len(embodiment_B), 2), embodiments)
     if count == embodiments:
         return Active(jnp.arange(embodiments), embodiment_B)
