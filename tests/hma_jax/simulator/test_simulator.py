@@ -110,7 +110,7 @@ def test_beginning_and_going_back_cost_what_they_are_of_and_come_to_the_same(mon
     starts, asked, computed = [start(b % 3, b + 1) for b in range(4)], ([2], [1, 3, 0], []), []
     whole, parts = simulator(episodes=4), simulator(episodes=4)
     monkeypatch.setattr(parts, "_programs", copy(parts._programs))  # others share them
-    for name in ("begin", "again"):
+    for name in ("reset_from_images", "reset_from_tokens"):
         made = getattr(parts._programs, name)
         counted = lambda w, state, at, made=made: (computed.append(len(at.frames)), made(w, state, at))[1]  # noqa: E731
         monkeypatch.setattr(parts._programs, name, counted)
@@ -300,8 +300,8 @@ def test_an_action_of_another_shape_or_that_is_not_finite_is_refused():
 
 
 DEEDS = {
-    "begin": lambda sim: sim.reset(start(0, 2), episodes=[0]),
-    "again": lambda sim: sim.rewind(1, [0]),
+    "reset_from_images": lambda sim: sim.reset(start(0, 2), episodes=[0]),
+    "reset_from_tokens": lambda sim: sim.rewind(1, [0]),
     "advance": lambda sim: sim.step([chunks_of(0, 1)[0], None]),
 }
 
