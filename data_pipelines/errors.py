@@ -1,7 +1,7 @@
-"""What goes wrong with data, as exceptions whose message is complete.
+"""Exceptions for data that cannot be used, with complete messages.
 
-Owns the exception types, and how their advice is told from the rest. A message says what is wrong,
-where (file and byte offset, or dataset, episode and step) and what to do; the command line prints it as it is.
+Owns the exception types, and how the advice at the end of a message is recognised. A message says what is wrong,
+where (file and byte offset, or dataset, episode and step) and what to do; the command line prints it unchanged.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ MAX_LISTED = 6
 every shard may be damaged."""
 
 ADVICE = re.compile(r"[.;] (?:Download|Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
-"""The end of a message that says how damage is left out."""
+"""The end of a message that says how to skip damaged data."""
 
 
 def without_advice(text: str) -> str:
-    """The message of an EpisodeError for whoever leaves damage out already: what is wrong and where, as a sentence.
+    """The message of an EpisodeError without its advice, for users who skip damaged data already.
 
-    Not for what a token store keeps: its hash covers the whole message.
+    Not for messages that a token store keeps: its hash covers the whole message.
     """
     return ADVICE.sub(".", text)
 
@@ -30,21 +30,20 @@ class DataError(Exception):
 
 
 class UnreachableError(DataError):
-    """A store that does not answer. No damage of data, so no policy leaves anything out for it."""
+    """A disk or an object store that cannot be read. The data may be intact, so no policy skips anything for it."""
 
 
 class EpisodeError(DataError):
-    """One episode is unusable; the policy corrupt='skip' may leave it out.
+    """One episode is unusable; the policy corrupt='skip' may skip it.
 
-    Attributes, where they are known: `path` of the file it lies in, `offset` of its first byte
-    there.
+    Attributes, if known: `path` of its file, `offset` of its first byte in the file.
     """
 
     path: Path | None = None
     offset: int | None = None
 
     def at(self, path: Path, offset: int) -> EpisodeError:
-        """The same error, with its place."""
+        """The same error, with file and offset."""
         self.path, self.offset = path, offset
         return self
 

@@ -1,7 +1,6 @@
-"""True robots stepped side by side under the interface of the learned simulator, which says what calls mean
-(`hma_jax.simulator`).
+"""Ground-truth simulators with the interface of the learned simulator, which documents it (`hma_jax.simulator`).
 
-Owns what all true simulators share; each kind says which robots it has and opens their worlds.
+Owns what all true simulators share; each subclass says which robots it has and opens their worlds.
 """
 
 from __future__ import annotations

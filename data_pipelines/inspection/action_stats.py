@@ -1,6 +1,6 @@
-"""The numbers of an action field, value by value, and what they look like.
+"""Statistics of an action field, value by value, and hints at their meaning.
 
-Hints are guesses from statistics, for a person to judge: they never change how data is read.
+Hints are guesses from the statistics, for a person to check: they never change how data are read.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from data_pipelines.registry.angles import TURN, AngleUnit
 from hma_jax.model.embodiments import DEAD_STD
 
 SWITCH_SHARE = 0.8
-"""A value that is one of two numbers at least so often is a switch."""
+"""A value that takes one of two numbers in at least this share of the steps is a switch."""
 
 
 WRAPPING: dict[AngleUnit, str] = {"radian": "wrapping angle", "degree": "wrapping angle in degrees"}

@@ -1,8 +1,8 @@
-"""Episodes that are probably the same recording, within a split or in two of them.
+"""Finds episodes that are probably the same recording, within a split or across splits.
 
-What is compared survives another compression or another size of the pictures: a coarse picture of
-an episode's first and last frame, and its actions at sixteen times. A fixed camera sees much the same
-in every episode, so pictures alone say little: where there are actions that vary, they decide too.
+The fingerprint is robust to recompression and resizing: thumbnails of an episode's first and last frame, and its
+actions at sixteen times. A fixed camera shows much the same in every episode, so images alone do not suffice: if
+actions vary, they must match too.
 """
 
 from __future__ import annotations
@@ -82,11 +82,11 @@ def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, 
 
 
 def _finite(actions: np.ndarray) -> np.ndarray:
-    """0 in the place of what is no number: one infinite value would make all others of its column alike."""
+    """Replaces NaN and infinity by 0: one infinite value would make all others of its column equal after scaling."""
     return np.nan_to_num(actions, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _same_pictures(a: Fingerprint, b: Fingerprint, actions_vary: bool) -> bool:
     if not actions_vary and not (a.pictures.std(axis=(1, 2)) > SAME_PICTURE).any():
-        return False  # blank pictures and still actions: nothing to tell episodes apart by
+        return False  # blank images and constant actions: episodes cannot be told apart
     return not (np.sqrt(((a.pictures - b.pictures) ** 2).mean(axis=(1, 2))) > SAME_PICTURE).any()

@@ -1,8 +1,7 @@
-"""What lies in a dataset: schema, counts, lengths, cameras and the numbers of its actions.
+"""Inspection of a dataset: schema, counts, lengths, cameras and statistics of its actions.
 
-Owns the facts, read from a sample of episodes so that terabytes take as long as gigabytes.
-What the registry should say of the dataset follows from them in `suggest`; drawing and
-printing are the caller's.
+Owns these facts, read from a sample of episodes so that terabytes take as long as gigabytes. `suggest` derives a
+registry entry from them; drawing and printing are the caller's.
 """
 
 from __future__ import annotations
@@ -140,7 +139,7 @@ def inspect_dataset(
     max_bytes: int = 2_000_000_000,
     action_keys: Sequence[str] = (),
 ) -> Sample:
-    """Facts of one split, some of its episodes to look at, and what tells duplicates.
+    """Facts of one split, example episodes, and fingerprints to find duplicates by.
 
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
     each camera are decoded in the first `max_examples`, two in the others. Fields of numbers count as actions
@@ -339,7 +338,7 @@ def _look(record: dict, cameras: dict[str, _CameraLog], times: Sequence[int], wh
 
 
 class _CameraLog:
-    """What was seen of one camera so far."""
+    """Collects the facts of one camera."""
 
     def __init__(self, key: str):
         self._key = key

@@ -1,4 +1,4 @@
-"""The registry entry that the facts of a dataset suggest, and what an entry gives for it."""
+"""Suggests a registry entry from the facts of a dataset, and counts the windows that an entry gives."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNO
 NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
 
 NO_RATE = 0.0
-"""Stands in an entry for a rate that nobody gave; a `DatasetSpec` refuses it."""
+"""Placeholder for an unknown rate, which `DatasetSpec` refuses."""
 
 NO_CAMERA = (
     "none of its fields is an image of 8 bits; write pictures that are stored as plain numbers as images "
@@ -34,7 +34,7 @@ NO_CAMERA = (
 
 @dataclass(frozen=True)
 class Suggestion:
-    """The fields of an entry, and why."""
+    """The fields of a suggested entry, and the reasons."""
 
     name: str
     image_key: str
@@ -91,7 +91,7 @@ class Suggestion:
 
 @dataclass(frozen=True)
 class WindowFacts:
-    """What an entry gives at a number of frames."""
+    """The windows that an entry gives, for a number of frames per window."""
 
     frames: int
     stride: int

@@ -37,8 +37,8 @@ def make_loader(
     A batch: `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C]; `actions` float32
     [B, T, U] in raw units, zero-padded; `embodiment` int32 [B], index into `table`; `real` bool [B, T],
     False for frames that only fill up a window of a short episode. `rows` are those of the
-    global batch that are wanted, in their order: one of several processes takes its own
-    (`hma_jax.runtime.rows`). `threads` read ahead by `prefetch` batches each.
+    global batch that are wanted, in their order: each process of several takes its own
+    (`hma_jax.runtime.rows`). Each of the `threads` prefetches `prefetch` batches.
 
     Raises ConfigError for unknown datasets or rows, DataError if no episode is long enough for one window.
     """
@@ -134,14 +134,14 @@ class _Stream:
             episode, start = windows.locate(self._other(at, i))
             item = self.store.episode(windows.name, "train", episode)
         actions = slicer.actions(item, start, self.action_width)
-        if self.shuffle_actions:  # a shorter window's chunks come again, so that every real frame has one
+        if self.shuffle_actions:  # the chunks of a shorter window are repeated, so that every real frame has one
             actions = actions[np.arange(slicer.frames) % slicer.count_real(item, start)] * row["real"][:, None]
         return row | {"actions": actions}
 
     def _other(self, at: int, i: int) -> int:
-        """A window of another episode, drawn anew on every visit so that no pair can be learnt.
+        """A window of another episode, drawn anew on every visit so that no pair can be learned.
 
-        Windows of one episode overlap: their actions would still tell of this one's.
+        Not one of the same episode: windows of an episode overlap, so their actions would still carry information.
         """
         first, end = self.windows.episode_range(at)
         n = len(self.windows)

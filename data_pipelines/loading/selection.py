@@ -15,8 +15,8 @@ from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 Weighed = Literal["used", "all"]
-"""Whose windows weigh in the mixture: those of the trajectories that are used, or all that there are, so that a
-cap on trajectories changes nothing but the trajectories."""
+"""Which windows determine the mixture's weights: those of the trajectories that are used, or those of all trajectories,
+so that a cap on trajectories does not change the weights."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class LoaderConfig:
     tau: float = 3.0  # datasets are drawn with p ∝ windows^(1/tau)
     seed: int = 0  # of the order and of the subset of trajectories
     max_trajectories: int | None = None  # per dataset
-    capped: tuple[str, ...] = ()  # datasets that it concerns; (): all of them
+    capped: tuple[str, ...] = ()  # datasets to which max_trajectories applies; (): all of them
     datasets: tuple[str, ...] = ()  # empty: all of the store
     shuffle_actions: bool = False  # control: actions of another episode
     rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
@@ -58,7 +58,7 @@ class TrainingWindows:
 
 
 def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
-    """Counts windows and weighs datasets. Raises DataError if not one window is left."""
+    """Counts windows and computes the datasets' weights. Raises DataError if no window is left."""
     names = config.datasets or store.names
     sets = {name: _windows(store, name, config, config.max_trajectories) for name in names}
     require_windows(sets)

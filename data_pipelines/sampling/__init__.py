@@ -1,1 +1,1 @@
-"""Seeded choices, below all that make them: order, splits and subsets, the mixture of datasets."""
+"""All random choices of the data path, as functions of a seed: order, splits and subsets, the mixture of datasets."""

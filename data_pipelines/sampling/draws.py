@@ -1,11 +1,10 @@
-"""From which dataset each example is drawn, as a pure function of (seed, position).
+"""From which dataset each example is drawn, as a pure function of (seed, position): stratified sampling in blocks.
 
-Draws come in blocks. How often a dataset was drawn before a block is known without looking at any block:
-the block's number, times its length, is shared out by the weights. Between two such counts lies what the
-block holds, in an order that a hash of (seed, block) shuffles. So the i-th draw of a dataset ever is
-numbered i: its order visits every window once per epoch, which independent draws of every position would
-not, and counts never stray from their shares by more than a few, which matters for datasets of small weight.
-Any position costs one block, whatever came before it.
+The number of draws of each dataset before a block follows from the weights and the block's number alone. The
+difference between two such counts is what the block holds, in an order shuffled by a hash of (seed, block). So every
+draw of a dataset has a running number: its shuffled order visits each window once per epoch, which independent draws
+would not, and counts deviate from their expectation by a few at most, which matters for datasets of small weight.
+Any position takes the computation of one block.
 DIFFERS: the release draws datasets and windows with replacement, the same in every epoch (reference section 4.3).
 """
 
@@ -18,18 +17,18 @@ import numpy as np
 from data_pipelines.sampling.order import hash64, stream_seed
 
 BLOCK = 512
-"""Draws of a block: several batches of most sizes, so that what a batch holds varies nearly as in free draws."""
+"""Draws per block: several batches of most sizes, so that batches vary nearly as with independent draws."""
 
 _BITS = 48
-"""Of a share, a fixed-point number: weights are exact to 1e-14, in integers."""
+"""Bits of a share as a fixed-point number: weights are exact to 1e-14, and all arithmetic is in integers."""
 
 
 class Draws:
     """The draws of datasets with `weights` (float [D], sum 1), in blocks."""
 
     def __init__(self, weights: Sequence[float], seed: int | str):
-        rest = np.cumsum(np.asarray(weights, np.float64)[::-1])[::-1]  # of a dataset and those after it
-        nothing = np.zeros(len(rest))  # where no weight is left: those before take all there is
+        rest = np.cumsum(np.asarray(weights, np.float64)[::-1])[::-1]  # weight of a dataset and those after it
+        nothing = np.zeros(len(rest))  # if no weight remains, earlier datasets take all draws
         shares = np.minimum(np.divide(weights, rest, out=nothing, where=rest > 0), 1.0)
         shares[-1] = 1.0
         self._shares = [round(float(share) * (1 << _BITS)) for share in shares]
@@ -40,8 +39,8 @@ class Draws:
     def counts(self, block: int) -> np.ndarray:
         """int64 [D]: draws of each dataset before `block`; their sum is block x BLOCK.
 
-        Each dataset takes its share of what those before it left, rounded at a point of its own. Neither
-        what it takes nor what it leaves ever shrinks, so that no block asks for less than nothing.
+        Each dataset takes its share of the draws that those before it left, rounded with an offset of its own. Both
+        numbers never decrease from block to block, so that no block has a negative count.
         """
         left, counts = block * BLOCK, []
         for share, offset in zip(self._shares, self._offsets, strict=True):
@@ -60,7 +59,7 @@ class Draws:
         return dataset, number
 
     def _block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """The same for all positions of a block."""
+        """(dataset, which of its draws this is) for all positions of a block."""
         before = self.counts(block)
         here = self.counts(block + 1) - before
         shuffled = np.argsort(hash64(np.arange(BLOCK), hash64(block, self._seed)), kind="stable")

@@ -1,6 +1,6 @@
 """How often each dataset is drawn: p ∝ n^(1/τ).
 
-Owns the weights and the drop of datasets that have nothing to give; draws nothing.
+Owns the weights, and drops datasets without examples; draws nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hma_jax.config import require
 
 @dataclass(frozen=True)
 class Mixture:
-    """Datasets that are drawn, their probabilities, and why the others are not drawn."""
+    """Datasets that are drawn, their probabilities, and why others were dropped."""
 
     names: tuple[str, ...]
     weights: tuple[float, ...]

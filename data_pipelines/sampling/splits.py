@@ -1,9 +1,9 @@
-"""Which episodes are held out and which belong to a subset: by hash, never by order.
+"""Which episodes are held out and which belong to a subset: chosen by hash, not by order.
 
-Neighbouring episodes of a robot dataset share a scene, a task or a day, so the first 5 %
-are no sample of it. A hash of (dataset, episode) is one, needs no file, and is the same for
-everybody who reads the dataset. What is hashed is the episode's name (`sources.identity`), and what is
-divided is all episodes that there should be: which are damaged changes the place of no other.
+Neighbouring episodes of a robot dataset share a scene, a task or a day, so its first 5 % are not a representative
+sample. Choosing by a hash of (dataset, episode) is random, needs no file, and is the same for everybody who reads the
+dataset. The hash is of the episode's name (`sources.identity`), and the choice is among all episodes that the dataset
+should have, so that damaged ones do not change the split of the others.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def held_out(
 ) -> np.ndarray:
     """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 
-    How many they are says `count_held_out`.
+    `count_held_out` says how many.
     DIFFERS: the release takes the first max(20, 5 %) episodes (reference section 5.1).
     """
     count = count_held_out(len(ids), fraction, min_val, max_val, max_fraction)
@@ -59,8 +59,8 @@ def held_out(
 def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, max_fraction: float) -> int:
     """`fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_fraction` of a dataset.
 
-    Of a small dataset the last decides: with min_val 8, two of nine episodes are held out, not four. One is, of
-    two episodes or more, where the others ask for any.
+    In a small dataset the last bound decides: with min_val 8 and max_fraction 0.25, two of nine episodes are held
+    out. If the other bounds ask for any, at least one of two or more episodes is held out.
     """
     most = max(int(max_fraction * episodes), 1)
     return min(max(round(fraction * episodes), min_val), max_val, most, episodes // 2)

@@ -1,6 +1,6 @@
-"""Episodes of one simulator: recorded under a behaviour, or run again from a recorded start.
+"""Episodes of one simulator: recorded with a behaviour policy, or replayed from a recorded start.
 
-Owns the loop and what is remembered of it. `Simulator` is what a backend provides.
+Owns the loop and what is recorded. `Simulator` is the interface of a backend.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Simulator(Protocol):
         """Inverse of `physics`."""
 
     def vector(self) -> np.ndarray:
-        """float32 [S]: what the robot may know of its state."""
+        """float32 [S]: the robot's observed state (proprioception)."""
 
     def frame(self) -> np.ndarray:
         """uint8 [size, size, 3], RGB."""
@@ -55,7 +55,7 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True)
 class StartState:
-    """Where an episode began: what resets the environment, then the physics it is set to."""
+    """The start of an episode: the environment and seed to reset with, then the physics state to set."""
 
     env: str
     seed: int

@@ -1,9 +1,8 @@
-"""Making the simulator suite: which episodes are missing, in which processes, all or nothing each.
+"""Makes the simulator suite: simulates the missing episodes in several processes and publishes whole datasets.
 
-Bytes depend on the table, the packages' versions, frame size, episode count and seed; never on
-the number of workers or on how often a run was cut short. Episodes are kept as they are made, a
-dataset appears when all of its episodes are there. One process at a time makes a dataset (see
-`publishing`). Imports no simulator.
+Bytes depend on the table, the packages' versions, frame size, number of episodes and seed; not on the number of
+workers or on interruptions. Finished episodes are kept, and a dataset appears when all of its episodes are finished.
+One process at a time makes a dataset (see `publishing`). Imports no simulator.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ GENERATOR_VERSION = 1
 (`made_by_other_versions`)."""
 
 JOB_EPISODES = 10
-"""At most so many episodes in one process: starting one costs a few seconds."""
+"""Episodes per process, at most: starting a process costs a few seconds."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with (dataset, episodes that are there, of how many) over all datasets."""
+"""Called with (dataset, finished episodes, total episodes), both over all datasets."""
 
 
 def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
@@ -132,7 +131,7 @@ def generate_sim(
 
 
 class _Run:
-    """One call of `generate_sim`: what is there, and the processes under way."""
+    """One call of `generate_sim`: what is finished, and the running processes."""
 
     def __init__(
         self, root: Path, fingerprints: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack
@@ -145,11 +144,11 @@ class _Run:
         self.stack, self.output_locks = stack, dict[str, OutputLock]()
 
     def staging(self, name: str) -> Path:
-        """Where the episodes of a dataset wait for each other."""
+        """The directory in which the episodes of an unfinished dataset are collected."""
         return self.root / name / f".{VERSION}.episodes.{self.fingerprints[name]}"
 
     def plan(self, spec: SimSpec) -> list[Job]:
-        """The jobs that a dataset lacks; it is put together if nothing but that is left to do."""
+        """The jobs that a dataset still needs; if there are none, the dataset is finished here."""
         name = spec.name
         if not is_complete(self.root / name / VERSION, self.fingerprints[name]):
             self.output_locks[name] = self.acquire(name)  # looked at again: another process may have made it by then

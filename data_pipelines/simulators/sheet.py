@@ -1,6 +1,6 @@
-"""Contact sheets: what a dataset shows, to be looked at.
+"""Contact sheets of datasets.
 
-Frames are read back through `RldsDataset`, as training will.
+Frames are read back through `RldsDataset`, as in training.
 """
 
 from __future__ import annotations

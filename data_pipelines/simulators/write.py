@@ -1,7 +1,7 @@
-"""One simulator dataset on disk, put together from the records of its episodes.
+"""Writes one simulator dataset from the records of its episodes.
 
-Owns shards and what lies beside them; the dataset appears whole. Beside it, not in it, lies
-stats.json: how fast it was made and what became of the episodes.
+Owns the shards and the metadata; the dataset appears atomically. stats.json lies beside it, not in it: speed, lengths
+and success of the episodes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What an episode is called, whatever lies before it: its file's name, and its place in that file.
+"""Names of episodes that do not depend on other episodes: the file's name, and the position in the file.
 
-Owns names as numbers. Splits and subsets hash them, so that an episode keeps its side when others are damaged,
-absent or left out.
+Owns names as numbers. Splits and subsets hash them, so that an episode stays in its split when others are damaged,
+missing or skipped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from data_pipelines.errors import DataError
 
 @dataclass(frozen=True)
 class EpisodeRun:
-    """The episodes at the places `first`, ..., `first + count - 1` of one file, readable or not."""
+    """The episodes at positions `first`, ..., `first + count - 1` of one file, readable or not."""
 
     file: str  # its name, without a directory
     first: int
@@ -26,7 +26,7 @@ class EpisodeRun:
 
 
 def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:
-    """uint64 per episode: SHA-256 of the file's name, its first 8 bytes, plus the place.
+    """uint64 per episode: the first 8 bytes of the SHA-256 of the file's name, plus the position in the file.
 
     Raises DataError for two episodes of one name.
     """
@@ -48,7 +48,7 @@ def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:
 
 
 def describe(runs: Sequence[EpisodeRun], number: int) -> str:
-    """The name of the `number`-th episode, for people: file and place."""
+    """The name of the `number`-th episode for a message: file and position."""
     for run in runs:
         if number < run.count:
             return f"{run.file}, episode {run.first + number}"

@@ -1,6 +1,6 @@
-"""Any dataset by its location: which format lies there, and the source that reads it.
+"""Opens a dataset of any format by its location.
 
-Owns that choice. A new format is one more source and one line here.
+Owns the choice of the format. A new format is one more source and one line here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ HDF5 = (".hdf5", ".h5")
 
 
 def find_format(location: str | Location) -> str:
-    """'rlds', 'lerobot' or 'robomimic', by what lies there; 'rlds' where nothing does."""
+    """'rlds', 'lerobot' or 'robomimic', by the files at `location`; 'rlds' if there are none."""
     place = locate(location)
     if place.suffix in HDF5 and not place.is_dir():
         found = "robomimic"

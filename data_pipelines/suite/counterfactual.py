@@ -1,4 +1,4 @@
-"""What would have been seen: recorded episodes of the suite from their start, under other actions."""
+"""Counterfactual frames: recorded episodes of the suite, simulated from their start under other actions."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Making the suite: which datasets are missing, in which processes, all or nothing each.
+"""Makes the suite: generates the missing datasets in several processes, each atomically.
 
-Bytes depend on the table, scale and seed, never on the number of workers.
+Bytes depend on the table, scale and seed, not on the number of workers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Episodes from start to end: worlds driven by their behaviour, or by given actions.
+"""Rollouts of whole episodes under the scripted behaviour, or under given actions.
 
-Owns the loop and what is remembered of it. A rollout is a pure function of (spec, seeds) or,
-when actions are given, of those. Nothing is drawn here.
+Owns the loop and what is recorded. A rollout is a pure function of (spec, seeds) and, if given, the actions. Nothing
+is rendered here.
 """
 
 from __future__ import annotations

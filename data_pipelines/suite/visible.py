@@ -1,6 +1,6 @@
-"""What of an object a camera sees: its colour, and the share of it that lies in the image and under no link.
+"""Visibility of objects: their colours, and the share of each that lies in the image and is not occluded by a link.
 
-Found by geometry from the same shapes that `render` paints, at a few points of each object.
+Computed from the shapes that `render` paints, at a few points of each object.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""The simulator: many episodes of one robot at once, in numpy.
+"""The physics simulator of the suite: many episodes of one robot at once, in numpy.
 
-Owns the state, momentum, contact and grasping; it does what actions say and decides nothing.
-Joints take a moment to reach the velocity they are asked for; objects slide, slow down by
-friction, hit each other and the walls, and stay where they come to rest. All episodes advance
-together, and none sees another: each is a function of its seed and its actions alone.
+Owns the state, momentum, contact and grasping; it executes actions and decides nothing. Joints take a moment to reach
+the commanded velocity; objects slide, slow down by friction, collide with each other and the walls, and come to rest.
+All episodes advance together but are independent: each is a function of its seed and its actions alone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A dataset of the token store, made part by part by any number of processes, and published at once.
+"""Writes a dataset of the token store part by part, by any number of processes, and publishes it atomically.
 
-Owns the work directory, what is kept after a crash, and publishing. Who makes which part is in
-`part_maker`; what goes into it is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
+Owns the work directory, what survives a crash, and publishing. `part_maker` decides who makes which part; the caller
+gives its contents: episodes of any source (`tokenize_job`) or folders of the release (`import_tokens`).
 
 Parts gather in the work directory `<store>/.<name>.<hash of the plan>`, which neither readers nor jobs with another
 plan use. Every process takes the next part that is neither finished nor locked by another process (lock files are in
@@ -35,7 +35,7 @@ from hma_jax.config.json import diff, stable_hash
 from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
-"""Bytes of records in one part: what a killed process has to do again, at most."""
+"""Bytes of records in one part, which is the most work that a killed process loses."""
 
 
 def write_dataset(
@@ -123,7 +123,7 @@ def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
 
 
 def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifest | None:
-    """Makes every part that is free and publishes the dataset if it is complete; None if it is not."""
+    """Makes every free part and publishes the dataset if it is complete; None if it is not."""
     manifest = _published(maker.final, maker.plan)
     if manifest is not None:
         return manifest
@@ -134,7 +134,7 @@ def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifes
 
 
 def _publish(maker: PartMaker) -> None:
-    """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
+    """Publishes the dataset, unless another process is doing so. A damaged part is made again by the next attempt."""
     work, final, plan = maker.work, maker.final, maker.plan
     maker.check_skipped()
     try:

@@ -1,4 +1,4 @@
-"""Frames of many episodes through the tokenizer, in equal pieces and in order."""
+"""Encodes the frames of many episodes with the tokenizer, in order and in batches of equal size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Encoder:
-    """Frames in, their tokens out in the same order. The device works while the next piece gathers."""
+    """Takes frames and gives their tokens in the same order. The device encodes while the next batch is collected."""
 
     def __init__(self, tokenizer: Tokenizer, batch: int):
         self._tokenizer, self._batch = tokenizer, batch
@@ -36,7 +36,7 @@ class Encoder:
             self._start()
 
     def flush(self) -> None:
-        """Encodes what has gathered; afterwards everything is ready."""
+        """Encodes the remaining frames; afterwards the tokens of all frames are ready."""
         if self._frames:
             self._start()
         self._collect()

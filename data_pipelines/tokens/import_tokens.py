@@ -1,8 +1,8 @@
-"""Token folders of the official release into a token store, as if they had been tokenised here.
+"""Imports token folders of the official release into a token store.
 
-Owns what the folders leave open: the true rate, which split a folder is, and how the store calls
-a tokenizer that is not at hand. Folders hold no raw frames; the tokenizer that made the tokens, if it
-is given, decodes the validation frames that evaluation compares with.
+Owns what the folders do not say: the true rate, which split a folder is, and an identity for a tokenizer that is not
+available. Folders hold no raw frames; the tokenizer that made the tokens, if it is given, decodes the validation
+frames that evaluation compares with.
 
 DIFFERS: the release multiplies latents by 0.18215 when it loads them; here they are stored so, in
 half precision as everywhere, which rounds them by at most one part in 2048.
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from hma_jax.tokenizers.base import Tokenizer
 
 LATENT_SCALE = SvdVaeConfig().scale
-"""Brings the latents of the Stable Video Diffusion autoencoder to about unit deviation."""
+"""Scales the latents of the Stable Video Diffusion autoencoder to about unit standard deviation."""
 
 PIXELS = {"magvit": 16, "temporalvae": 8}
-"""Pixels per cell of the two encoders, along one side."""
+"""Encoder type -> pixels per cell, along one side."""
 
 IMAGE_SIZE = 256
-"""Pixels of the release's images, where the encoder is unknown."""
+"""Side of the release's images in pixels, used for an unknown encoder."""
 
 
 def import_tokens(

@@ -128,7 +128,7 @@ class SkippedEpisodes:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything a reader must know of `<store>/<dataset>`."""
+    """Everything that reading `<store>/<dataset>` needs."""
 
     spec: DatasetSpec
     tokenizer: TokenizerFacts
@@ -143,7 +143,7 @@ class Manifest:
     action_max: tuple[float, ...] = ()
     action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
     skipped: tuple[SkippedEpisodes, ...] = ()  # what was left out
-    runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
+    runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): only numbers
     recipe: int = 1  # RECIPE_VERSION of the code that made it; 1 where the file does not say
     format: int = FORMAT_VERSION
 

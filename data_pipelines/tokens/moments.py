@@ -1,4 +1,4 @@
-"""Statistics of actions that come in pieces, and whose bits do not depend on who added them up."""
+"""Moments of actions, computed part by part; the bits of the result do not depend on the processes that did it."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def merge_all(pieces: Iterable[Moments], dim: int) -> Moments:
     return merged
 
 
-# --- Of single episodes, so that any choice of them has its own statistics ----------------------
+# --- Moments per episode, so that those of any subset of episodes can be computed ----------------
 
 
 def moments_row(actions: np.ndarray) -> np.ndarray:
@@ -80,12 +80,12 @@ def moments_row(actions: np.ndarray) -> np.ndarray:
 
 
 def moments_path(part: Path) -> Path:
-    """Where the rows of a part's episodes stand, in their order; `part` is its file of records."""
+    """The file with one row per episode of a part, in their order; `part` is the part's file of records."""
     return part.with_suffix(".moments.npy")
 
 
 def read_moments(part: Path, episodes: int) -> np.ndarray | None:
-    """float64 [episodes, 1 + 2 A], not loaded before it is used; None if none were written beside `part`."""
+    """float64 [episodes, 1 + 2 A], memory-mapped; None if there is no such file beside `part`."""
     path = moments_path(part)
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -104,9 +104,9 @@ def read_moments(part: Path, episodes: int) -> np.ndarray | None:
 
 
 def merge_exactly(rows: np.ndarray, dim: int) -> Moments:
-    """Of the actions behind `rows` [N, 1 + 2 A]. Sums are rounded once, so that no order matters.
+    """The moments of the episodes of `rows` [N, 1 + 2 A]. Sums are rounded once, so that their order does not matter.
 
-    Smallest and largest values are not kept: they are 0.
+    Smallest and largest values are not known: they are 0.
     """
     count, mean, square = rows[:, :1], rows[:, 1 : 1 + dim], rows[:, 1 + dim :]
     total = int(count.sum())

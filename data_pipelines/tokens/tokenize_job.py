@@ -1,11 +1,11 @@
-"""Episodes of any source in, one dataset of the token store out.
+"""Tokenises the episodes of any source into one dataset of the token store.
 
-Owns what is made of an episode: which are held out, which frames are kept, how frames of many
-episodes are put through the tokenizer in equal pieces. Reading ahead is in `read_ahead`; parts,
-restarts, several processes and publishing are in `dataset_writer`.
-DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written,
-and everything behind it is misaligned (reference section 5.1). Here an episode is stored whole,
-or recorded as skipped with its file and offset.
+Owns what is stored of an episode: which are held out, which frames are kept, how frames of many episodes are encoded
+in batches of equal size. Prefetching is in `read_ahead`; parts, restarts, several processes and publishing are in
+`dataset_writer`.
+DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written, and everything after
+it is misaligned (reference section 5.1). Here an episode is stored completely, or recorded as skipped with its file
+and offset.
 """
 
 from __future__ import annotations
@@ -71,14 +71,13 @@ def tokenize_dataset(
 ) -> Manifest | None:
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
-    `frame_step`: every how many native frames one is stored; default the stride at `rate` Hz (None: native),
-    1 stores all phases and serves every rate; it must divide that stride. `batch` images are encoded at a
-    time, `threads` (default: as many as cores, up to 8) decode. If the store already has this
-    dataset made from the same shards in the same way, nothing is done. Any number of processes
-    may do the same at a time, start and be killed: each makes parts that no other one makes.
-    `progress(done, total)` counts the episodes of all. `wait`: until parts of others are there;
-    without it, None is returned while they are not. The bytes of the dataset depend on `spec`,
-    source, tokenizer, `part_size` and the settings of JobSettings; on nothing else.
+    `frame_step`: native frames per stored frame; by default the stride at `rate` Hz (None: native), which it must
+    divide. 1 stores all frames and serves every rate. `batch` images are encoded at a time, `threads` (default: as
+    many as cores, up to 8) decode. If the store already has this dataset, made from the same shards in the same way,
+    nothing is done. Any number of processes may run the same call, start and be killed at any time: each makes parts
+    that no other one makes. `progress(done, total)` counts the episodes of all processes. With `wait` it waits for
+    the parts of other processes; without, it returns None while parts are missing. The bytes of the dataset depend
+    on `spec`, source, tokenizer, `part_size` and the settings of JobSettings only.
 
     Raises ConfigError for keys, settings or a store directory that cannot work, and for a
     dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
@@ -177,7 +176,7 @@ def _without_location(reason: str, source: EpisodeSource) -> str:
 
 @dataclass
 class _Pending:
-    """An episode whose frames are on their way through the tokenizer."""
+    """An episode whose frames are being encoded."""
 
     begin: Begin
     keep: bool
@@ -187,7 +186,7 @@ class _Pending:
 
 
 class _Work:
-    """How the parts of one dataset are made."""
+    """Makes the parts of one dataset."""
 
     def __init__(self, source: EpisodeSource, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int):
         s = plan.settings

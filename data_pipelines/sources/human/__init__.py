@@ -1,1 +1,1 @@
-"""Human video with annotated or detected hands: sources whose episodes are cut out of long recordings."""
+"""Human video with annotated or detected hands: sources whose episodes are segments of long recordings."""
