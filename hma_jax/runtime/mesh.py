@@ -15,15 +15,14 @@ from jax.experimental import mesh_utils
 from jax.sharding import AxisType, Mesh
 
 from hma_jax.config import ConfigError, MeshConfig, ModelConfig, require
-
-AXES = ("data", "fsdp", "tensor")
+from hma_jax.runtime.sharding import MESH_AXES
 
 
 def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -> Mesh:
     """The mesh of `config` over `devices` (default: those of all processes). Raises ConfigError if they do not fit."""
     devices = jax.devices() if devices is None else devices
     sizes = mesh_sizes(config, len(devices))
-    return Mesh(arrange(sizes, devices), AXES, axis_types=(AxisType.Auto,) * 3)
+    return Mesh(arrange(sizes, devices), MESH_AXES, axis_types=(AxisType.Auto,) * 3)
 
 
 def mesh_sizes(config: MeshConfig, devices: int) -> list[int]:
@@ -67,7 +66,7 @@ def split_over_slices(sizes: Sequence[int], slices: int) -> list[int]:
 
 def check_mesh(mesh: Mesh, model: ModelConfig, batch: int, accumulate: int = 1) -> None:
     """Raises ConfigError if a batch, or what `tensor` splits of the model, does not divide over the mesh."""
-    check_sizes([mesh.shape[axis] for axis in AXES], model, batch, accumulate)
+    check_sizes([mesh.shape[axis] for axis in MESH_AXES], model, batch, accumulate)
 
 
 def check_sizes(sizes: Sequence[int], model: ModelConfig, batch: int, accumulate: int = 1) -> None:

@@ -22,6 +22,9 @@ Axes = tuple[str | None, ...]
 Rules = tuple[tuple[str, tuple[str, ...]], ...]
 """(logical axis, mesh axes), in order: mesh axes split the first dimension so named that they divide, once."""
 
+MESH_AXES = ("data", "fsdp", "tensor")
+"""The axes of every mesh that this package makes (`mesh`)."""
+
 BATCH = ("data", "fsdp")
 """The mesh axes over which examples are split."""
 
@@ -107,9 +110,11 @@ def mesh_axes(part: str | tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def is_split() -> bool:
-    """Whether what is traced runs under a mesh of several devices; what `shard_map` runs on each does not."""
+    """Whether what is traced runs under a mesh of several devices; what `shard_map` runs on each does not. Under a
+    mesh of the caller's own, with other axes, no layout is set here: shardings are the caller's and the compiler's."""
     mesh = jax.sharding.get_abstract_mesh()
-    return math.prod(mesh.shape[axis] for axis in mesh.auto_axes) > 1
+    ours = set(MESH_AXES) <= set(mesh.axis_names)
+    return ours and math.prod(mesh.shape[axis] for axis in mesh.auto_axes) > 1
 
 
 def batch_ways() -> int:

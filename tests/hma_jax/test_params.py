@@ -2,11 +2,13 @@ import jax
 import numpy as np
 import pytest
 from flax import nnx
+from jax.sharding import AbstractMesh, AxisType
 
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import declare, normal, param, stack, zeros
+from hma_jax.runtime.sharding import MESH_AXES, find_layouts
 from tests.tiny import TABLE, model_config
 
 ONE_ROBOT = EmbodimentTable((Embodiment("table", 2, 1, (0.0, 0.0), (1.0, 1.0)),))
@@ -67,6 +69,15 @@ def test_every_robot_s_own_parameter_is_known_by_its_axis():
     parts = ("stem", "conditioning", "action_head")
     assert own == {name for name in leaves if any(part in name for part in parts)}
     assert all(leaves[n].shape[leaves[n].embodiment_axis] == TABLE.size for n in own)
+
+
+@pytest.mark.parametrize("axes", [("batch", "copies"), ("data", "model"), ("data", "fsdp", "tensor")], ids="-".join)
+def test_a_mesh_of_the_caller_s_own_is_left_to_the_caller(axes: tuple[str, ...]):
+    """Under one, whatever was computed ended in a KeyError: its axes are called otherwise."""
+    mesh = AbstractMesh((2, 2, 1)[: len(axes)], axes, axis_types=(AxisType.Auto,) * len(axes))
+    with jax.sharding.use_abstract_mesh(mesh):
+        found = find_layouts(("D", "D_out"), (4, 4), 1)
+    assert (found is not None) == (axes == MESH_AXES)
 
 
 def test_initial_arrays_follow_the_requested_sharding():
