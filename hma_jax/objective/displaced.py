@@ -34,7 +34,7 @@ def displace_patches(past: jax.Array, share: float, key_B: jax.Array) -> jax.Arr
         chosen, first, last, high, wide, top, left, down, right = jax.random.uniform(key, (9, PATCHES, 1), jnp.float32)
         begin = jnp.floor(first * frames)
         end = begin + 1 + jnp.floor(last * (frames - begin))
-        frame_T = jnp.arange(frames)
+        frame_T = jnp.arange(frames).astype(begin.dtype)
         within_PT = (chosen < share) & (frame_T >= begin) & (frame_T < end)
         within_PS = _within(y_S, side, high, top) & _within(x_S, side, wide, left)
         y_PS = (y_S + jnp.floor(down * side).astype(int)) % side
@@ -52,4 +52,5 @@ def _within(place_S: jax.Array, side: int, u_length: jax.Array, u_start: jax.Arr
     """bool [..., S]: inside a stretch of up to `LARGEST` of the side, wherever it fits."""
     length = 1 + jnp.floor(u_length * int(LARGEST * side))
     start = jnp.floor(u_start * (side - length + 1))
+    place_S = place_S.astype(start.dtype)
     return (place_S >= start) & (place_S < start + length)

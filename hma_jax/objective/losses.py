@@ -70,7 +70,8 @@ def weigh_tokens(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> j
 
 def count_targets(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> TargetCounts:
     tokens_counted = jnp.sum(weigh_tokens(masked, tokens, masking))
-    return TargetCounts(*(jnp.maximum(n, 1) for n in (tokens_counted, jnp.sum(masked.action_targets_T))))
+    actions_counted = jnp.sum(masked.action_targets_T).astype(tokens_counted.dtype)
+    return TargetCounts(*(jnp.maximum(n, 1) for n in (tokens_counted, actions_counted)))
 
 
 def smoothed_cross_entropy(logits: jax.Array, labels: jax.Array, smoothing: float) -> tuple[jax.Array, jax.Array]:
@@ -141,11 +142,11 @@ def masked_loss(
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
             logits = model.logits(out.predictions, tokens)
             per_token, right = smoothed_cross_entropy(logits, labels, masking.label_smoothing)
-            correct = jnp.sum(right * weight)
+            correct = jnp.sum(right.astype(weight.dtype) * weight)
         loss = jnp.sum(per_token * weight)
     if masking.predicts_actions:
         per_step = action_loss_per_step(model, out.actions, actions_BTU, embodiment_B, slice_B, key_B)
-        action_loss = jnp.sum(per_step * masked.action_targets_T)
+        action_loss = jnp.sum(per_step * masked.action_targets_T.astype(per_step.dtype))
     return LossSums(loss, correct, action_loss)
 
 
@@ -217,4 +218,5 @@ def action_loss_per_step(
         some_BTU = alive_BTU | ~alive_BTU.any(axis=-1, keepdims=True)  # a mean over nothing is no number
         return sum(diffusion_loss(network, target, time, noise, process, valid=some_BTU))
     error = jnp.square(model.action_head(pooled_BTD, slice_B) - target)
+    alive_BTU = alive_BTU.astype(error.dtype)
     return jnp.sum(error * alive_BTU, axis=-1) / jnp.maximum(jnp.sum(alive_BTU, axis=-1), 1)

@@ -148,8 +148,8 @@ def apply_update(
     moment. Weight decay is not divided by m: muP scales a hidden matrix's decay up as much as its rate down (reference
     section 4.4).
     """
-    count = {use: n + presence.shared[use] for use, n in state.count.items()}
-    count_E = {use: n + presence.robots[use] for use, n in state.count_E.items()}
+    count = {use: n + presence.shared[use].astype(n.dtype) for use, n in state.count.items()}
+    count_E = {use: n + presence.robots[use].astype(n.dtype) for use, n in state.count_E.items()}
     b1, b2 = config.beta1, config.beta2
 
     def update(p, g, m, v, spec: ParamSpec, multiplier: float):
@@ -194,7 +194,7 @@ def only_per_robot(grads: Params, specs: Params, trained_E: jax.Array) -> Params
     """Gradients of the `trained_E` robots' own parameters; zero for everything else."""
 
     def keep(g: jax.Array, spec: ParamSpec) -> jax.Array:
-        return jnp.zeros_like(g) if spec.embodiment_axis is None else g * spec.along_robots(trained_E)
+        return jnp.zeros_like(g) if spec.embodiment_axis is None else g * spec.along_robots(trained_E).astype(g.dtype)
 
     return jax.tree.map(keep, grads, specs)
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, ExecutionConfig, OptimizerConfig
+from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig, OptimizerConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.divergence import DivergedError
@@ -16,7 +16,7 @@ from hma_jax.training.runs import load_run
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
 from hma_jax.training.train import train_model
-from tests.tiny import SMALLER, TABLE, batches, model_config, train_config
+from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, model_config, random_batch, train_config
 
 MODEL = model_config(**SMALLER)
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
@@ -237,3 +237,21 @@ def test_a_seed_in_the_batch_is_that_of_the_configuration():
         norms[seed] = float(step(state, given)[1]["grad_norm"])
         assert norms[seed] == pytest.approx(float(step(state, batch)[1]["grad_norm"]), rel=1e-4)
     assert abs(norms[0] / norms[1] - 1) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("masking", "diffusion"),
+    [
+        (MaskingConfig(setting="full"), None),
+        (MaskingConfig(teacher_forcing=True, displaced_past=0.5), None),
+        (MaskingConfig(), DIFFUSION),
+    ],
+    ids=["actions", "displaced", "latents"],
+)
+def test_a_step_mixes_no_types_of_numbers_where_jax_forbids_it(masking, diffusion):
+    config, training = dataclasses.replace(MODEL, diffusion=diffusion), train_config(masking=masking)
+    declared = declare_model(config, TABLE)
+    step = make_train_step(declared, TABLE, config, training)
+    state = jax.eval_shape(lambda: init_state(declared, TABLE, 0))
+    with jax.numpy_dtype_promotion("strict"):
+        jax.eval_shape(step, state, random_batch(0, config))
