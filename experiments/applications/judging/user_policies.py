@@ -41,6 +41,9 @@ class CheckedPolicy:
             require(callable(function), f"{where} is of type {type(policy).__name__} and has no {shown} ({PAGE})")
             try:
                 signature = inspect.signature(function)
+            except ValueError:  # functions written in C may have no signature
+                continue
+            try:
                 signature.bind(*takes.values()) if method == "act" else signature.bind(**takes)
             except TypeError as error:
                 raise ConfigError(f"{where}: its {method}{signature} cannot be called as {shown}: {error}") from error

@@ -176,3 +176,9 @@ def test_a_policy_may_write_into_images_and_into_what_it_gave():
     kept = policy.act(images)
     given.actions[:] = 5
     assert (images == 9).all() and (kept == 1).all()
+
+
+def test_a_policy_of_c_does_not_say_what_it_takes_and_is_taken_all_the_same():
+    given = Gives(np.ones((2, 3), np.float32))
+    given.act = {}.update
+    assert CheckedPolicy(given, ROBOT, "net").policy is given
