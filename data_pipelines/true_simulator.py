@@ -14,7 +14,7 @@ import numpy as np
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
 from hma_jax.config.base import require_choice
-from hma_jax.simulator.interface import chosen_episodes, each_start, whole_numbers
+from hma_jax.simulator.interface import Actions, chosen_episodes, each_start, whole_numbers
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 
@@ -88,7 +88,11 @@ class TrueSimulator(ABC, Generic[W]):
         return self._images
 
     def reset(
-        self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
+        self,
+        starts: Start | Sequence[Start],
+        *,
+        seeds: int | Sequence[int] | np.ndarray = 0,
+        episodes: Sequence[int] | None = None,
     ) -> np.ndarray:
         """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no
         effect."""
@@ -113,7 +117,7 @@ class TrueSimulator(ABC, Generic[W]):
             self._draw(b, world)
         return self.images
 
-    def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray:
+    def step(self, actions: Actions) -> np.ndarray:
         require(len(actions) == len(self), f"{len(self)} episodes need as many actions, got {len(actions)}")
         asked, clipped = {}, [()] * len(self)
         for b, action in enumerate(actions):

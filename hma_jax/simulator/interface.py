@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
+import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
+Actions = Sequence[ArrayLike | None] | np.ndarray | jax.Array
+"""One entry per episode: numbers, or None for one that waits."""
+
 
 class AnySimulator(Protocol):
     """B episodes that begin at recorded starts and advance frame by frame; `Simulator` says what each means."""
 
-    robots: Mapping[str, Robot]
-    clipped: list[tuple[str, ...]]
+    @property
+    def robots(self) -> Mapping[str, Robot]: ...
+
+    @property
+    def clipped(self) -> Sequence[tuple[str, ...]]: ...
 
     def __len__(self) -> int: ...
 
@@ -27,15 +35,19 @@ class AnySimulator(Protocol):
         ...
 
     def reset(
-        self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
+        self,
+        starts: Start | Sequence[Start],
+        *,
+        seeds: int | Sequence[int] | np.ndarray = 0,
+        episodes: Sequence[int] | None = None,
     ) -> np.ndarray: ...
 
-    def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray: ...
+    def step(self, actions: Actions) -> np.ndarray: ...
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray: ...
 
 
-def whole_numbers(what: str, values: Sequence[int]) -> list[int]:
+def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
     """`values` as ints. Raises ConfigError for anything else: 0.5 is not truncated to 0."""
     try:
         return [operator.index(value) for value in values]
@@ -62,9 +74,9 @@ def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
     return each
 
 
-Judge = Callable[[AnySimulator], tuple[np.ndarray, np.ndarray]]
-"""Rewards and termination at the present frames: (float [B], bool [B]: the task is done and the episode over). A judge
-with a method `begin(simulator, episodes)` has it called after `episodes` were reset."""
+Judge = Callable[[Any], tuple[np.ndarray, np.ndarray]]
+"""Of an `AnySimulator`, rewards and termination at the present frames: (float [B], bool [B]: the task is done and the
+episode over). A judge with a method `begin(simulator, episodes)` has it called after `episodes` were reset."""
 
 
 def no_judge(simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:

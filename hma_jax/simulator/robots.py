@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hma_jax.config import ConfigError, require
 from hma_jax.model.embodiments import DEAD_STD, Embodiment
@@ -88,12 +89,22 @@ class Robot:
         high = tuple(b if on else m for b, on, m in zip(high, alive, entry.mean, strict=True))
         return cls(entry.name, entry.stride, low, high, rest_action(low, high, entry.mean), recorded=False)
 
-    def chunk(self, action: np.ndarray) -> np.ndarray:
+    def numbers(self, action: ArrayLike) -> np.ndarray:
+        """`action` as float32. Raises ConfigError unless it is an array of real numbers."""
+        try:
+            given = np.asarray(action)
+            if given.dtype.kind not in "cSU":  # a cast would drop imaginary parts, and parse text
+                return given.astype(np.float32)
+        except (TypeError, ValueError):  # objects, or lists of different lengths
+            pass
+        raise ConfigError(f"{self.name}: an action is an array of real numbers, got {action!r}")
+
+    def chunk(self, action: ArrayLike) -> np.ndarray:
         """float32 [stride, A] of one action [A], held for a whole frame, or of a chunk [stride, A].
 
-        Raises ConfigError for another shape or a value that is not finite.
+        Raises ConfigError for another shape, for other types than real numbers and for a value that is not finite.
         """
-        action = np.asarray(action, np.float32)
+        action = self.numbers(action)
         shapes = (self.action_dim,), (self.stride, self.action_dim)
         require(
             action.shape in shapes,

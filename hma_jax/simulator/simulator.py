@@ -20,7 +20,7 @@ from hma_jax.config.base import require_choice, require_seed
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, find_robots, find_starts, find_tokenizer
-from hma_jax.simulator.interface import chosen_episodes, each_start, whole_numbers
+from hma_jax.simulator.interface import Actions, chosen_episodes, each_start, whole_numbers
 from hma_jax.simulator.programs import Programs, ResetInputs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -106,7 +106,7 @@ class Simulator:
         run = Path(run)
         model = load_model(run, execution, weights)
         found = {"robots": find_robots(run, model.table), "starts": find_starts(run), "decode": find_decode(run)}
-        return cls(model, find_tokenizer(run, model.run, tokenizer and Path(tokenizer)), **(found | options))
+        return cls(model, find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None), **(found | options))
 
     # --- What there is -----------------------------------------------------------------------------
 
@@ -151,7 +151,11 @@ class Simulator:
     # --- Beginning ---------------------------------------------------------------------------------
 
     def reset(
-        self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
+        self,
+        starts: Start | Sequence[Start],
+        *,
+        seeds: int | Sequence[int] | np.ndarray = 0,
+        episodes: Sequence[int] | None = None,
     ) -> np.ndarray:
         """Begins `episodes` (default: all) at `starts`, one each or one for all; returns all frames.
 
@@ -159,8 +163,10 @@ class Simulator:
         """
         which = chosen_episodes(episodes, len(self))
         each = each_start(starts, len(which))
-        counted = isinstance(seeds, (int, np.integer))
-        numbers = [seeds + i for i in range(len(which))] if counted else whole_numbers("seeds", seeds)
+        if isinstance(seeds, (int, np.integer)):
+            numbers = [seeds + i for i in range(len(which))]
+        else:
+            numbers = whole_numbers("seeds", seeds)
         asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"
         require(len(each) == len(numbers) == len(which), asked)
         for number in numbers:
@@ -193,6 +199,7 @@ class Simulator:
         return ResetInputs.empty(padded(which, len(self)), self.capacity, self.model.table.action_width, shape, dtype)
 
     def _running_episode(self, b: int) -> Episode:
+        [b] = chosen_episodes([b], len(self))
         episode = self._episodes[b]
         if episode is None:
             raise ConfigError(f"episode {b} has not begun; reset it first")
@@ -206,7 +213,7 @@ class Simulator:
 
     # --- Advancing ---------------------------------------------------------------------------------
 
-    def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray:
+    def step(self, actions: Actions) -> np.ndarray:
         """The frames after `actions`, one entry per episode: an action [A], held for a frame, a chunk [stride, A], or
         None for an episode that waits. At the native rate every entry is one action [A].
 
@@ -219,15 +226,15 @@ class Simulator:
             if action is None:
                 continue
             robot = self._running_episode(b).robot
+            values = robot.numbers(action)
             native = self.rate == "native"
             require(
-                not native or np.ndim(action) == 1,
-                f"at the native rate an action must have shape [A], got {np.shape(action)}",
+                not native or values.ndim == 1, f"at the native rate an action must have shape [A], got {values.shape}"
             )
-            asked[b], beyond = robot.clip_to_range(robot.chunk(action), self.outside)
+            asked[b], beyond = robot.clip_to_range(robot.chunk(values), self.outside)
             if beyond.any():
                 clipped[b] = tuple(np.array(robot.dimensions)[beyond].tolist())
-                self._warn_once(robot, beyond, np.asarray(action, np.float32))
+                self._warn_once(robot, beyond, values)
         self.clipped = clipped
         chunks = {b: chunk for b, asked_b in asked.items() if (chunk := self._complete_chunk(b, asked_b)) is not None}
         return self._advance(chunks) if chunks else self.images
@@ -283,6 +290,7 @@ class Simulator:
     def compile(self, together: int) -> None:
         """Compiles the program that advances so many episodes at once, ahead of its first use. From any thread: no
         episode changes."""
+        [together] = whole_numbers("together", [together])
         require(
             1 <= together <= len(self), f"between 1 and {len(self)} episodes can be stepped together, got {together}"
         )
@@ -299,16 +307,21 @@ class Simulator:
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
         """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same
-        frames."""
+        frames. Raises ConfigError for a snapshot of another model, or of another number of episodes."""
+        require(
+            isinstance(snapshot, Snapshot), f"restore takes what `snapshot` returned, got {type(snapshot).__name__}"
+        )
         require(
             len(snapshot.episodes) == len(self),
             f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}",
         )
+        kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), state) for state in (snapshot.state, self._state)]
+        require(kinds[0] == kinds[1], "the snapshot is of a simulator of another model")
         self._state, self._images = self._copy_state(snapshot.state), snapshot.images
         self._episodes = list(copy.deepcopy(snapshot.episodes))
         return self.images
 
-    def branch(self, sources: Sequence[int]) -> np.ndarray:
+    def branch(self, sources: Sequence[int] | np.ndarray) -> np.ndarray:
         """Episode b becomes a copy of episode sources[b], seed included: later differences are due to actions alone."""
         copied = whole_numbers("sources", sources)
         fits = len(copied) == len(self) and all(0 <= s < len(self) for s in copied)

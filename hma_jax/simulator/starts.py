@@ -14,7 +14,7 @@ from hma_jax.runtime.arrays import reading_arrays, write_arrays
 FILE = "starts.npz"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Start:
     """The first n frames of an episode at the model's rate, and all native actions between them."""
 
@@ -34,6 +34,16 @@ class Start:
             self.actions.ndim == 2 and bool(np.isfinite(self.actions).all()),
             f"a start of {self.robot} needs finite actions [(n - 1) stride, A], got {self.actions.shape}",
         )
+
+    def __eq__(self, other: object) -> bool:
+        """Equal in all values; a dataclass would compare arrays, whose `==` is not a bool."""
+        if not isinstance(other, Start):
+            return NotImplemented
+        same = self.robot == other.robot and self.seed == other.seed
+        return same and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("images", "actions"))
+
+    def __hash__(self) -> int:
+        return hash((self.robot, self.seed, self.images.tobytes()))
 
 
 def save_starts(starts: Sequence[Start], path: Path) -> None:

@@ -140,6 +140,17 @@ def test_a_snapshot_is_gone_on_from_any_number_of_times(steps: int):
         np.testing.assert_array_equal(run(sim, plan[steps:]), first)
 
 
+def test_a_snapshot_of_another_model_changes_nothing():
+    """It was taken, and the next step failed."""
+    sim = simulator()
+    kept = sim.snapshot()
+    longer = kept._replace(state=jax.tree.map(lambda x: np.concatenate([x, x]), kept.state))
+    before = sim.reset(start(1, 1))
+    with pytest.raises(ConfigError, match="of a simulator of another model"):
+        sim.restore(longer)
+    assert sim.counts == (1,) and sim.images is not kept.images and np.array_equal(sim.images, before)
+
+
 def test_a_snapshot_from_a_file_is_gone_on_from_and_taken_back(tmp_path):
     """By a simulator whose same episodes have begun anew."""
     sim, other = simulator(episodes=2), simulator(episodes=2)
@@ -269,6 +280,11 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
         (lambda sim: sim.branch([1.0, 1.0]), "sources must be whole numbers"),
         (lambda sim: simulator(episodes=1.5), r"episodes must be whole numbers, got \[1.5\]"),
         (lambda sim: simulator(history=1.5), "history must be whole numbers"),
+        (lambda sim: sim.max_rewind(-1), r"numbers below 2, got \[-1\]"),
+        (lambda sim: sim.last_action(2), r"numbers below 2, got \[2\]"),
+        (lambda sim: sim.compile(1.5), r"together must be whole numbers, got \[1.5\]"),
+        (lambda sim: sim.restore(sim.images), "restore takes what `snapshot` returned, got ndarray"),
+        (lambda sim: sim.restore(sim.snapshot()._replace(state=sim.images)), "of a simulator of another model"),
         (lambda sim: sim.robot("walker"), "the model has no robot 'walker'; it has pusher, arm, base"),
     ],
 )
@@ -296,6 +312,9 @@ def test_an_action_of_another_shape_or_that_is_not_finite_is_refused():
     sim.reset(start(1, 1))
     for action in (np.zeros(3), np.zeros((3, 7)), np.full(7, np.nan)):
         with pytest.raises(ConfigError, match="arm: "):
+            sim.step([action])
+    for action in (["0.1"] * 7, np.zeros(7) + 1j, [[0.0], [0.0, 1.0]], "left", object()):
+        with pytest.raises(ConfigError, match="arm: an action is an array of real numbers, got "):
             sim.step([action])
 
 
@@ -369,6 +388,14 @@ def test_a_start_may_be_given_as_lists_and_says_what_it_lacks():
     assert made.actions.shape == (1, 2)
     with pytest.raises(ConfigError, match="needs finite actions .* got \\(0,\\)"):
         Start("arm", made.images, [])
+
+
+def test_starts_are_looked_for_by_their_values():
+    """The equality of arrays is no truth value."""
+    starts = [start(1, 2, seed) for seed in range(3)]
+    again = start(1, 2, 2)
+    assert starts.index(again) == 2 and {again: "third"}[starts[2]] == "third"
+    assert start(1, 3) not in starts and again != "third" and len({*starts, again}) == 3
 
 
 def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
