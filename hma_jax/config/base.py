@@ -22,8 +22,10 @@ def require(condition: bool, message: str) -> None:
 
 def require_shapes(what: str, found: Mapping[str, Any], wanted: Mapping[str, tuple[int, ...]]) -> None:
     """Raises ConfigError, which begins with `what`, unless the arrays in `found` have the shapes `wanted`; None has
-    none."""
-    shapes = {name: getattr(array, "shape", None) for name, array in found.items()}
+    none, and what is not an array is named by its type."""
+    shapes = {
+        name: None if array is None else getattr(array, "shape", type(array).__name__) for name, array in found.items()
+    }
     wrong = [f"{name} {shape}, got {shapes[name]}" for name, shape in wanted.items() if shapes[name] != shape]
     require(not wrong, f"{what} {'; '.join(wrong)}")
 

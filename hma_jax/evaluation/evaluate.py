@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import jax
@@ -24,8 +24,9 @@ from hma_jax.evaluation.protocol import Predicted, make_predictor
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable, join
 from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.given import require_known
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import Params
+from hma_jax.model.params import Params, require_params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.rows import lay_out
@@ -47,9 +48,11 @@ for."""
 class Evaluation:
     """Every window's numbers, their means with errors, and a few clips to look at."""
 
-    windows: WindowTable
+    windows: WindowTable = field(repr=False)
     summary: Summary
-    samples: dict[str, dict[str, np.ndarray]]  # {dataset: {kind: uint8 [n, T, H, W, 3]}}, see `images.make_clips`
+    samples: dict[str, dict[str, np.ndarray]] = field(
+        repr=False
+    )  # {dataset: {kind: uint8 [n, T, H, W, 3]}}, see `images.make_clips`
 
 
 def evaluate(
@@ -71,18 +74,23 @@ def evaluate(
     (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the
     model was trained for. `progress` is called with the number of windows done so far. With several processes
     (`runtime.processes`) all call this with the same batches, and each gets the whole result. A model that was trained
-    for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for a model
-    whose predictions are not finite, or as `make_predictor` and `lpips.load_lpips`.
+    for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for incomplete
+    batches, unknown ids or robots and parameters of another model, for a model whose predictions are not finite, or as
+    `make_predictor` and `lpips.load_lpips`.
     """
     mesh = make_mesh(execution.mesh)
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     declared = declare_model(model, table, execution)
+    require_params(declared, params, "these parameters are not those of the model")
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
     metric_params = lay_out(metric_params, NamedSharding(mesh, PartitionSpec()))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
         for batch in batches:
+            missing = [name for name in (*REQUIRED_ARRAYS, "dataset", "valid") if name not in batch]
+            require(not missing, f"a batch to evaluate lacks {', '.join(missing)}")
+            require_known(model, table, *(np.asarray(batch[name]) for name in ("tokens", "actions", "embodiment")))
             groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, devices_per_batch(mesh))
             _check_lengths(batch, config)
             arrays = (*REQUIRED_ARRAYS, *(name for name in OPTIONAL_ARRAYS if name in batch))
@@ -102,6 +110,7 @@ def evaluate(
         if progress is not None:
             progress(sum(map(len, tables)))
     windows = join(tables)
+    require(len(windows) > 0, "the evaluation has no windows: all rows of its batches are padding")
     return Evaluation(windows, summarise(windows, config.perplexity_group), make_clips(tokenizer, samples))
 
 

@@ -17,6 +17,7 @@ from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window, cut
 from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
+from hma_jax.model.given import Array, as_frames, require_keys, require_known
 from hma_jax.model.hma import HMA
 
 
@@ -40,13 +41,13 @@ class Sequences(NamedTuple):
 
 def rollout(
     model: HMA,
-    prompt: jax.Array,
-    actions_BRTU: jax.Array,
-    embodiment_B: jax.Array,
+    prompt: Array,
+    actions_BRTU: Array,
+    embodiment_B: Array,
     key_B: jax.Array,
     decode: DecodeConfig,
     *,
-    hidden_BT: jax.Array | None = None,
+    hidden_BT: Array | None = None,
 ) -> jax.Array:
     """Continues each prompt, [B, T', S] or [B, T', S, C], under R action sequences.
 
@@ -57,9 +58,12 @@ def rollout(
     computed once. All R sequences use the same random numbers (a function of the example's key
     and the frame), so that they differ by their actions alone. `hidden_BT` marks chunks
     that the model is not shown: those that it was trained without (`objective.masking.hidden_at_inference`).
-    Raises ConfigError for shapes that do not fit the model or each other.
+    Raises ConfigError for shapes and types that do not fit the model or each other, and, where arrays are not traced,
+    for unknown ids and robots and for actions that are not finite.
     """
     _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, hidden_BT)
+    require_known(model.config, model.table, prompt, actions_BRTU, embodiment_B)
+    prompt = as_frames(model.config, prompt)
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape
     size = min(frames, model.config.frames)
@@ -178,11 +182,11 @@ def fold_in(key_B: jax.Array, data: int | jax.Array) -> jax.Array:
 
 def _require_shapes(
     model: HMA,
-    prompt: jax.Array,
-    actions_BRTU: jax.Array,
-    embodiment_B: jax.Array,
+    prompt: Array,
+    actions_BRTU: Array,
+    embodiment_B: Array,
     key_B: jax.Array,
-    hidden_BT: jax.Array | None,
+    hidden_BT: Array | None,
 ) -> None:
     batch, *frames = jnp.shape(prompt)
     token = [*model.config.frame_shape]
@@ -194,13 +198,14 @@ def _require_shapes(
         f"{model.table.action_width}] (all chunks of a frame, padded with zeros), B robots and B keys; got "
         + ", ".join(str(jnp.shape(x)) for x in (prompt, actions_BRTU, embodiment_B, key_B)),
     )
+    require_keys(key_B, batch)
     if hidden_BT is not None:
         require_shapes("a rollout takes", {"hidden": hidden_BT}, {"hidden": (batch, sequences[1])})
 
 
 def _recent(
-    model: HMA, prompt: jax.Array, actions_BRTU: jax.Array, hidden_BT: jax.Array | None
-) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    model: HMA, prompt: Array, actions_BRTU: Array, hidden_BT: Array | None
+) -> tuple[Array, Array, Array | None]:
     """Prompt, chunks and marks without the prompt frames that no new frame sees. Raises ConfigError."""
     count, frames = prompt.shape[1], actions_BRTU.shape[2]
     require(

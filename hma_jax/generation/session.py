@@ -17,6 +17,7 @@ from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
+from hma_jax.model.given import Array, as_frames, require_keys, require_known
 from hma_jax.model.hma import HMA
 
 Phase = Literal["filling", "sliding"]
@@ -36,16 +37,16 @@ class Session(NamedTuple):
 
 def start(
     model: HMA,
-    prompt: jax.Array,
-    chunks_BTU: jax.Array,
-    embodiment_B: jax.Array,
+    prompt: Array,
+    chunks_BTU: Array,
+    embodiment_B: Array,
     *,
-    hidden_BT: jax.Array | None = None,
+    hidden_BT: Array | None = None,
 ) -> Session:
     """A session that has seen `prompt` [B, T', S (, C)], of which the last T - 1 frames count.
 
     `chunks_BTU` [B, T' - 1, U] are those executed between its frames. Raises ConfigError for shapes that do not fit the
-    model or each other.
+    model or each other, and for unknown ids and robots as `rollout`.
     """
     capacity, count = model.config.frames - 1, prompt.shape[1]
     require(capacity >= 1, "a model with model.frames 1 cannot generate frames: it needs at least 2")
@@ -62,6 +63,8 @@ def start(
             "robots": between[:1],
         },
     )
+    require_known(model.config, model.table, prompt, chunks_BTU, embodiment_B)
+    prompt = as_frames(model.config, prompt)
     old = max(count - capacity, 0)
     chunks, hidden = (_padded(x[:, old:], capacity + 1) for x in (chunks_BTU, hidden))
     past = Window.over(model, chunks, hidden, embodiment_B).start(prompt[:, old:-1], capacity)
@@ -71,12 +74,12 @@ def start(
 def advance(
     model: HMA,
     session: Session,
-    chunk_BU: jax.Array,
+    chunk_BU: Array,
     key_B: jax.Array,
     decode: DecodeConfig,
     *,
-    next_chunk_BU: jax.Array | None = None,
-    hidden_B: jax.Array | None = None,
+    next_chunk_BU: Array | None = None,
+    hidden_B: Array | None = None,
     phase: Phase | None = None,
 ) -> tuple[Session, jax.Array]:
     """(session, frame [B, S (, C)]) after `chunk_BU`, raw, was executed.
@@ -92,14 +95,10 @@ def advance(
     next_chunk_BU = chunk_BU if next_chunk_BU is None else next_chunk_BU
     require_shapes(
         "a session goes on by",
-        {"chunk": chunk_BU, "next chunk": next_chunk_BU, "hidden": hidden_B, "keys": key_B},
-        {
-            "chunk": (batch, width),
-            "next chunk": (batch, width),
-            "hidden": (batch,),
-            "keys": (batch, *jnp.shape(key_B)[1:]),
-        },
+        {"chunk": chunk_BU, "next chunk": next_chunk_BU, "hidden": hidden_B},
+        {"chunk": (batch, width), "next chunk": (batch, width), "hidden": (batch,)},
     )
+    require_keys(key_B, batch)
     last = jnp.minimum(t, capacity) - 1
     both = jnp.stack([chunk_BU, next_chunk_BU], axis=1)
     chunks = _written(session.chunks_BTU, both, last)

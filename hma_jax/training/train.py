@@ -40,7 +40,7 @@ def train_model(
     config: TrainConfig,
     make_batches: Callable[[int], Iterator[dict[str, np.ndarray]]],
     *,
-    run_dir: Path,
+    run_dir: str | Path,
     provenance: dict[str, Any],
     modernise_provenance: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     execution: ExecutionConfig = ExecutionConfig(),
@@ -125,6 +125,8 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
     if not model.diffusion:
         numbers["tokens"] = "ids", model.vocab_size
     for name, (what, count) in numbers.items():
+        kind = batch[name].dtype
+        require(np.issubdtype(kind, np.integer), f"a batch has {what} of type {kind}, not integers")
         low, high = int(np.min(batch[name])), int(np.max(batch[name]))
         require(
             0 <= low and high < count, f"a batch has {what} from {low} to {high}, but the model allows 0 to {count - 1}"

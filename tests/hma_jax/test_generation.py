@@ -387,6 +387,50 @@ def test_a_rollout_of_other_shapes_is_refused(prompt, actions, robots, message):
 
 
 @pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prompt": np.full((1, 2, 9), 64)}, "ids from 64 to 64 were given, but the model allows 0 to 63"),
+        ({"prompt": np.zeros((1, 2, 9))}, "this model's frames are int32, got float64"),
+        ({"robots": np.array([3])}, "robots from 3 to 3 were given, but the model allows 0 to 2"),
+        ({"robots": np.array([-1])}, "robots from -1 to -1 were given"),
+        ({"robots": np.zeros(1)}, "robots are integers, positions in the model's table; got float64"),
+        ({"actions": np.full((1, 1, 4, 14), np.nan)}, "the actions are not finite"),
+        ({"keys": jax.random.split(jax.random.PRNGKey(0), 1)}, r"1 keys are needed, .*got uint32 \(1, 2\); `jax"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_values_that_a_model_does_not_know_are_refused(changes, message):
+    """JAX computed frames from them, or raised an internal error."""
+    config = shallow_config()
+    declared, params = lively_params(config)
+    given = dict(
+        prompt=np.zeros((1, 2, 9), np.int32),
+        actions=np.zeros((1, 1, 4, 14), np.float32),
+        robots=np.zeros(1, np.int32),
+        keys=jax.random.split(jax.random.key(0), 1),
+    )
+    with pytest.raises(ConfigError, match=message):
+        jax.eval_shape(lambda p: rollout(declared.merge(p), *(given | changes).values(), DecodeConfig()), params)
+
+
+def test_ids_of_any_whole_type_are_continued():
+    config = shallow_config()
+    declared, params = lively_params(config)
+    made = jax.eval_shape(
+        lambda p: rollout(
+            declared.merge(p),
+            np.zeros((1, 2, 9), np.uint8),
+            np.zeros((1, 1, 4, 14), np.float32),
+            np.zeros(1, np.int32),
+            jax.random.split(jax.random.key(0), 1),
+            DecodeConfig(),
+        ),
+        params,
+    )
+    assert made.dtype == np.int32 and made.shape == (1, 1, 2, 9)
+
+
+@pytest.mark.parametrize(
     ("tokens", "between", "chunk", "message"),
     [
         (4, 1, None, r"a session of 2 prompt frames starts with frames \(2, 2, 9\), got \(2, 2, 4\)"),

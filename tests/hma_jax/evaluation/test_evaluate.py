@@ -52,6 +52,33 @@ def test_metrics_cover_the_valid_windows_of_each_dataset(params):
     assert result.summary.overall["ssim"].mean == pytest.approx((pusher + arm) / 2)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"images": None, "valid": None}, "a batch to evaluate lacks images, valid"),
+        ({"tokens": 64}, "ids from 64 to 64 were given, but the model allows 0 to 63"),
+        ({"embodiment": 3}, "robots from 3 to 3 were given, but the model allows 0 to 2"),
+        ({"actions": np.nan}, "the actions are not finite"),
+        ({"valid": False}, "no windows: all rows of its batches are padding"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else "-".join(value),
+)
+def test_batches_that_are_not_as_they_should_be_are_refused(params, changes, message, monkeypatch):
+    """Numbers came of unknown ids and robots, and of no window at all."""
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    changed = {name: np.full_like(batch[name], value) for name, value in changes.items() if value is not None}
+    given = {name: x for name, x in (batch | changed).items() if changes.get(name, 0) is not None}
+    found = {"finite": np.ones(4, bool)}
+    monkeypatch.setattr(module, "make_evaluator", lambda *_: lambda *_: (found, None))
+    with pytest.raises(ConfigError, match=message):
+        evaluate(params, CONFIG, TABLE, TOKENIZER, [given], EVAL)
+
+
+def test_parameters_of_another_model_are_not_evaluated(params):
+    with pytest.raises(ConfigError, match="these parameters are not those of the model: .* should be"):
+        evaluate({}, CONFIG, TABLE, TOKENIZER, [], EVAL)
+
+
 def test_images_are_compared_as_the_host_would(params):
     """The rollout of the library, decoded by the tokenizer's own `decode`, in float64."""
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
