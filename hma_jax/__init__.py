@@ -13,7 +13,21 @@ throughout, in signatures, parameter axes and tensor names:
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # type checkers and editors do not run `__getattr__`
+    from hma_jax.config import DecodeConfig as DecodeConfig
+    from hma_jax.config import ExecutionConfig as ExecutionConfig
+    from hma_jax.config import ModelConfig as ModelConfig
+    from hma_jax.config import TrainConfig as TrainConfig
+    from hma_jax.generation import advance as advance
+    from hma_jax.generation import rollout as rollout
+    from hma_jax.generation import start as start
+    from hma_jax.model.embodiments import EmbodimentTable as EmbodimentTable
+    from hma_jax.model.hma import declare_model as declare_model
+    from hma_jax.simulator import Simulator as Simulator
+    from hma_jax.training.runs import load_model as load_model
+    from hma_jax.training.train import train_model as train_model
 
 __version__ = "0.1.0"
 
@@ -41,3 +55,8 @@ def __getattr__(name: str) -> Any:
     if name not in PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it offers {', '.join(PUBLIC)}")
     return getattr(import_module(PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Includes names that have not been imported yet, for completion."""
+    return sorted({*globals(), *PUBLIC})

@@ -1,5 +1,6 @@
 """What is installed: one version, and types that checkers of users' code read."""
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -14,6 +15,14 @@ def test_the_version_is_the_same_wherever_it_stands():
     (cited,) = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     latest = re.search(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1]
     assert PYPROJECT["project"]["version"] == hma_jax.__version__ == cited == latest
+
+
+def test_checkers_and_editors_see_what_is_offered():
+    """They do not run the function by which a name is imported when it is first asked for."""
+    offered = {(f"hma_jax.{name}", home) for name, home in hma_jax.PUBLIC.items()}
+    (block,) = [node for node in ast.parse(Path(hma_jax.__file__).read_text()).body if isinstance(node, ast.If)]
+    seen = {(f"hma_jax.{name.asname}", node.module) for node in block.body for name in node.names}
+    assert seen == offered and set(hma_jax.PUBLIC) < set(dir(hma_jax))
 
 
 def test_every_package_says_that_it_is_typed():

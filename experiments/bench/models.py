@@ -11,7 +11,7 @@ import numpy as np
 from experiments.presets import CPU, CPU_CONTINUOUS
 from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, require
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model.hma import declare_model
+from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params
 
 BASE = ModelConfig(action_heads=False)
@@ -36,7 +36,7 @@ class Subject:
     config: ModelConfig
     execution: ExecutionConfig
     table: EmbodimentTable
-    declared: Declared
+    declared: Declared[HMA]
     params: Params
     seed: int
 

@@ -13,7 +13,7 @@ from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import TrainConfig
 from hma_jax.model.flops import pass_flops, train_flops_per_step
-from hma_jax.model.hma import declare_model
+from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.masking import mask_batch
 from hma_jax.training.state import init_state
@@ -28,7 +28,7 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
     settings = TrainConfig(batch=rows, seed=subject.seed)
     batch = subject.batch(rows)
 
-    def passes(declared: Declared) -> Callable[[Params, dict[str, jax.Array]], jax.Array]:
+    def passes(declared: Declared[HMA]) -> Callable[[Params, dict[str, jax.Array]], jax.Array]:
         def forward(params: Params, batch: dict[str, jax.Array]) -> jax.Array:
             model, key = declared.merge(params), jax.random.key(subject.seed)
             masked = mask_batch(key, batch["tokens"], batch["embodiment"], config, settings.masking, table)

@@ -171,6 +171,6 @@ class HMA(nnx.Module):
 @lru_cache(maxsize=16)
 def declare_model(
     config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
-) -> Declared:
+) -> Declared[HMA]:
     """The model's declarations, which do not depend on how it is executed; see `params.Declared`."""
     return declare(lambda: HMA(config, table, execution), execution.mesh.min_shard_size)

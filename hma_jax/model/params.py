@@ -12,8 +12,8 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any, Generic, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,8 @@ from jax.sharding import PartitionSpec
 from hma_jax.config import MeshConfig, require
 from hma_jax.kernels import remat
 from hma_jax.runtime.sharding import Layouts, find_layouts, for_compute, is_split, place
+
+M = TypeVar("M", bound=nnx.Module)
 
 Params = Any
 """A nested dict of arrays, the structure of `Declared.specs`."""
@@ -127,7 +129,7 @@ def xavier_uniform(fan_in: float, fan_out: float, gain: float = 1.0) -> Initiali
     return lambda rng, shape: uniform(rng, shape, bound)
 
 
-def stack(make: Callable[[], nnx.Module], count: int, axis: str = LAYER_AXIS) -> nnx.Module:
+def stack(make: Callable[[], M], count: int, axis: str = LAYER_AXIS) -> M:
     """`count` modules as one whose parameters have a leading axis, of layers unless named otherwise."""
     module = nnx.vmap(lambda _: make(), in_axes=0, out_axes=0)(jnp.arange(count))
     for variable in _params(module):
@@ -135,7 +137,7 @@ def stack(make: Callable[[], nnx.Module], count: int, axis: str = LAYER_AXIS) ->
     return module
 
 
-def used(use: Use, module: nnx.Module) -> nnx.Module:
+def used(use: Use, module: M) -> M:
     """`module`, its parameters declared to be of `use`."""
     for variable in _params(module):
         variable.set_metadata(use=use)
@@ -146,12 +148,12 @@ def _params(module: nnx.Module) -> list[nnx.Param]:
     return [node for _, node in nnx.iter_graph(module) if isinstance(node, nnx.Param)]
 
 
-@dataclass(frozen=True)
-class Declared:
+@dataclass(frozen=True, eq=False)  # compared by identity, so that it can be a static argument of `jax.jit`
+class Declared(Generic[M]):
     """A module's static structure and the specs of its parameters, without arrays."""
 
-    graphdef: nnx.GraphDef
-    specs: Params  # nested dict of ParamSpec
+    graphdef: nnx.GraphDef = field(repr=False)
+    specs: Params = field(repr=False)  # nested dict of ParamSpec
     min_shard_size: int = MeshConfig.min_shard_size
 
     def init(self, seed: int, shardings: Params | None = None) -> Params:
@@ -178,7 +180,7 @@ class Declared:
         given = () if shardings is None else (shardings,)
         return jax.tree.map(describe, self.specs, *given, is_leaf=is_spec)
 
-    def merge(self, params: Params) -> nnx.Module:
+    def merge(self, params: Params) -> M:
         """The module with `params` in it; call it inside the traced function.
 
         On a mesh, parameters without a layer or embodiment axis go to their compute layout here; those of layers do so
@@ -206,7 +208,7 @@ class Declared:
         return sum(spec.size for spec in self.leaves().values())
 
 
-def declare(make: Callable[[], nnx.Module], min_shard_size: int = MeshConfig.min_shard_size) -> Declared:
+def declare(make: Callable[[], M], min_shard_size: int = MeshConfig.min_shard_size) -> Declared[M]:
     """Traces `make` abstractly (no arrays are allocated) and reads its declarations."""
     graphdef, state, _ = nnx.split(nnx.eval_shape(make), nnx.Param, ...)
     # List indices become strings: checkpoints keep dictionaries with string keys only.

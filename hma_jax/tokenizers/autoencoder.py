@@ -17,7 +17,7 @@ from hma_jax.tokenizers.shared import BaseTokenizer
 
 
 @lru_cache(maxsize=16)
-def declare_tokenizer(config: TokenizerConfig) -> Declared:
+def declare_tokenizer(config: TokenizerConfig) -> Declared[Autoencoder]:
     """The network's parameters, without arrays."""
     return declare(lambda: Autoencoder(config))
 
@@ -28,7 +28,7 @@ class AutoencoderTokenizer(BaseTokenizer):
     config_class = TokenizerConfig
 
     @classmethod
-    def declare(cls, config: TokenizerConfig) -> Declared:
+    def declare(cls, config: TokenizerConfig) -> Declared[Autoencoder]:
         return declare_tokenizer(config)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:

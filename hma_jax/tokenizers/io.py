@@ -34,7 +34,7 @@ KINDS: dict[str, type[BaseTokenizer]] = {
 ADVICE = "train, import or copy the tokenizer again"
 
 
-def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:
+def save_tokenizer(tokenizer: BaseTokenizer, directory: str | Path) -> None:
     """Writes into `directory`, replacing a tokenizer that is there. Raises ConfigError if it cannot."""
     directory = Path(directory)
     description = {
@@ -56,7 +56,7 @@ def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:
 
 
 def load_tokenizer(
-    directory: Path,
+    directory: str | Path,
     expect: AnyTokenizerConfig | None = None,
     *,
     piece: int | None = None,

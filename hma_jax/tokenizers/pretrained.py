@@ -43,7 +43,7 @@ class Magvit2Tokenizer(BaseTokenizer):
     config_class = Magvit2Config
 
     @classmethod
-    def declare(cls, config: Magvit2Config) -> Declared:
+    def declare(cls, config: Magvit2Config) -> Declared[Magvit2]:
         return declare(lambda: Magvit2(config))
 
     @classmethod
@@ -66,7 +66,7 @@ class SvdVaeTokenizer(BaseTokenizer):
     config_class = SvdVaeConfig
 
     @classmethod
-    def declare(cls, config: SvdVaeConfig) -> Declared:
+    def declare(cls, config: SvdVaeConfig) -> Declared[SvdVae]:
         return declare(lambda: SvdVae(config))
 
     @classmethod

@@ -9,7 +9,7 @@ import abc
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import jax
@@ -70,6 +70,11 @@ class BaseTokenizer(abc.ABC):
         self._mesh = make_mesh(MeshConfig(), list(devices or jax.local_devices()))
         self._encode = self._jit_over_devices(self.encode_fn)
         self._decode = self._jit_over_devices(self.decode_uint8_fn)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickling; where it is unpickled, it uses the devices of that process."""
+        options = {name: getattr(self, name) for name in self.measured} | {"piece": self.piece}
+        return partial(type(self), **options), (self.config, self.params)
 
     @classmethod
     @abc.abstractmethod

@@ -36,7 +36,7 @@ def train_tokenizer(
     config: TokenizerConfig,
     train: TokenizerTrainConfig,
     make_batches: Callable[[int], Iterator[np.ndarray]],
-    run_dir: Path,
+    run_dir: str | Path,
     *,
     provenance: dict[str, Any] | None = None,
     options: LoopOptions = LoopOptions(),

@@ -95,7 +95,7 @@ class RunInfo:
 
 @dataclass(frozen=True)
 class FitResult:
-    state: Any
+    state: Any = field(repr=False)
     losses: list[float]  # one per step, from the first step of the run (processes but 0: of this start)
     seconds: float  # spent in steps by this process, without compiling and validating
     compile_seconds: float
@@ -109,7 +109,7 @@ def fit(
     make_batches: Callable[[int], Iterator[Any]],
     *,
     steps: int,
-    run_dir: Path,
+    run_dir: str | Path,
     info: RunInfo,
     put_batch: Callable[[Any], Any] = jax.device_put,
     options: LoopOptions = LoopOptions(),

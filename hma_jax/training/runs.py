@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,32 +14,35 @@ from hma_jax.config.execution import FORMER_FIELDS
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.config.training import PREDICT_FRAMES
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.hma import declare_model
+from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params
 from hma_jax.runtime.devices import default_device
 from hma_jax.training.reading import CheckpointError, has_item, list_steps, load_items, read_description
 from hma_jax.training.run_lock import CHECKPOINTS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # `==` of arrays is not a bool
 class Run:
     """A trained model, read from its run directory."""
 
     model: ModelConfig
     train: TrainConfig
     table: EmbodimentTable
-    params: Params
+    params: Params = field(repr=False)
     step: int
     provenance: dict[str, Any]
     weights: Weights = "last"  # which of the run's weights `params` are: last or ema
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
-    """A trained model, ready for inference: `declared.merge(params)` is what computes, inside a traced function."""
+    """A trained model, ready for inference: `declared.merge(params)` is what computes, inside a traced function.
+
+    It can be pickled; where it is unpickled, its parameters lie on the default device.
+    """
 
     run: Run  # with parameters as `model.params.inference_params` makes them
-    declared: Declared
+    declared: Declared[HMA]
     execution: ExecutionConfig
 
     @property
@@ -58,6 +61,13 @@ class Model:
     @property
     def step(self) -> int:
         return self.run.step
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (self.run, self.execution)
+
+
+def _rebuild(run: Run, execution: ExecutionConfig) -> Model:
+    return Model(run, declare_model(run.model, run.table, execution), execution)
 
 
 def describe_run(

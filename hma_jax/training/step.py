@@ -14,6 +14,7 @@ from hma_jax.config import MaskingConfig, ModelConfig, TrainConfig, check_micro_
 from hma_jax.config.training import ActionLeak
 from hma_jax.kernels.random import GENERATOR, key_of
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import HMA
 from hma_jax.model.params import Declared, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import Masked, mask_batch
@@ -39,7 +40,7 @@ program."""
 
 
 def make_train_step(
-    declared: Declared, table: EmbodimentTable, model: ModelConfig, config: TrainConfig, accumulate: int = 1
+    declared: Declared[HMA], table: EmbodimentTable, model: ModelConfig, config: TrainConfig, accumulate: int = 1
 ) -> Callable[[TrainState, Batch], tuple[TrainState, dict[str, jax.Array]]]:
     """step(state, batch) -> (state, metrics), to be jitted with the state donated.
 

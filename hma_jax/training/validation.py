@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, check_micro_batches, require
 from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.hma import declare_model
+from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
@@ -84,7 +84,7 @@ def _jitted_sums(
 
 
 def make_sums(
-    declared: Declared, table: EmbodimentTable, model: ModelConfig, masking: MaskingConfig, accumulate: int = 1
+    declared: Declared[HMA], table: EmbodimentTable, model: ModelConfig, masking: MaskingConfig, accumulate: int = 1
 ) -> Callable[[Params, Mapping[str, jax.Array], jax.Array], tuple[LossSums, TargetCounts]]:
     """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -190,6 +191,15 @@ def test_the_package_offers_what_loads_a_model(averaged):
         hma_jax.load_modle  # noqa: B018
 
 
+def test_a_model_goes_to_another_process_and_is_shown_in_a_few_lines(averaged):
+    """Its initialisers cannot be pickled, and its repr had all weights in it."""
+    model = load_model(averaged[0], ExecutionConfig("bfloat16"))
+    other = pickle.loads(pickle.dumps(model))
+    assert equal(other.params, model.params) and other.execution == model.execution
+    assert other.run.provenance == model.run.provenance and other.declared is model.declared
+    assert len(repr(model)) < 4000 and len({model, other}) == 2
+
+
 # --- How a run is computed -------------------------------------------------------------------
 
 
@@ -219,8 +229,10 @@ ROWS = next(batches(MODEL, 4)(0))
             "a batch has ids from 16 to 31, but the model allows 0 to 15",
         ),
         (ROWS | {"embodiment": ROWS["embodiment"] - 1}, "a batch has robots from -1 to 1, but the model allows 0 to 2"),
+        (ROWS | {"embodiment": ROWS["embodiment"].tolist()}, r"has embodiment \(4,\), got list"),
+        (ROWS | {"tokens": ROWS["tokens"] / 2}, "a batch has ids of type float64, not integers"),
     ],
-    ids=["fewer rows", "no actions", "ids", "robots"],
+    ids=["fewer rows", "no actions", "ids", "robots", "list", "halves"],
 )
 def test_batches_of_another_model_are_refused(batch, message, tmp_path: Path):
     """Such ids and fewer rows were trained on without a word; other robots were told as a divergence."""

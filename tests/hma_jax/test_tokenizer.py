@@ -1,6 +1,7 @@
 """The tokenizers: what tokens mean, what they depend on, and that training teaches them something."""
 
 import itertools
+import pickle
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -206,6 +207,12 @@ def test_decoding_inside_a_jit_gives_the_same_frames(tokenizer):
     frames = np.asarray(jax.jit(tokenizer.decode_fn)(tokenizer.params, tokens))
     assert frames.dtype == np.float32 and frames.min() >= 0 and frames.max() <= 255
     np.testing.assert_allclose(frames, tokenizer.decode(tokens), atol=0.51)
+
+
+def test_a_tokenizer_goes_to_another_process(tokenizer):
+    """Pickled, as it goes there; the devices that it has here cannot be."""
+    other = pickle.loads(pickle.dumps(tokenizer))
+    assert type(other) is type(tokenizer) and (other.identity, other.piece) == (tokenizer.identity, tokenizer.piece)
 
 
 def test_what_cannot_be_encoded_is_refused(tokenizer):
