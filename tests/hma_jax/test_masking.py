@@ -281,6 +281,9 @@ def test_presence_is_by_use_and_robot():
     assert presence.robots["actions_shown"].tolist() == [True, False, True]
     assert presence.robots["actions_predicted"].tolist() == [True, False, True]
     assert presence.robots["frames_predicted"].tolist() == [True, True, False]
+    no_target = masked._replace(targets_TS=jnp.zeros_like(masked.targets_TS))  # masked in padding alone, say
+    presence = find_presence(no_target, jnp.asarray(data["embodiment"]), jnp.ones(3, bool), config)
+    assert not presence.shared["frames_predicted"]
     shown = masked._replace(hidden_T=jnp.zeros_like(masked.hidden_T))
     for alignment in ("released", "causal"):  # the first frame is never shown an action where it is causal
         aligned = shallow_config(action_alignment=alignment)
