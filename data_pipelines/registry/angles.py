@@ -1,8 +1,7 @@
-"""Angles in an action that wrap: they jump by a whole turn where the motion goes on.
+"""Wrapping angles in actions: they jump by a whole turn while the motion is continuous.
 
-Half of the values of such an angle lie at one end of its range and half at the other, so neither a
-mean nor a difference of them means anything. Told which values are angles, a reader gives them
-without the jumps, or as their sine and cosine, which have none.
+Such values lie near both ends of their range, so their means and differences are meaningless. An entry names the
+values that are angles, and they are then given unwrapped, or as sine and cosine, which do not jump.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The record type of the dataset registry: everything a reader must be told about one dataset."""
+"""The record type of the dataset registry: everything that reading a dataset needs and its files do not say."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ NOT_OF_ACTIONS = (
     "name", "image_key", "hz", "rate", "camera", "split", "note", "video_targets", "version", "unverified",
     "episodes", "median_steps", "mean_steps", "val_split",
 )  # fmt: skip
-"""Fields of an entry that say nothing of what an action's values are."""
+"""Fields of an entry that do not affect the meaning of action values."""
 
 
 def stride_of(hz: float, rate: float | None = FRAME_RATE) -> int:
     """Native frames per model frame, at least 1: of the two integers around hz / rate the one nearer in ratio.
 
-    Frames are then as near to `rate` Hz as they can be: 5 Hz for 2 has stride 3 (1.67 Hz, off by a factor of
-    1.2), not 2 (2.5 Hz, 1.25). The two are equally near at sqrt(n (n + 1)), which no fraction equals, so there is
-    no tie to decide. `rate` None is the native one, stride 1.
+    Frames are then as near to `rate` Hz as possible: for 5 Hz and a rate of 2 the stride is 3 (1.67 Hz, off by a
+    factor of 1.2), not 2 (2.5 Hz, 1.25). Both would be equally near at sqrt(n (n + 1)), which is irrational, so there
+    are no ties. `rate` None is the native rate, stride 1.
     DIFFERS: the release floors the ratio and knows a rate for 28 of its 40 datasets only;
     the others run at their native rate (reference sections 5.3 and 5.4).
     """
@@ -131,7 +131,7 @@ class DatasetSpec:
         return stride_of(self.hz, rate if self.rate is None else self.rate)
 
     def rate_for(self, stride: int) -> float:
-        """The rate, in Hz, that gives this stride; six digits, which do."""
+        """The rate, in Hz, that gives this stride, to six digits, which are enough."""
         return float(f"{self.hz / stride:.6g}")
 
     def check_compatible(self, robot: Embodiment, rate: float | None = FRAME_RATE) -> None:
@@ -168,9 +168,9 @@ class DatasetSpec:
         return ", ".join(f"{key} ({dim})" for key, dim in dims) or "no actions"
 
     def action_layout(self) -> str:
-        """A hash of what the values of an action mean and where they stand; of equal layouts it is equal.
+        """A hash of the meaning and order of the action values; equal for equal layouts.
 
-        Covers every fact of the entry but what `NOT_OF_ACTIONS` names, as far as it is not the default.
+        Covers all fields of the entry that have another value than the default, except those of `NOT_OF_ACTIONS`.
         """
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in NOT_OF_ACTIONS}
         defaults = {f.name: f.default for f in dataclasses.fields(self)}
@@ -186,7 +186,7 @@ class DatasetSpec:
         return convert_angles(actions, self.angles, self.angle_form, self.angle_unit)
 
     def facts(self) -> DatasetSpec:
-        """This entry without its words for people, which do not change the data."""
+        """This entry without the fields that only describe it and do not affect the data."""
         return dataclasses.replace(
             self, camera="", note="", version="", unverified="", episodes=0, median_steps=0.0, mean_steps=0.0
         )

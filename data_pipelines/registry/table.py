@@ -1,4 +1,4 @@
-"""Finding an entry: the registry's own tables, and what the user registered besides."""
+"""Looking up an entry in the registry's own tables and among those that the user registered."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def register(specs: Iterable[DatasetSpec]) -> None:
 
 
 def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
-    """Every entry that is used, by where it comes from."""
+    """All entries in effect, by origin."""
     groups = {
         "own and samples": OWN,
         "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,

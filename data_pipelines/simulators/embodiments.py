@@ -1,7 +1,7 @@
 """The table of simulated robots, one row per dataset, and its look-up.
 
-A row is all there is to a dataset: the registry entry, the record's features and what is simulated
-follow from it. In the order of action sizes. Imports no simulator.
+A row defines a dataset completely: the registry entry, the record's features and the simulation follow from it. The
+rows are in the order of action sizes. Imports no simulator.
 """
 
 from __future__ import annotations

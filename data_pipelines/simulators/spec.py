@@ -1,6 +1,6 @@
 """The record type of the simulator table: everything that defines one simulated dataset.
 
-Facts only; `embodiments` holds the table, `backends` know the packages. Imports no simulator.
+Declarations only; `embodiments` holds the table, `backends` know the packages. Imports no simulator.
 """
 
 from __future__ import annotations

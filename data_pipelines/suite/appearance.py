@@ -1,6 +1,6 @@
-"""How the episodes of a robot differ in looks: light and object colours.
+"""Visual variation between the episodes of a robot: light and object colours.
 
-Drawn anew for every episode from its seed, so that held-out episodes look new.
+Drawn for every episode from its seed, so that held-out episodes look different from training ones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Appearance:
 
 
 def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
-    """The looks of the episodes with these seeds, each a function of its own seed alone."""
+    """The appearance of the episodes with these seeds, each a function of its own seed alone."""
     n, palette, count = len(seeds), spec.palette, spec.task.objects
     draws, lights, orders = zip(*(_begin(spec, seed) for seed in seeds), strict=True)
     light = np.array(lights)[:, None, None]

@@ -1,6 +1,6 @@
 """The record types of the tables: everything that defines one simulated robot and its dataset.
 
-Facts only; `families` holds the tables, `world` simulates, `render` draws.
+Declarations only; `families` holds the tables, `world` simulates, `render` renders.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What all MuJoCo packages share: the physics as numbers, the picture, the loop of repeats.
+"""What all MuJoCo backends share: the physics state as a vector, rendering, and the action repeat.
 
 A package's backend gives `reset` and `advance`, and sets `model` and `data`.
 """

@@ -1,7 +1,7 @@
-"""Pictures of a MuJoCo model, fast on a CPU.
+"""Fast rendering of a MuJoCo model on a CPU.
 
-Shadows, reflections and multisampling cost ten times the rest on a software renderer: they are
-off, and edges are smoothed by drawing at twice the size. The packages' own cameras are not used:
+Shadows, reflections and multisampling take ten times as long as the rest on a software renderer: they are off, and
+edges are antialiased by rendering at twice the size. The packages' own renderers are not used:
 robosuite's returns uninitialised memory now and then, gym-aloha's draws 640 x 480 in every step.
 """
 

@@ -1,4 +1,4 @@
-"""Episodes of human video: two hands in the image, and where they are next.
+"""Episodes of human video: the positions of both hands in the image are the state, their next positions the action.
 
 A position row is [left x, left y, right x, right y] as fractions of the image's width and height,
 from its top left corner; NaN where a hand is not seen. An episode is a run of frames, evenly

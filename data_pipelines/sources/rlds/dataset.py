@@ -1,9 +1,8 @@
-"""An RLDS dataset directory as random-access episodes, without TensorFlow.
+"""An RLDS dataset directory as an `EpisodeSource`, without TensorFlow.
 
-Owns reading what tfds wrote: schema, shards, records, one camera and the action of an
-episode. Knows neither tokenizers nor windows nor which dataset has which camera (see
-`registry`). Metadata goes through `schema`, records through `tfrecord` and `example`; both
-lie on a disk or in a remote store (see `location`).
+Owns reading what tfds wrote: schema, shards, records, one camera and the action of an episode. Knows neither
+tokenizers nor windows nor which camera a dataset is used with (see `registry`). Metadata is read by `schema`, records
+by `tfrecord` and `example`, from a disk or a remote store (see `location`).
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class RldsDataset(EpisodeSource):
     `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, then the
     newest version is taken. Shards are indexed once, for all later starts (see `index`).
 
-    Many datasets may share `files`, so that their number does not multiply the files kept open.
+    Several datasets may share `files`, so that the number of open files does not grow with theirs.
 
     Raises DataError for a directory that is no dataset, missing or damaged shards and a
     record count that contradicts dataset_info.json; ConfigError for an unknown split.
@@ -176,7 +175,7 @@ class RldsDataset(EpisodeSource):
             yield parse_record(payload, path, offset, keys, lazy)
 
     def _check_shards(self, expected: Sequence[int]) -> None:
-        """Raises what is wrong with the shards, or counts the episodes that it costs."""
+        """Raises DataError for missing, damaged or contradictory shards, or counts their episodes as skipped."""
         for path, shard, count in zip(self._paths, self._index.shards, expected, strict=True):
             problem = None
             if shard.missing:

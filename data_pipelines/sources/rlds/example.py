@@ -1,9 +1,8 @@
 """tf.train.Example without TensorFlow: bytes to arrays and back.
 
-Owns the wire format of that one message, nothing of RLDS. Only the wanted features are
-decoded and long lists go through numpy, which is faster than a general protobuf message
-when an episode's record holds cameras and embeddings that nobody asked for; of a record that
-is a view into a file, the others are not even read.
+Owns the wire format of that one message, nothing of RLDS. Only the wanted features are decoded, and long lists with
+numpy, which is faster than a general protobuf parser if a record holds cameras and embeddings that are not needed;
+if the record is a view of a file, these are not even read.
 
 Message (protobuf field numbers): Example{1: Features}, Features{1: map entries {1: key,
 2: Feature}}, Feature{1: BytesList | 2: FloatList | 3: Int64List}, each list {1: values}.
@@ -30,14 +29,14 @@ MAX_FEATURES = 10_000
 """Features of a record: one of a few bytes in the file takes hundreds in memory."""
 
 BATCH = 2**16
-"""Bytes of varints that are decoded at once, for which fifty times as much is needed."""
+"""Bytes of varints that are decoded at a time, which takes fifty times as much memory."""
 
 _BYTES, _FLOAT, _INT = 1, 2, 3  # field numbers inside Feature
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5  # wire types
 
 
 class LazyBytes(Sequence[bytes]):
-    """The n values of a bytes feature, each cut from the record when it is asked for."""
+    """The n values of a bytes feature, each read from the record on access."""
 
     def __init__(self, data: bytes | FileView, spans: np.ndarray):
         self._data, self.spans = data, spans  # int64 [n, 2]
@@ -74,7 +73,7 @@ def parse_example(
     A float feature is float32 [n], an integer feature int64 [n], a bytes feature a list of
     n `bytes`. A feature without a value is an empty list. With `keys`, other features are
     skipped unread; a wanted key that the record lacks is absent from the result. With `lazy`,
-    bytes features are `LazyBytes`, which need `data` as long as they live.
+    bytes features are `LazyBytes`, which read from `data` on access.
 
     Raises DataError if `data` is not such a message.
     """

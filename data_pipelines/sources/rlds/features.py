@@ -1,8 +1,8 @@
-"""features.json, the schema that tfds writes beside its shards, as the fields of a record.
+"""Parses features.json, the schema that tfds writes beside its shards, into the fields of a record.
 
-Owns the forms of that file: the JSON of tfds's `Feature` message, and the `type` and `content` of tfds 4.0
-to 4.4. What a field is follows from its content; the Python classes that the file names are neither
-imported nor asked for, so that a schema of unknown origin is data only.
+Owns the formats of that file: the JSON of tfds's `Feature` message, and the `type` and `content` of tfds 4.0 to 4.4.
+The kind of a field follows from its content. The Python classes that the file names are not imported, so that a
+schema of unknown origin cannot run code.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_NUMBERS = 2**28
 NUMBERS = ("bool", "float16", "float32", "float64") + tuple(
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 )
-"""Types whose values a record holds as numbers; of others it holds bytes."""
+"""Types whose values a record stores as numbers; values of other types are stored as bytes."""
 
 _FORMS = {
     "featuresDict": ("FeaturesDict",),
@@ -38,15 +38,15 @@ _FORMS = {
     "text": ("TextFeature", "Text"),
     "translation": ("TranslationFeature", "Translation", "TranslationVariableLanguages"),
 }
-"""A field's content in the message, and the last part of the names of classes and messages that have it."""
+"""Form of a field: its key in the message, and the last parts of the names of classes that have this form."""
 
 _FORM_OF = {name: form for form, names in _FORMS.items() for name in names}
 
 
 @dataclass(frozen=True)
 class FlatFeature:
-    """A field of the schema: an image, or `size` numbers per step (0: text and the like). `encoding`: numbers that a
-    record holds as bytes, which are not read, in the form that tfds calls so."""
+    """A field of the schema: an image, or `size` numbers per step (0: text and the like). `encoding`: tfds's name of the
+    encoding of numbers that a record stores as bytes, which are not read."""
 
     image: bool
     size: int
@@ -69,7 +69,7 @@ def parse_features(schema: Any) -> dict[str, FlatFeature]:
 
 
 def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[tuple[str, FlatFeature]]:
-    """Of `node`; `listed`: it lies in a list, as of the steps of an episode."""
+    """The fields below `node`; `listed`: it is inside a list, such as that of an episode's steps."""
     if depth > MAX_DEPTH:
         raise ValueError(f"{_field(key)}: fields are nested more than {MAX_DEPTH} levels deep")
     form, content = _content(node, key)
@@ -95,13 +95,13 @@ def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[t
         yield key, FlatFeature(False, 4, (4,), "float32")
     elif form in ("tensor", "audio"):
         yield key, _numbers(_shape(content, key), _dtype(content), _encoding(content), key)
-    else:  # text, and what a class of somebody else's holds
+    else:  # text, and fields of unknown classes
         yield key, FlatFeature(image=False, size=0)
 
 
 def _in_lists(feature: FlatFeature) -> FlatFeature:
-    """What each step has a list of, however long. A record holds that under other keys than the field's own (tfds calls
-    it ragged), and not so many of it per step."""
+    """A field of which each step has a list of variable length. A record stores it under other keys than the field's
+    own (tfds calls it ragged), so that it cannot be read per step."""
     return FlatFeature(False, 0, (None, *feature.shape), feature.dtype)
 
 
@@ -110,7 +110,7 @@ def _field(key: str) -> str:
 
 
 def _content(node: Any, key: str) -> tuple[str, Mapping[str, Any]]:
-    """The form of a field and what describes it; form "" for one that is not known."""
+    """The form of a field and its description; form "" for an unknown one."""
     node = _mapping(node, key)
     if "type" in node:
         return _old_content(node.get("proto_cls") or node["type"], node.get("content"), key)
@@ -135,7 +135,7 @@ def _old_content(name: Any, content: Any, key: str) -> tuple[str, Mapping[str, A
 
 
 def _either(node: Mapping[str, Any], name: str) -> Any:
-    """A field of a message by either of the two names that JSON may give it."""
+    """A field of a message by either of its two JSON names, camelCase or snake_case."""
     snake = "".join(f"_{c.lower()}" if c.isupper() else c for c in name)
     return node.get(name, node.get(snake))
 
@@ -153,7 +153,7 @@ def _list(value: Any, key: str) -> list[Any]:
 
 
 def _shape(content: Mapping[str, Any], key: str) -> tuple[int | None, ...]:
-    """Sizes, None for one that differs between records."""
+    """Sizes; None for one that varies between records."""
     shape = content.get("shape") or []
     if isinstance(shape, dict):
         shape = shape.get("dimensions") or []
@@ -175,7 +175,7 @@ def _dtype(content: Mapping[str, Any]) -> str:
 
 
 def _encoding(content: Mapping[str, Any]) -> str:
-    """Of a tensor; "" for numbers that stand in the record as they are."""
+    """The encoding of a tensor; "" for numbers that are stored as numbers."""
     encoding = content.get("encoding")
     return encoding[:32] if isinstance(encoding, str) and encoding.isprintable() and encoding.lower() != "none" else ""
 

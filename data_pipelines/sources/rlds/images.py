@@ -1,7 +1,4 @@
-"""Encoded camera images to square uint8 frames.
-
-Owns decoding of one image and its geometry. Pixels leave here as uint8 [H, W, 3], RGB.
-"""
+"""Decoding of camera images, and resizing to square frames: uint8 [H, W, 3], RGB."""
 
 from __future__ import annotations
 
@@ -21,9 +18,9 @@ MAX_PIXELS = 2**25
 def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     """uint8 [H, W, 3] from JPEG or PNG bytes (grey images become RGB, alpha is dropped).
 
-    The fast DCT is what TensorFlow's decoder uses by default, so pixels equal those that
-    RLDS pipelines built on TensorFlow see. With `at_least`, a JPEG image may come smaller, as its
-    coefficients allow, but no side shorter than that: what is resized anyway costs half as much.
+    The fast DCT is the default of TensorFlow's decoder, so pixels equal those of RLDS pipelines built on
+    TensorFlow. With `at_least`, a JPEG image may be decoded at a reduced size, as its coefficients allow, with no
+    side shorter than that: decoding an image that is resized anyway then takes half the time.
     Raises ValueError if the bytes are no image, one of more than MAX_PIXELS, or one of depths.
     """
     if data.startswith(JPEG_MAGIC):

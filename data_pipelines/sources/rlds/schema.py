@@ -1,7 +1,7 @@
-"""The metadata of an RLDS directory: where its version lies, what a step holds, which shards.
+"""The metadata of an RLDS directory: its version directory, the fields of a step, its splits and shards.
 
-Owns reading features.json and dataset_info.json as tfds wrote them. Reads no record, and neither imports
-tfds nor what the files name; they may come from anywhere and lie on a disk or in a remote store.
+Owns reading features.json and dataset_info.json as tfds wrote them. Reads no record, and imports neither tfds nor the
+classes that the files name; the files may be of unknown origin, on a disk or in a remote store.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 INFO, FEATURES = "dataset_info.json", "features.json"
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-"""How tfds calls shards where dataset_info.json does not say."""
+"""tfds's default template of shard names."""
 
 MAX_SHARDS = 2**15
 """Shards of one split."""
@@ -32,7 +32,7 @@ MAX_SHARDS = 2**15
 ADVICE = "Restore the file as tfds wrote it."
 
 FILE_FORMATS = ("tfrecord", "array_record")
-"""How records may lie in shards, as dataset_info.json says it."""
+"""Supported file formats of shards, as named in dataset_info.json."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class DatasetInfo:
     splits: dict[str, SplitInfo]
 
     def shard_names(self, split: str) -> list[str]:
-        """The files of a split. Raises ValueError for a name that is none."""
+        """The file names of a split's shards. Raises ValueError for an invalid one."""
         of = self.splits[split]
         count = len(of.shard_lengths)
         digits = max(len(str(count)), 5)
@@ -109,10 +109,7 @@ def _has_info(directory: Location) -> bool:
 
 
 def dataset_name(directory: str | Location) -> str:
-    """The name that an RLDS directory gives itself, read from dataset_info.json alone.
-
-    Raises DataError for a directory that is none.
-    """
+    """The dataset's name in dataset_info.json. Raises DataError for a directory that is no RLDS dataset."""
     return read_info(resolve_version(directory)).name
 
 
@@ -225,7 +222,7 @@ def step_key(key: str) -> str:
 
 
 def listing(names: Sequence[str]) -> str:
-    """Names for a message, as a user writes them."""
+    """Field names for a message, in the form that a user writes."""
     return ", ".join(n.removeprefix("steps/") for n in names)
 
 

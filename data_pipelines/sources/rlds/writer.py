@@ -1,7 +1,7 @@
-"""An RLDS directory as tfds lays it out: the schema, a step's flags, and the files beside the shards.
+"""Writing an RLDS directory in tfds's layout: the schema, the flags of a step, and the metadata files.
 
-Owns what every writer of episodes shares; which fields a dataset has and what is in them is the
-writer's own business. Records are `example.encode_example`, shards `tfrecord.write_shard`.
+Owns what all writers of episodes share; each writer decides which fields a dataset has. Records are made by
+`example.encode_example`, shards by `tfrecord.write_shard`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ STEP_FIELDS = {
     "is_terminal": Field("bool"),
     "language_instruction": Field(TEXT),
 }
-"""What every step has besides observations and actions."""
+"""Fields of every step besides observations and actions."""
 
 
 def step_features(rewards: np.ndarray, instructions: Sequence[str]) -> dict[str, np.ndarray | list[bytes]]:
