@@ -120,7 +120,7 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """What one trial of a study will take, after those that it shares the beginning of its training with."""
+    """The remaining cost of one trial, after those that it shares the beginning of its training with."""
 
     trial: Trial
     cost: Cost

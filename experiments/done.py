@@ -1,4 +1,4 @@
-"""What of a study is there already, for dry runs: what is prepared and which trials are finished, or how far they are.
+"""What of a study exists already, for dry runs: prepared data, finished trials, and progress of unfinished ones.
 
 Nothing is made and no data are read, so that a dataset that was changed since is not noticed: the study's own command
 refuses it.

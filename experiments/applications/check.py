@@ -1,4 +1,4 @@
-"""Whether a model listens to each action dimension of a robot's recordings, and with the sign and scale they have."""
+"""Whether a model responds to each action dimension of a robot's recordings, with the sign and scale they have."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from hma_jax.training.runs import Model
 
 BATCH = 16
 AT_LEAST = 8
-"""Episodes that `store.min_val` is to hold out, where there are enough."""
+"""The `store.min_val` that is advised where there are enough episodes."""
 
 
 def open_study(workspace: Workspace) -> PreparedData:

@@ -115,7 +115,7 @@ def windows(
 
 
 def with_heads(model: Model, seed: int) -> tuple[Params, ModelConfig]:
-    """(parameters, configuration) of a model that says the same of frames and has action heads, which know nothing."""
+    """(parameters, configuration) of a model with the same frame predictions and with untrained action heads."""
     config = replace(model.config, action_heads=True)
     known = {path_name(path): x for path, x in jax.tree_util.tree_leaves_with_path(model.params)}
     fresh = declare_model(config, model.table).init(seed)

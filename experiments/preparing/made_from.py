@@ -1,4 +1,4 @@
-"""What a prepared thing was made from, and who may make it again in its place.
+"""Stamps of prepared data: what they were made from, and whether they may be replaced.
 
 Three kinds of facts are written beside what is made, none of them a path or a time. *Inputs* are settings and data,
 by content. A thing that is there and was made from other inputs is refused, never replaced, unless the user asked for

@@ -1,4 +1,4 @@
-"""Generated trajectories, read back, beside the recordings whose actions they are of."""
+"""Compares generated trajectories with the recordings whose actions they replay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is judged, and how its parts are made."""
+"""The configuration of a judgement."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from experiments.applications.policies.learning import Report
 from experiments.applications.policies.tasks import AnyTask
 from hma_jax.config import require
 
-Step = Callable[[str], AbstractContextManager[Report]]
+OpenProgress = Callable[[str], AbstractContextManager[Report]]
+"""Opens a progress bar with a title: `experiments.progress.step`."""
 
 
 @dataclass(frozen=True)
 class JudgeConfig:
-    """What is judged, and how its parts are made."""
+    """The task that policies are judged at, and how policies, starts and the success head are made."""
 
     task: AnyTask
     starts: int = 50

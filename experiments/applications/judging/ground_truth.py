@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.config import JudgeConfig, OpenProgress
 from experiments.applications.judging.head import Head, SuccessHead, measure_head, train_head
 from experiments.applications.judging.outcomes import WORLDS
 from experiments.applications.judging.rollouts import make_starts
@@ -70,7 +70,7 @@ class SimulatedTruth:
 
     worlds = WORLDS
 
-    def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator, step: Step):
+    def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator, step: OpenProgress):
         """Raises ConfigError for a robot that has none."""
         require(has_truth(robot), f"{robot.name} has no true simulator here; give recordings of it with --recordings")
         self.config, self._robot, self._learned, self._step = config, robot, learned, step

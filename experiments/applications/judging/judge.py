@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.applications.generating.trajectories import open_trajectories, require_layout
-from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.config import JudgeConfig, OpenProgress
 from experiments.applications.judging.ground_truth import GroundTruth, SimulatedTruth
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
 from experiments.applications.judging.head import Head, load_head, save_head
@@ -63,7 +63,7 @@ class Judgement:
 
 
 def judge_run(
-    run_directory: Path, out: Path, config: JudgeConfig, step: Step, user_file: Path | None = None
+    run_directory: Path, out: Path, config: JudgeConfig, step: OpenProgress, user_file: Path | None = None
 ) -> Judgement:
     """The ladder's policies, and those of the user's file `user_file`, in the true and in the learned simulator.
 
@@ -81,7 +81,7 @@ def judge_recorded(
     out: Path,
     config: JudgeConfig,
     dataset: str,
-    step: Step,
+    step: OpenProgress,
     user_file: Path | None = None,
     split: str = "train",
     counted: Sequence[str] = (),
@@ -128,7 +128,7 @@ def _judge(
     simulator: Simulator,
     robot: Robot,
     truth: GroundTruth,
-    step: Step,
+    step: OpenProgress,
     user_file: Path | None,
     counted: Sequence[str] = (),
 ) -> Judgement:

@@ -18,7 +18,7 @@ import numpy as np
 from data_pipelines.sampling.order import hash64, stream_seed
 from experiments.applications.generating.source import confined
 from experiments.applications.generating.trajectories import Trajectories, describe
-from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.config import JudgeConfig, OpenProgress
 from experiments.applications.judging.ground_truth import Reconstruct
 from experiments.applications.judging.head import Head, SuccessHead, balanced_error, fit_heads, worth_of
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
@@ -66,7 +66,7 @@ class RecordedTruth:
 
     worlds = (LEARNED, SHUFFLED)
 
-    def __init__(self, config: JudgeConfig, recorded: Trajectories, robot: Robot, step: Step):
+    def __init__(self, config: JudgeConfig, recorded: Trajectories, robot: Robot, step: OpenProgress):
         """Raises ConfigError for too few recordings of either kind."""
         task = config.task
         if not isinstance(task, RecordedTask):

@@ -43,7 +43,7 @@ class Request:
 
 @dataclass
 class Session:
-    """A visitor's episode of the simulator, and what belongs to it (on the page: a seat)."""
+    """A visitor's episode of the simulator, and what belongs to it."""
 
     episode: int
     robot: Robot | None = None

@@ -1,4 +1,4 @@
-"""How networks that see a few frames and plan a few actions act: what they remember of B episodes."""
+"""Base class of policies that see the last frames and predict chunks of actions, with their state for B episodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How small networks are trained here: one jitted step on arrays in memory, kept at several steps of training."""
+"""Training of small networks: one jitted step on arrays in memory, checkpoints at several steps."""
 
 from __future__ import annotations
 

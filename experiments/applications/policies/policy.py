@@ -1,4 +1,4 @@
-"""What a policy is: images in, a robot's raw actions out, frame by frame, for B episodes at once."""
+"""The interface of policies: images in, a robot's raw actions out, frame by frame, for B episodes at once."""
 
 from __future__ import annotations
 

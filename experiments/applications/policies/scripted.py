@@ -1,4 +1,4 @@
-"""The scripted expert of the suite, more or less precise. It looks at the true state: it can act in the true simulator
+"""The scripted expert of the suite, with adjustable noise. It sees the true state, so it can act in the true simulator
 alone, and there is no such thing in a learned one."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What policies of robots that have a true simulator are to do, and when it is done: by that simulator's state."""
+"""Tasks of policies, and when they succeed: of robots with a true simulator by its state, of others by recordings."""
 
 from __future__ import annotations
 
