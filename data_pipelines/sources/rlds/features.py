@@ -45,8 +45,8 @@ _FORM_OF = {name: form for form, names in _FORMS.items() for name in names}
 
 @dataclass(frozen=True)
 class FlatFeature:
-    """A field of the schema: an image, or `size` numbers per step (0: text and the like). `encoding`: tfds's name of the
-    encoding of numbers that a record stores as bytes, which are not read."""
+    """A field of the schema: an image, or `size` numbers per step (0: text and the like). `encoding`: tfds's name for
+    the encoding of numbers that a record stores as bytes, which are not read."""
 
     image: bool
     size: int
