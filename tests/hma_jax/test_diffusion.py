@@ -244,3 +244,6 @@ def test_shifted_steps_are_drawn_as_often_as_the_shift_says():
             want = share / (k - (k - 1) * share)
             assert abs(float(np.mean(np.asarray(time) < 100 * share)) - want) < 0.02, (k, share)
         np.testing.assert_array_equal(noise, draw_noise(key, shape, 100)[1])
+    # The middles of four steps, at 3 u / (1 + 2 u): 1.2, 2.6, 3.3 and 3.8 of four.
+    time = np.asarray(draw_noise(key, shape, 4, 3.0)[0])
+    np.testing.assert_allclose(np.bincount(time, minlength=4) / len(time), [0, 1 / 4, 1 / 4, 1 / 2], atol=0.02)

@@ -41,6 +41,11 @@ def test_rectangles_of_frames_on_end_show_what_stands_elsewhere_in_the_same_fram
     assert len(lengths) > 0.95 * rows and np.min(starts) == 0
     assert np.max(lengths, axis=0).tolist() == [frames, LARGEST * side, LARGEST * side]
     assert 0.45 < (np.max(starts, axis=0) / [frames, side, side]).min()
+    assert 0.6 < np.mean([high != wide for _, high, wide in lengths]) < 0.9  # of four each: three in four
+    ends = np.add(starts, lengths)
+    assert np.max(ends, axis=0).tolist() == [frames, side, side]
+    # Of frames that begin at the b-th of seven, one in 7 - b lasts to the end: of all, (1 + 1/2 + ... + 1/7) / 7.
+    assert 0.27 < (ends[:, 0] == frames).mean() < 0.47
     np.testing.assert_array_equal(displace(past, 0.0, keys), past)
     touched = (np.asarray(displace(past, 0.5, keys)) != past).any((1, 2)).mean()
     assert 0.4 < touched < 0.6
