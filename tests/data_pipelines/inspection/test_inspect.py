@@ -225,7 +225,7 @@ def test_pictures_of_lerobot_that_are_no_cameras_are_named(tmp_path):
     facts = inspect_dataset(root).facts
     left = {f.key: f.shape for f in facts.fields if f.kind == NOT_READ}
     assert left == {"observation/ir": (8, 8, 1), "observation/depth": (4, 6, 3)}
-    assert "left out: observation/ir, observation/depth" in " ".join(suggest_entry(facts, 10).reasons)
+    assert "not used as cameras: observation/ir, observation/depth" in " ".join(suggest_entry(facts, 10).reasons)
     assert [c.key for c in facts.cameras] == ["observation/top"]
     with pytest.raises(ConfigError, match="'observation/ir' is not an image; images: observation/top"):
         LeRobotDataset(root).check_keys("observation/ir", ("action",))

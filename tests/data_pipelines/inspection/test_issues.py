@@ -51,7 +51,7 @@ def test_nothing_stands_out_of_healthy_data(tmp_path):
 
 def test_no_window(tmp_path):
     assert issues_of(tmp_path, lengths=[2, 3], frames=4) == {
-        "no window": "error: the shortest window at stride 2 takes 4 steps; the longest of 2 episodes has 3"
+        "no window": "error: the shortest window at stride 2 needs 4 steps; the longest of 2 episodes has 3"
     }
 
 
@@ -139,7 +139,7 @@ def test_angles_are_numbered_as_the_entry_numbers_them(tmp_path):
 def test_an_entry_that_names_what_is_not_there(tmp_path):
     wrong = replace(SPEC, image_key="observation/rgb", action_keys=("action[:9]",), action_dims=(9,))
     text = issues_of(tmp_path, spec=wrong)["entry does not fit"]
-    assert text.startswith("error") and "wants observation/rgb, action[:9] with 9 values" in text
+    assert text.startswith("error") and "needs observation/rgb, action[:9] with 9 values" in text
 
 
 # --- duplicates ---------------------------------------------------------------------------------

@@ -95,7 +95,7 @@ def test_figures_that_cannot_be_read_are_told_with_their_file(tmp_path, text):
 
 def test_missing_packages_are_named_with_the_extra_and_what_draws(monkeypatch):
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
-    message = r"not installed \(gym-pusht, mujoco\): pip install -e '.\[sim\]'.*libegl1"
+    message = r"not installed \(gym-pusht, mujoco\)\. Run: pip install -e '.\[sim\]'.*libegl1"
     with pytest.raises(ConfigError, match=message):
         packages.require_packages([SPEC])
 
@@ -141,7 +141,7 @@ def test_a_job_survives_its_command_line_and_seeds_are_its_episodes_own():
 
 
 def test_text_that_is_no_start_state_is_refused():
-    with pytest.raises(DataError, match="is no start state"):
+    with pytest.raises(DataError, match="is not a start state"):
         StartState.from_json(b'{"env": "Lift"}')
 
 

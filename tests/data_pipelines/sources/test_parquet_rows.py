@@ -59,9 +59,9 @@ def test_other_groups_and_columns_are_not_read(path):
     assert rows.read(path, ["number"], 5, 90)["number"].to_pylist() == list(range(5, 95))
     assert rows.read(path, ["picture.top"], 60, 1)["picture.top"][0].as_py()["bytes"] == bytes([60]) * 50
     for first in (59, 90):
-        with pytest.raises(DataError, match="rows.parquet: the table cannot be read .*kind 13"):
+        with pytest.raises(DataError, match="rows.parquet: the table cannot be read .*kind of field, 13"):
             rows.read(path, ["picture.top"], first, 2)
-    with pytest.raises(DataError, match="kind 13"):
+    with pytest.raises(DataError, match="kind of field, 13"):
         rows.read(path, ["list"], 0, 1)
 
 
@@ -69,7 +69,7 @@ def test_a_table_of_some_columns_reads_no_other(path):
     """As beside an episode's place in LeRobot's tables stand statistics."""
     spoil(path, "list")
     assert read_table(path, ["number", "absent"]).to_pydict() == {"number": list(range(ROWS))}
-    with pytest.raises(DataError, match="kind 13"):
+    with pytest.raises(DataError, match="kind of field, 13"):
         read_table(path, ["number", "list"])
 
 

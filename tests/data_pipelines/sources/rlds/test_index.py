@@ -153,7 +153,7 @@ def test_shards_that_exchanged_their_names_are_found(directory):
     aside = a.with_name("aside")
     a.rename(aside), b.rename(a), aside.rename(b)
     for corrupt in ("raise", "skip"):
-        with pytest.raises(DataError, match=r"00001-of-00004 and .*00002-of-00004: .* changed places"):
+        with pytest.raises(DataError, match=r"00001-of-00004 and .*00002-of-00004: .* swapped names"):
             RldsDataset(directory, corrupt=corrupt)
     index_path(directory, "train").unlink()
     assert RldsDataset(directory).episode(2, *KEYS).steps == 9

@@ -107,7 +107,7 @@ def test_a_file_that_was_replaced_meanwhile_is_not_read_as_the_old_one(tmp_path,
     held = OpenFiles().get(path)
     path.write_bytes(b"other contents")
     fail(monkeypatch, "pread", errno.ESTALE, 1)
-    with pytest.raises(DataError, match="was replaced while it was read"):
+    with pytest.raises(DataError, match="was replaced while it was being read"):
         held.read(0, 4)
 
 
