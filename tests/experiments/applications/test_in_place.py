@@ -102,7 +102,7 @@ def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monk
         unfinished.touch()
         return Detector(init_detector(jax.random.key(0), 1, 5), list(scenes))
 
-    for name, value in (("EPISODES", 1), ("FEWEST", 1), ("HELD_OUT", (1, 1)), ("train_detector", untrained)):
+    for name, value in (("EPISODES", 1), ("MIN_EPISODES", 1), ("HELD_OUT", (1, 1)), ("train_detector", untrained)):
         monkeypatch.setattr(detector_module, name, value)
     monkeypatch.setattr(detector_module, "detection_errors", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -218,7 +218,7 @@ def test_what_a_stop_leaves_is_said_as_it_is(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_detector_is_made_of_a_run_s_robots(simulator, tmp_path, monkeypatch):
-    few = {"EPISODES": 4, "FEWEST": 2, "PER_EPISODE": 2, "HELD_OUT": (2, 2), "STEPS": 1, "MORE": 1}
+    few = {"EPISODES": 4, "MIN_EPISODES": 2, "PER_EPISODE": 2, "HELD_OUT": (2, 2), "STEPS": 1, "STEPS_PER_ROBOT": 1}
     for name, value in few.items():
         monkeypatch.setattr(detector_module, name, value)
     made = make_detector(list(simulator.robots), simulator.tokenizer, tmp_path)

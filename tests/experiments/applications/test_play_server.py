@@ -172,7 +172,7 @@ class FakeTruth:
     def rewind(self, frames):
         del self.made[len(self.made) - frames :]
 
-    def reach(self, _):
+    def max_rewind(self, _):
         return len(self.made) - 1
 
     @property
