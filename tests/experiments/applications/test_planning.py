@@ -119,9 +119,10 @@ def test_a_goal_counts_in_the_second_half_of_the_horizon():
     assert cost.tolist() == [0, 0.5]
 
 
-def test_the_true_model_sees_what_the_robot_would():
+@pytest.mark.parametrize("stride", [1, 2])
+def test_the_true_model_sees_what_the_robot_would(stride):
     task = find_task("pusher_sand", "reach")
-    robot, seen = Robot("pusher_sand", 1, (-8.0, -8.0), (8.0, 8.0), (0.0, 0.0)), Environment(task.spec)
+    robot, seen = Robot("pusher_sand", stride, (-8.0, -8.0), (8.0, 8.0), (0.0, 0.0)), Environment(task.spec)
     actions = np.random.default_rng(0).uniform(-8, 8, (2, 3, 2)).astype(np.float32)
     model = TrueModel(task.spec, robot, 64)
     seen.reset(5)
@@ -131,7 +132,8 @@ def test_the_true_model_sees_what_the_robot_would():
     for b in range(2):
         seen.set_state(began)
         for t in range(3):
-            seen.step(actions[b, t])
+            for _ in range(stride):
+                seen.step(actions[b, t])
             np.testing.assert_array_equal(imagined[b, t], seen.render())
 
 
@@ -168,6 +170,29 @@ def test_the_learned_model_imagines_again_from_the_same_present():
     assert (model.imagine(other) != imagined).any()
     np.testing.assert_array_equal(model.imagine(first), imagined)
     assert (goal_image_cost(imagined[0, -1])(imagined) < goal_image_cost(255 - imagined[0, -1])(imagined)).all()
+
+
+class Recorder:
+    """A simulator of two episodes that keeps what it was reset to."""
+
+    def __len__(self) -> int:
+        return 2
+
+    def reset(self, start, seeds):
+        self.start, self.seeds = start, seeds
+
+    def snapshot(self):
+        return None
+
+
+def test_the_learned_model_begins_with_the_newest_frames_and_the_actions_between_them():
+    recorder, robot = Recorder(), Robot("r", 2, (-9.0,), (9.0,), (0.0,))
+    images, actions = list(np.arange(5, dtype=np.uint8)[:, None, None, None]), [np.array([float(i)]) for i in range(4)]
+    LearnedModel(recorder, robot).observe(images, actions, None)
+    assert recorder.start.images.ravel().tolist() == [2, 3, 4] and recorder.seeds == [5, 5]
+    assert recorder.start.actions.ravel().tolist() == [2, 2, 3, 3]
+    LearnedModel(recorder, robot).observe(images[:1], [], None)
+    assert recorder.start.images.ravel().tolist() == [0] and recorder.start.actions.shape == (0, 1)
 
 
 @pytest.mark.slow
