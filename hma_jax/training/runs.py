@@ -21,7 +21,7 @@ from hma_jax.training.reading import CheckpointError, has_item, list_steps, load
 from hma_jax.training.run_lock import CHECKPOINTS
 
 
-@dataclass(frozen=True, eq=False)  # `==` of arrays is not a bool
+@dataclass(frozen=True)
 class Run:
     """A trained model, read from its run directory."""
 
@@ -34,7 +34,7 @@ class Run:
     weights: Weights = "last"  # which of the run's weights `params` are: last or ema
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False)  # compared by identity: it has a hash, which a tree of arrays has not
 class Model:
     """A trained model, ready for inference: `declared.merge(params)` is what computes, inside a traced function.
 
