@@ -316,7 +316,7 @@ def test_robots_of_which_nothing_is_predicted_are_refused(setting: str, only: st
     """Training ended well, with losses of 0."""
     config, masking = shallow_config(), MaskingConfig(setting=setting)
     declared = declare_model(config, MIXED)
-    with pytest.raises(ConfigError, match=f"'{setting}' predicts {what}, of which {only} and all other robots"):
+    with pytest.raises(ConfigError, match=f"'{setting}' predicts {what}, but {only} and all other robots"):
         make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only,)))
     make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only, "arm")))
 
