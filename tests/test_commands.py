@@ -138,10 +138,10 @@ def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bo
     if code:
         missing = "equired" in said and "nrecognized" not in said and "invalid" not in said.lower()
         return None if missing and not whole else said
-    arguments = calls[-1].get("arguments") if calls else None
-    if arguments is not None and arguments.set:
+    given = calls[-1].get("arguments") if calls else None
+    if given is not None and given.set:
         with contextlib.suppress(SystemExit):  # of --set help
-            override(get_preset(arguments.preset or "cpu"), list(arguments.set))  # raises ConfigError
+            override(get_preset(given.preset or "cpu"), list(given.set))  # raises ConfigError
     return None
 
 

@@ -333,7 +333,7 @@ def test_the_page_shows_the_reference_in_whichever_order_axes_come(axes):
     that."""
     for order in (axes, axes[::-1]):
         shown = page._choose_shown(plan_sweeps(CPU_FULL, order), CPU_FULL)
-        assert (shown.by.name, shown.name) == (axes[1], "reference")
+        assert (shown.sweep.name, shown.name) == (axes[1], "reference")
     shown = page._choose_shown(plan_sweeps(CPU_FULL, axes[:1]), CPU_FULL)
     assert shown.name == f"default of {axes[0]}"
     assert page._choose_shown(plan_sweeps(CPU_FULL, ("lr",)), CPU_FULL) is None

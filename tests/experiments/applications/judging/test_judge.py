@@ -141,7 +141,7 @@ def test_policies_of_ones_own_are_judged_beside_the_random_one_and_told_from_cha
         shutil.copy(kept, out / "rollouts" / kept.name)
     alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
     found = judge_run(root / "model", out, alone, step, file)
-    assert found.policies == ("random", "hma", "still") and found.own == ("still",)
+    assert found.policies == ("random", "hma", "still") and found.user_policies == ("still",)
     assert not (out / "policies").exists() and (out / "own_policies.py").read_text() == file.read_text()
     assert (found.rollouts("still", TRUE).actions == 0).all()
     assert found.clipped["still"] == 0
