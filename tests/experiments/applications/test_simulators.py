@@ -59,7 +59,7 @@ def test_of_one_s_own_data_targets_stay_where_they_were_moved_to_and_changes_end
     monkeypatch.setattr(simulators_module, "TokenStore", lambda _: store)
     robots = {name: Robot(name, 2, (-1.0,) * 3, (1.0,) * 3, (0.0,) * 3) for name in recorded}
     described = []
-    simulator = SimpleNamespace(robots=robots, describe=described.extend)
+    simulator = SimpleNamespace(robots=robots, update_robots=described.extend)
     workspace = Workspace(tmp_path)
     workspace.store.mkdir()
     simulators_module.mark_absolute_actions(simulator, tmp_path / "model")
