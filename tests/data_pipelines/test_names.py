@@ -43,7 +43,7 @@ def test_name(name):
 @pytest.mark.parametrize("name", BAD)
 def test_text_that_is_no_name(name):
     assert not is_dataset_name(name)
-    with pytest.raises(ConfigError, match="no name of a dataset: use up to 128 letters"):
+    with pytest.raises(ConfigError, match="cannot be the name of a dataset: use up to 128 letters"):
         make_spec(name)
 
 
@@ -51,7 +51,7 @@ def test_text_that_is_no_name(name):
 def test_entry_of_a_file_cannot_be_called_like_a_path(tmp_path, name):
     path = tmp_path / "own.toml"
     path.write_text(f'["{name}"]\nimage_key = "image"\naction_keys = ["action"]\naction_dims = [7]\nhz = 5\n')
-    with pytest.raises(ConfigError, match="own.toml: dataset .* no name of a dataset"):
+    with pytest.raises(ConfigError, match="own.toml: .* cannot be the name of a dataset"):
         load_entries(path)
 
 

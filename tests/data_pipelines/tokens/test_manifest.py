@@ -144,7 +144,7 @@ def test_a_column_is_a_tuple_of_integers_to_its_users():
     column = Column([3, 1, 2])
     assert (*column,) == (3, 1, 2) and column == (3, 1, 2) and column[-1] == 2 and 1 in column
     assert column[1:] == (1, 2) and sorted(column) == [1, 2, 3] and column != Column([3, 1])
-    with pytest.raises(ValueError, match="no column"):
+    with pytest.raises(ValueError, match="is not a column"):
         Column([2**31])
 
 

@@ -142,7 +142,7 @@ def test_edited_file_is_refused(manifest, tmp_path):
     values = json.loads(path.read_text())
     values["datasets"][0]["windows"].pop()
     path.write_text(json.dumps(values))
-    with pytest.raises(DataError, match="do not match its hash"):
+    with pytest.raises(DataError, match="do not match the hash in it"):
         EvalManifest.load(path)
     for content in ("", "[]", "{}", '{"frames": "x"}'):
         path.write_text(content)
