@@ -72,6 +72,17 @@ def test_tokens_are_drawn_as_often_as_they_are_likely():
     assert np.abs(share[ids] - wanted).max() < 5 * np.sqrt(wanted.max() / draws)
 
 
+def test_each_factor_has_its_own_noise_and_the_top_k_are_the_likeliest():
+    even = jnp.zeros((1000, 2, 8))
+    choose = choose_sampled(jax.random.key(0), even.shape)
+    first, second = (np.asarray(choose(q, even[:, q])) for q in range(2))
+    assert np.mean(first == second) == pytest.approx(1 / 8, abs=0.04)
+    uneven = jnp.broadcast_to(jnp.log(jnp.array([0.1, 0.4, 0.2, 0.3])), (1000, 1, 4))
+    for k, likeliest in ((1, [1]), (2, [1, 3])):
+        drawn = choose_sampled(jax.random.key(1), uneven.shape, top_k=k)(0, uneven[:, 0])
+        assert np.unique(drawn).tolist() == likeliest
+
+
 def test_the_likeliest_factor_follows_the_likeliest_before_it():
     head, predictions = lively_head()
     digits, of_each = head.decode_factors(predictions, choose_likeliest)
