@@ -86,6 +86,8 @@ def test_robots_without_actions_or_video_targets_train_what_they_can(setting: st
         assert np.asarray(masked.targets_TS)[film].any()
     if setting != "forward":
         assert np.asarray(masked.action_targets_T)[blind].any()
+        counted = count_targets(masked, masked.inputs, MaskingConfig(setting=setting)).actions
+        assert counted == np.asarray(masked.action_targets_T).sum() < np.asarray(masked.hidden_T).sum()
 
 
 def test_chunks_that_training_never_shows_are_hidden_at_inference():

@@ -58,7 +58,7 @@ def test_seeds_of_robots_of_their_own_have_one_level_their_geometric_mean():
     points = measure(("trunk parameters",), positions, tables)
     np.testing.assert_allclose(points.value, [4, 2, 1, 9 / 2, 16 / 9])
     assert points.levels == 1
-    with pytest.raises(NoLevel, match="no position has a finished trial of each"):
+    with pytest.raises(NoLevel, match="no position has a finished trial"):
         measure(("trunk parameters",), [positions[0], positions[4]], tables)
 
 
