@@ -142,7 +142,7 @@ def test_after_a_fault_of_the_device_all_begin_again_and_drive_on(monkeypatch):
             broken.setattr(simulator, "_programs", copy(simulator._programs))  # other tests share them
             broken.setattr(simulator._programs, "advance", failing)
             told = await ask(first.socket, type="act", action=[0.5] * 7)
-        assert told["type"] == "error" and "start again" in told["message"]
+        assert told["type"] == "error" and "start the episode again" in told["message"]
         await ask(first.socket, type="start", robot="arm")
         told = await asyncio.gather(
             ask(first.socket, type="act", action=[0.5] * 7), ask(second.socket, type="act", action=[0.5] * 7)
