@@ -17,7 +17,7 @@ import pytest
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.tokens.dataset_writer import cut_parts
-from data_pipelines.tokens.moments import Moments, merge_all, moments_path
+from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row, read_moments
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import write_rlds
@@ -304,3 +304,11 @@ def test_moments_of_pieces_are_those_of_the_whole():
     np.testing.assert_allclose(merged.std, rows.astype(float).std(axis=0), rtol=1e-12)
     assert merged.low == tuple(rows.min(axis=0).tolist()) and merged.high == tuple(rows.max(axis=0).tolist())
     assert merge_all([], 2) == Moments.none(2)
+
+
+def test_moments_of_an_episode_of_one_action_and_of_as_many_episodes_as_asked_for(tmp_path):
+    np.testing.assert_array_equal(moments_row(np.array([[3.0, 4.0]])), [1, 3, 4, 0, 0])
+    np.save(moments_path(tmp_path / "part.array_record"), np.zeros((3, 5)))
+    for episodes in (2, 4):
+        with pytest.raises(DataError, match=f"of {episodes} episodes"):
+            read_moments(tmp_path / "part.array_record", episodes)
