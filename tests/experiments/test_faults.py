@@ -178,7 +178,7 @@ def test_a_directory_that_another_command_works_in_is_refused(command, tmp_path,
     with Workspace(tmp_path).locked():
         assert main([*command.split(), *SMOKE, "--out", str(tmp_path)]) == Exit.REFUSED
     said = capsys.readouterr().err
-    assert said.startswith(f"error: another command is at work in {tmp_path} (process {os.getpid()} on ")
+    assert said.startswith(f"error: another command is using {tmp_path} (process {os.getpid()} on ")
 
 
 def test_two_evaluations_of_one_run_are_refused(where, study, capsys):
