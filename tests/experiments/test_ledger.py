@@ -71,7 +71,7 @@ def test_damage_before_the_end_is_reported_with_its_line(ledger, line):
 
 
 def test_second_writer_is_refused(tmp_path):
-    with Workspace(tmp_path).locked(), pytest.raises(ConfigError, match="another command is at work"):
+    with Workspace(tmp_path).locked(), pytest.raises(ConfigError, match="another command is using"):
         with Workspace(tmp_path).locked():
             pass
     with Workspace(tmp_path).locked():

@@ -59,7 +59,7 @@ def test_robots_of_one_episode_take_turns_to_choose_and_to_judge():
     tables = {steps: with_loss(table, np.full(len(table), loss)) for steps, loss in ((500, 9.0), (1000, 1.0))}
     whole, chosen = cross_fit(tables, ROBOTS)
     assert chosen == (1000, 1000) and set(whole.metrics["cross_entropy"]) == {1.0}
-    with pytest.raises(NotComparable, match="there is one"):
+    with pytest.raises(NotComparable, match="there is only one episode"):
         cross_fit(tables, ROBOTS[:1])
 
 

@@ -45,7 +45,7 @@ def test_one_digit_of_the_windows_of_a_trial_cannot_be_changed(tmp_path):
     with_loss(table, loss).save(directory / FILE, directory.name)
     with pytest.raises(ConfigError, match=f"{FILE} was changed"):
         read_trial(directory)
-    with pytest.raises(ConfigError, match="no finished trial"):
+    with pytest.raises(ConfigError, match="not a finished trial"):
         read_trial(tmp_path)
     (directory / FILE).unlink()
     with pytest.raises(ConfigError, match=f"{FILE} is missing"):

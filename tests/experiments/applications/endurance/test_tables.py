@@ -96,7 +96,7 @@ def test_rows_are_of_whole_parts_and_are_read_again(tmp_path):
 
 def test_a_drive_too_short_for_a_row_is_refused_before_it_is_made(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["endurance", "nowhere", "--minutes", "0.4"])
-    with pytest.raises(ConfigError, match="--every 60: .* --minutes 0.4 are 24; give fewer"):
+    with pytest.raises(ConfigError, match="--every 60: .* --minutes 0.4 are 24; give a smaller --every"):
         main()
     monkeypatch.setattr(sys, "argv", ["endurance", "nowhere", "--starts", "0"])
     with pytest.raises(ConfigError, match="--starts must be at least 1, got 0"):
@@ -107,7 +107,7 @@ def test_starts_that_there_are_not_are_missed_before_anything_is_filmed():
     starts = [Start("a", np.zeros((1, 8, 8, 3), np.uint8), np.zeros((0, 2)), seed) for seed in (3, None, 5)]
     simulator, robots = SimpleNamespace(starts=starts), {"a": Robot("a", 1, (0.0,) * 2, (1.0,) * 2, (0.0,) * 2)}
     assert [s.seed for s in true_starts_of(simulator, robots, 2)["a"]] == [3, 5]
-    with pytest.raises(ConfigError, match="--starts 3: a has 2 starts"):
+    with pytest.raises(ConfigError, match="--starts 3: a has only 2 starts"):
         true_starts_of(simulator, robots, 3)
 
 
