@@ -288,7 +288,7 @@ def test_a_tokenizer_that_does_not_say_what_it_was_made_from(old, hma, out):
         (out / "tokenizer" / OLD_STAMP).write_text("0123456789abcdef")
     before = contents(out)
     code, said = hma("tokenize")
-    assert code == 2 and "it is not written down there" in said and ("as of earlier versions" in said) == old
+    assert code == 2 and "it is not recorded there" in said and ("as of earlier versions" in said) == old
     assert contents(out) == before
     use_it = ["--tokenizer", str(out / "tokenizer")]
     assert f"--tokenizer {out / 'tokenizer'}" in said and hma("tokenize", *use_it)[0] == 0
