@@ -27,12 +27,13 @@ def require_known(
         counts["ids"] = frames, config.vocab_size
     for what, (array, count) in counts.items():
         if _has_values(array) and array.size:
-            low, high = int(np.min(array)), int(np.max(array))
+            values = np.asarray(array)  # inside a traced function jnp's minimum of a constant is traced as well
+            low, high = int(values.min()), int(values.max())
             require(
                 0 <= low and high < count,
                 f"{what} from {low} to {high} were given, but the model allows 0 to {count - 1}",
             )
-    require(not _has_values(actions) or bool(np.isfinite(actions).all()), "the actions are not finite")
+    require(not _has_values(actions) or bool(np.isfinite(np.asarray(actions)).all()), "the actions are not finite")
 
 
 def _has_values(array: Array) -> bool:

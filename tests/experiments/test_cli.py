@@ -101,7 +101,7 @@ def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp
 
 
 @pytest.mark.parametrize(
-    ("command", "word"), [("convert to-safetensors x --out", "begins anew"), ("adapt x", "goes on")]
+    ("command", "word"), [("convert to-safetensors x --out", "begins anew"), ("adapt x", "continues")]
 )
 def test_a_command_that_is_stopped_says_what_the_same_will_do(command, word, tmp_path, monkeypatch, capsys):
     def stopped(*_, **__):

@@ -225,17 +225,20 @@ def test_a_file_that_is_no_axis_is_refused(text, words, tmp_path):
     [
         (
             OWN.format("replace(\n        trial, tua=x)"),
-            "line 6: TypeError: Trial.__init__() got .* argument 'tua'; mend",
+            "line 6: TypeError: Trial.__init__() got .* argument 'tua'; correct the file",
         ),
-        (OWN.replace("gain=", "gian="), "line 5: TypeError: make_sweep() got .*'gian'; mend"),
+        (OWN.replace("gain=", "gian="), "line 5: TypeError: make_sweep() got .*'gian'; correct the file"),
         (
             "def plan(study):\n    assert study.seed",
-            "line 2: AttributeError: 'Study' object has no attribute 'seed'; mend",
+            "line 2: AttributeError: 'Study' object has no attribute 'seed'; correct the file",
         ),
-        ("def plan(study):\n    assert study.unseen", "line 2: AssertionError; mend"),
-        ("import replace", "line 1: ModuleNotFoundError: No module named 'replace'; mend"),
-        ("\ndef plan(study)\n    return 3", "line 2: SyntaxError: expected ':'; mend"),
-        ("def plan(): return 3", "mine.py: TypeError: plan() takes 0 positional arguments but 1 was given; mend"),
+        ("def plan(study):\n    assert study.unseen", "line 2: AssertionError; correct the file"),
+        ("import replace", "line 1: ModuleNotFoundError: No module named 'replace'; correct the file"),
+        ("\ndef plan(study)\n    return 3", "line 2: SyntaxError: expected ':'; correct the file"),
+        (
+            "def plan(): return 3",
+            "mine.py: TypeError: plan() takes 0 positional arguments but 1 was given; correct the file",
+        ),
         (OWN.format("replace(trial, train=replace(trial.train, steps=0))"), "line 6: train.steps must be at least 1"),
     ],
 )

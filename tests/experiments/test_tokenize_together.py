@@ -110,7 +110,7 @@ def test_who_joins_needs_a_tokenizer_and_replaces_nothing(data, tokenizer, tmp_p
     with Workspace(tmp_path).locked():
         assert main(arguments) == 2
         message = capsys.readouterr().err
-        assert "no tokenizer yet, and another command is at work" in message
+        assert "no tokenizer yet, and another command is using" in message
         assert f"hma tokenizer train --preset smoke --out {tmp_path} --data {data[1]} {data[2]}" in message
         assert main([*arguments, *tokenizer, "--replace", "tokens"]) == 2
         assert "with --replace no other command may use the directory" in capsys.readouterr().err

@@ -70,7 +70,7 @@ def test_one_flipped_bit_in_any_file_is_refused_by_its_name(run_dir: Path):
             fit_toy(run_dir, 8, options=EVERY_TWO)
         message = str(refused.value)
         assert str(checkpoint) in message and name in message, name
-        assert "step 4 is whole" in message and "--skip-damaged" in message
+        assert "step 4 is undamaged" in message and "--skip-damaged" in message
         (checkpoint / name).write_bytes(good)
     assert list_steps(run_dir / "checkpoints") == [4, 6]
     assert fit_toy(run_dir, 8, options=EVERY_TWO).resumed_from == 6

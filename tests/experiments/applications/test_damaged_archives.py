@@ -29,5 +29,5 @@ def test_a_changed_byte_is_named_with_what_to_do(read, tmp_path):
         at += 30 + name + extra
         content[at] = 0xFF  # where an array begins, packed: zlib finds it
     (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(ConfigError, match="a.npz .*(invalid|Error).*; (make|remove|record)"):
+    with pytest.raises(ConfigError, match="a.npz .*(invalid|Error).*; (make|remove|record|train)"):
         read(tmp_path / "a.npz")

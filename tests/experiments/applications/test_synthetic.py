@@ -210,7 +210,7 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
 
 
 def test_episodes_that_leave_nothing_to_generate_or_to_judge_are_refused():
-    with pytest.raises(ConfigError, match="--given 14: an episode has 14 frames"):
+    with pytest.raises(ConfigError, match="--given 14 must be below the 14 frames of an episode"):
         Settings(given=14)
     with pytest.raises(ConfigError, match="--starts must be at least 1, got 0"):
         Settings(starts=0)

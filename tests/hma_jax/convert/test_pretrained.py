@@ -125,7 +125,7 @@ def test_full_size_lists_are_accepted_and_any_other_is_refused_by_name(name):
     changes = {
         rf"1 missing: {victim}": {n: s for n, s in shapes.items() if n != victim},
         r"1 not expected: quantize.mask \(18,\)": shapes | {"quantize.mask": (18,)},
-        rf"1 of another shape: {victim}: expected": shapes | {victim: (3, *shapes[victim][1:])},
+        rf"1 with another shape: {victim}: expected": shapes | {victim: (3, *shapes[victim][1:])},
     }
     for message, changed in changes.items():
         with pytest.raises(ConfigError, match=message):
