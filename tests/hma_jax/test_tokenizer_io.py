@@ -209,7 +209,7 @@ def test_unknown_kind(copy):
 def test_weights_of_another_training(copy, tmp_path):
     save_tokenizer(make(seed=1), tmp_path / "other")
     shutil.copy(tmp_path / "other" / WEIGHTS, copy / WEIGHTS)
-    assert f"{WEIGHTS} is not the file {DESCRIPTION} describes" in refusal(copy)
+    assert f"{WEIGHTS} is not the file that {DESCRIPTION} describes" in refusal(copy)
 
 
 def test_weights_of_another_configuration(copy, tmp_path):
