@@ -26,14 +26,17 @@ def require_known(
     if not config.diffusion:
         counts["ids"] = frames, config.vocab_size
     for what, (array, count) in counts.items():
-        if _has_values(array) and array.size:
-            values = np.asarray(array)  # inside a traced function jnp's minimum of a constant is traced as well
-            low, high = int(values.min()), int(values.max())
-            require(
-                0 <= low and high < count,
-                f"{what} from {low} to {high} were given, but the model allows 0 to {count - 1}",
-            )
+        if _has_values(array):
+            require_below(count, array, f"got {what}")
     require(not _has_values(actions) or bool(np.isfinite(np.asarray(actions)).all()), "the actions are not finite")
+
+
+def require_below(count: int, array: Array, subject: str) -> None:
+    """Raises ConfigError, which begins with `subject`, unless all integers of `array` lie in 0 to `count` - 1."""
+    if array.size:
+        values = np.asarray(array)  # inside a traced function jnp's minimum of a constant is traced as well
+        low, high = int(values.min()), int(values.max())
+        require(0 <= low and high < count, f"{subject} from {low} to {high}, but the model allows 0 to {count - 1}")
 
 
 def _has_values(array: Array) -> bool:

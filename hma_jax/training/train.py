@@ -18,6 +18,7 @@ from hma_jax.config.json import to_dict
 from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_step
+from hma_jax.model.given import require_below
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.runtime.audit import audit_sharding, plan_sharding
@@ -127,10 +128,7 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
     for name, (what, count) in numbers.items():
         kind = batch[name].dtype
         require(np.issubdtype(kind, np.integer), f"a batch has {what} of type {kind}, not integers")
-        low, high = int(np.min(batch[name])), int(np.max(batch[name]))
-        require(
-            0 <= low and high < count, f"a batch has {what} from {low} to {high}, but the model allows 0 to {count - 1}"
-        )
+        require_below(count, batch[name], f"a batch has {what}")
 
 
 @lru_cache(maxsize=4)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
+from hma_jax.config import DecodeConfig, SamplerConfig
 from hma_jax.generation import (
     advance,
     next_frame_outputs,
@@ -361,94 +361,3 @@ def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignmen
         frames.append(frame)
     np.testing.assert_array_equal(np.stack(frames, axis=1), whole)
     assert step._cache_size() == 1, "a step was compiled more than once"
-
-
-@pytest.mark.parametrize(
-    ("prompt", "actions", "robots", "message"),
-    [
-        ((1, 2), (1, 1, 2), 1, "action chunks for more frames than the prompt has, got 2"),
-        ((1, 0), (1, 1, 4), 1, "needs at least 1 prompt frame, got 0"),
-        ((1, 2), (1, 4), 1, r"a prompt \[B, T', 9\], actions \[B, R, T, 14\] .*; got \(1, 2, 9\), \(1, 4, 14\), "),
-        ((1, 2), (1, 1, 4), 2, r"takes a prompt .*; got \(1, 2, 9\), \(1, 1, 4, 14\), \(2,\), \(1,\)$"),
-    ],
-)
-def test_a_rollout_of_other_shapes_is_refused(prompt, actions, robots, message):
-    config = model_config()
-    declared, params = lively_params(config)
-    with pytest.raises(ConfigError, match=message):
-        rollout(
-            declared.merge(params),
-            np.zeros((*prompt, config.tokens), np.int32),
-            np.zeros((*actions, TABLE.action_width), np.float32),
-            np.zeros(robots, np.int32),
-            jax.random.split(jax.random.key(0), 1),
-            DecodeConfig(),
-        )
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"prompt": np.full((1, 2, 9), 64)}, "ids from 64 to 64 were given, but the model allows 0 to 63"),
-        ({"prompt": np.zeros((1, 2, 9))}, "this model's frames are int32, got float64"),
-        ({"robots": np.array([3])}, "robots from 3 to 3 were given, but the model allows 0 to 2"),
-        ({"robots": np.array([-1])}, "robots from -1 to -1 were given"),
-        ({"robots": np.zeros(1)}, "robots are integers, positions in the model's table; got float64"),
-        ({"actions": np.full((1, 1, 4, 14), np.nan)}, "the actions are not finite"),
-        ({"keys": jax.random.split(jax.random.PRNGKey(0), 1)}, r"1 keys are needed, .*got uint32 \(1, 2\); `jax"),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
-)
-def test_values_that_a_model_does_not_know_are_refused(changes, message):
-    """JAX computed frames from them, or raised an internal error."""
-    config = shallow_config()
-    declared, params = lively_params(config)
-    given = dict(
-        prompt=np.zeros((1, 2, 9), np.int32),
-        actions=np.zeros((1, 1, 4, 14), np.float32),
-        robots=np.zeros(1, np.int32),
-        keys=jax.random.split(jax.random.key(0), 1),
-    )
-    with pytest.raises(ConfigError, match=message):
-        jax.eval_shape(lambda p: rollout(declared.merge(p), *(given | changes).values(), DecodeConfig()), params)
-
-
-def test_ids_of_any_whole_type_are_continued():
-    config = shallow_config()
-    declared, params = lively_params(config)
-    made = jax.eval_shape(
-        lambda p: rollout(
-            declared.merge(p),
-            np.zeros((1, 2, 9), np.uint8),
-            np.zeros((1, 1, 4, 14), np.float32),
-            np.zeros(1, np.int32),
-            jax.random.split(jax.random.key(0), 1),
-            DecodeConfig(),
-        ),
-        params,
-    )
-    assert made.dtype == np.int32 and made.shape == (1, 1, 2, 9)
-
-
-@pytest.mark.parametrize(
-    ("tokens", "between", "chunk", "message"),
-    [
-        (4, 1, None, r"a session of 2 prompt frames starts with frames \(2, 2, 9\), got \(2, 2, 4\)"),
-        (9, 2, None, r"chunks between them \(2, 1, 14\), got \(2, 2, 14\); hidden \(2, 1\), got \(2, 2\)"),
-        (9, 1, (2, 7), r"a session goes on by chunk \(2, 14\), got \(2, 7\); next chunk .*got \(2, 7\)"),
-        (9, 1, (1, 14), r"a session goes on by chunk \(2, 14\), got \(1, 14\)"),
-    ],
-)
-def test_a_session_of_other_shapes_is_refused(tokens, between, chunk, message):
-    """Narrower chunks left what stood there of the chunk before, and those of fewer examples moved these alone."""
-    config = shallow_config()
-    declared, params = lively_params(config)
-    chunks, hidden = np.zeros((2, between, TABLE.action_width), np.float32), np.zeros((2, between), bool)
-
-    def begin_and_go_on(params):
-        model, robots = declared.merge(params), jnp.zeros(2, jnp.int32)
-        session = start(model, jnp.zeros((2, 2, tokens), jnp.int32), chunks, robots, hidden_BT=hidden)
-        return advance(model, session, jnp.zeros(chunk), jax.random.split(jax.random.key(0), 2), DecodeConfig())
-
-    with pytest.raises(ConfigError, match=message):
-        jax.eval_shape(begin_and_go_on, params)

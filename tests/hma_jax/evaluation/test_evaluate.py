@@ -56,8 +56,8 @@ def test_metrics_cover_the_valid_windows_of_each_dataset(params):
     ("changes", "message"),
     [
         ({"images": None, "valid": None}, "a batch to evaluate lacks images, valid"),
-        ({"tokens": 64}, "ids from 64 to 64 were given, but the model allows 0 to 63"),
-        ({"embodiment": 3}, "robots from 3 to 3 were given, but the model allows 0 to 2"),
+        ({"tokens": 64}, "got ids from 64 to 64, but the model allows 0 to 63"),
+        ({"embodiment": 3}, "got robots from 3 to 3, but the model allows 0 to 2"),
         ({"actions": np.nan}, "the actions are not finite"),
         ({"valid": False}, "no windows: all rows of its batches are padding"),
     ],
