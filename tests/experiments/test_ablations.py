@@ -140,7 +140,7 @@ def test_page_names_variants_and_marks_the_default(drawn):
     assert page.count("data:image/png;base64,") == 2 + 3 * 3  # two figures, three strips of three datasets
 
 
-def test_page_of_a_model_without_perplexity(tmp_path):
+def test_page_of_a_model_without_perplexity(unrendered, tmp_path):
     axes = ("width", "settings", "lr")
     workspace = finished_study(tmp_path, axes=axes, without=("perplexity", "cross_entropy"))
     draw(workspace, record_of(axes=axes))

@@ -153,7 +153,7 @@ def test_a_study_is_the_scaling_axes_only(capsys):
     assert "5 trials" in said and "passive" not in said
 
 
-def test_report_is_drawn_again_from_disk(tmp_path, capsys):
+def test_report_is_drawn_again_from_disk(unrendered, tmp_path, capsys):
     workspace = finished_study(tmp_path)
     save_record(workspace, record_of())
     assert main(["report", str(tmp_path)]) == 0
@@ -217,7 +217,7 @@ def test_a_place_without_its_engine_is_refused_before_anything_is_prepared(monke
     assert "Slurm is not available" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_the_place_where_trials_run_is_entered_once(instant_trials, tmp_path, monkeypatch):
+def test_the_place_where_trials_run_is_entered_once(instant_trials, unrendered, tmp_path, monkeypatch):
     """A Ray cluster was joined to see that it is there, left, and joined again once all was prepared."""
     entered, place = [], object()
 
@@ -252,7 +252,7 @@ def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp
     assert (tmp_path / "report.html").exists()
 
 
-def test_an_ablation_ends_in_its_own_page(instant_trials, tmp_path, capsys):
+def test_an_ablation_ends_in_its_own_page(instant_trials, unrendered, tmp_path, capsys):
     assert main(["sweep", "settings", "--preset", "smoke", "--out", str(tmp_path)]) == 0
     assert [p.name for p in (tmp_path / "figures").iterdir()] == ["settings.png"]
     assert "Ablation: dynamics setting" in (tmp_path / "report.html").read_text()
@@ -300,7 +300,7 @@ def test_a_refused_command_leaves_the_axes_of_a_study_alone(no_trials, tmp_path,
     assert {file: file.read_bytes() for file in kept} == kept
 
 
-def test_axes_of_one_study_share_a_report(instant_trials, tmp_path):
+def test_axes_of_one_study_share_a_report(instant_trials, unrendered, tmp_path):
     for axis in ("trajectories", "datasets"):
         main(["sweep", axis, "--preset", "smoke", "--out", str(tmp_path)])
         for trial in (tmp_path / "trials").iterdir():
@@ -309,7 +309,7 @@ def test_axes_of_one_study_share_a_report(instant_trials, tmp_path):
     assert load_record(Workspace(tmp_path)).axes == ("trajectories", "datasets")
 
 
-def test_a_study_of_other_settings_is_not_drawn_over(instant_trials, tmp_path, capsys):
+def test_a_study_of_other_settings_is_not_drawn_over(instant_trials, unrendered, tmp_path, capsys):
     smoke = ["--preset", "smoke", "--out", str(tmp_path)]
     assert main(["sweep", "settings", *smoke]) == 0
     page = (tmp_path / "report.html").read_bytes()
@@ -338,7 +338,7 @@ def test_robots_that_any_seed_is_judged_on_need_held_out_windows(instant_trials,
     assert f"judged: {sorted(set.union(*drawn))}" in capsys.readouterr().err
 
 
-def test_settings_that_no_axis_so_far_depends_on_go_on_with_the_study(instant_trials, tmp_path):
+def test_settings_that_no_axis_so_far_depends_on_go_on_with_the_study(instant_trials, unrendered, tmp_path):
     smoke = ["--preset", "smoke", "--out", str(tmp_path)]
     assert main(["sweep", "settings", *smoke]) == 0
     for trial in (tmp_path / "trials").iterdir():
@@ -355,7 +355,9 @@ def test_a_record_that_cannot_be_read_is_not_replaced_either(instant_trials, tmp
     assert "of another version" in (tmp_path / "study.json").read_text()
 
 
-def test_failed_trials_are_tried_again_by_the_command_that_is_printed(instant_trials, tmp_path, capsys, monkeypatch):
+def test_failed_trials_are_tried_again_by_the_command_that_is_printed(
+    instant_trials, unrendered, tmp_path, capsys, monkeypatch
+):
     smoke = ["--preset", "smoke", "--out", str(tmp_path)]
     placed = ["--workers", "2", "--launcher", "slurm", "--launcher-set", "gpus=1", "--launcher-set", "partition=a b"]
     assert main(["sweep", "width", *smoke, "--set", "widths=8,32", *placed]) == 1

@@ -354,7 +354,7 @@ def test_results_that_are_kept_are_read(name):
     assert {r.sweep for r in rows} == set(record.axes) and all(r.code for r in rows)
 
 
-def test_results_that_are_kept_are_drawn_again_from_their_table(tmp_path):
+def test_results_that_are_kept_are_drawn_again_from_their_table(unrendered, tmp_path):
     for file in ("study.json", "results.csv"):
         shutil.copy(KEPT / "ablations" / file, tmp_path)
     draw_again(tmp_path)

@@ -399,7 +399,7 @@ def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():
     assert "nan" not in said
 
 
-def test_page_without_any_finished_trial(tmp_path):
+def test_page_without_any_finished_trial(unrendered, tmp_path):
     workspace = finished_study(tmp_path, broken={"": "failed"})
     draw(workspace, record_of())
     assert "0 of 11 finished" in workspace.report.read_text()

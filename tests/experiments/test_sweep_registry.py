@@ -88,7 +88,7 @@ def test_brackets_of_a_label_are_words_in_a_plan(tmp_path, capsys):
     assert "per [/s]" in capsys.readouterr().out
 
 
-def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
+def test_the_documented_axis_is_drawn_without_its_file(documented, unrendered, tmp_path):
     root = tmp_path / "study"
     root.mkdir()
     documented.write_text(documented.read_text().replace("another mixture", "another <mixture>"))

@@ -155,7 +155,7 @@ def test_what_a_choice_costs_is_judged_on_seeds_that_it_was_not_made_by():
     assert cross_validated_penalty(clear, base, set()) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-9))
 
 
-def test_an_optimum_at_the_end_of_the_grid_is_marked(tmp_path):
+def test_an_optimum_at_the_end_of_the_grid_is_marked(unrendered, tmp_path):
     study = replace(STUDY, transfer=TransferConfig(rates=3, widths=(8, 16, 32)))
     workspace = finished_study(tmp_path, study, axes=("lr",))
     draw(workspace, record_of(study, axes=("lr",)))
@@ -168,7 +168,7 @@ def test_an_optimum_at_the_end_of_the_grid_is_marked(tmp_path):
     assert "0.0005 <span class=failed>edge</span>" in workspace.report.read_text()
 
 
-def test_divergence_bounds_the_grid_and_costs_everything(tmp_path):
+def test_divergence_bounds_the_grid_and_costs_everything(unrendered, tmp_path):
     """One seed that diverges is enough to rule a rate out, and a diverged neighbour is no edge."""
     broken = {"width 32 · seed 1 · learning rate 0.001, no muP": "diverged",
               "width 8 · seed 0 · learning rate 0.004, no muP": "diverged"}  # fmt: skip

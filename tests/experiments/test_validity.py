@@ -16,6 +16,7 @@ from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
+from tests.experiments.conftest import leave_unrendered
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, judged_study
 
@@ -32,7 +33,9 @@ def study(tmp_path_factory):
     """A small study that all checks pass, drawn."""
     root = tmp_path_factory.mktemp("valid")
     workspace, record = judged_study(root / "study", SMALL)
-    draw(workspace, record)
+    with pytest.MonkeyPatch.context() as patch:
+        leave_unrendered(patch)
+        draw(workspace, record)
     return workspace, record
 
 

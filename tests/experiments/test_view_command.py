@@ -17,6 +17,7 @@ from PIL import Image
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
+from experiments.report import data_page
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
 
 SPEC = make_spec("toy", (3,), hz=4)
@@ -25,6 +26,14 @@ SPEC = make_spec("toy", (3,), hz=4)
 @pytest.fixture(autouse=True)
 def _registry(monkeypatch):
     monkeypatch.setattr(registry_table, "_registered", {})
+
+
+@pytest.fixture(autouse=True)
+def _small_clips(monkeypatch, request):
+    """Encoding clips of noise as tall as pages have them takes most of the time of a page."""
+    if request.function is not test_page_is_one_file_with_clips_curves_and_statistics:
+        monkeypatch.setattr(data_page, "TALL", 16)
+        monkeypatch.setattr(data_page, "SMALL", 8)
 
 
 def change(episode: int, features: dict) -> None:
