@@ -92,7 +92,7 @@ def param(
     """
     require(len(shape) == len(axes), f"a parameter of shape {shape} needs {len(shape)} axes, got {axes}")
     about = {"axes": axes, "init": init, "role": role, "decay": decay, "use": "always", "precise": precise}
-    return nnx.Param(jnp.zeros(shape, jnp.float32), **about, matrix=matrix)
+    return nnx.Param(jax.ShapeDtypeStruct(shape, jnp.float32), **about, matrix=matrix)
 
 
 def bias(shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
@@ -131,8 +131,10 @@ def xavier_uniform(fan_in: float, fan_out: float, gain: float = 1.0) -> Initiali
 
 def stack(make: Callable[[], M], count: int, axis: str = LAYER_AXIS) -> M:
     """`count` modules as one whose parameters have a leading axis, of layers unless named otherwise."""
-    module = nnx.vmap(lambda _: make(), in_axes=0, out_axes=0)(jnp.arange(count))
+    module = make()
     for variable in _params(module):
+        one = variable.get_value()
+        variable.set_value(jax.ShapeDtypeStruct((count, *one.shape), one.dtype))
         variable.set_metadata(axes=(axis, *variable.axes))
     return module
 
@@ -209,8 +211,8 @@ class Declared(Generic[M]):
 
 
 def declare(make: Callable[[], M], min_shard_size: int = MeshConfig.min_shard_size) -> Declared[M]:
-    """Traces `make` abstractly (no arrays are allocated) and reads its declarations."""
-    graphdef, state, _ = nnx.split(nnx.eval_shape(make), nnx.Param, ...)
+    """Reads the declarations of the module that `make` makes."""
+    graphdef, state, _ = nnx.split(make(), nnx.Param, ...)
     # List indices become strings: checkpoints keep dictionaries with string keys only.
     flat = {tuple(map(str, path)): _spec(variable) for path, variable in nnx.to_flat_state(state)}
     return Declared(graphdef, nnx.traversals.unflatten_mapping(flat), min_shard_size)

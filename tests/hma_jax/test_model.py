@@ -10,6 +10,7 @@ from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
 from hma_jax.model.hma import causal_mask, declare_model
+from hma_jax.model.params import declare
 from tests.tiny import TABLE, lively_params, model_config, random_batch, shallow_config
 
 
@@ -62,13 +63,13 @@ def test_the_chunk_before_a_frame_changes_its_logits():
 
 def test_of_actions_attended_to_a_frame_s_own_weighs_as_much_as_all_earlier_ones_until_something_is_learned():
     config = shallow_config(conditioning="cross_attention")
-    attend = CrossAttention(config, 1)  # every parameter 0: all logits are equal
-    attend.v.set_value(jnp.eye(config.width)[None])
-    attend.out.kernel.set_value(jnp.eye(config.width)[None])
+    declared = declare(lambda: CrossAttention(config, 1))
+    params = jax.tree.map(lambda x: jnp.zeros(x.shape), declared.shapes())  # of queries and keys: all logits are equal
+    params["v"] = params["out"]["kernel"] = jnp.eye(config.width)[None]
     feature = np.random.default_rng(0).normal(size=(2, 6, config.width)).astype(np.float32)
     shown = np.array([[True] * 6, [False, True, False, True, True, False]])
     x, slices = jnp.zeros((2, 6, 3, config.width)), jnp.zeros(2, int)
-    attend = jax.jit(attend)
+    attend = jax.jit(declared.merge(params))
     got, cache = attend(x, ActionFeature(feature, shown), slices, causal_mask(6), None)
 
     def mixed(example, t):
