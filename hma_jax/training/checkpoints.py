@@ -187,7 +187,7 @@ class Checkpoints:
             try:
                 orbax.close()
             except Exception as error:  # of the save that failed, which `wait` has raised already
-                log.debug("error when error when error when closing the checkpoints at %s: %s", self.directory, error)
+                log.debug("error when closing the checkpoints at %s: %s", self.directory, error)
 
     # --- Restoring ---------------------------------------------------------------------------
 
