@@ -76,11 +76,11 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
     ran = [c for c in own if c.observed is not None]
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
-    head = ["curve"] * sweep.has_series + [sweep.axis, "", "predicted", "came", "", "seeds"]
+    head = ["curve"] * sweep.has_series + [sweep.axis, "", "predicted", "observed", "", "seeds"]
     return (
-        f"<h4>Written down before</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals hold what came. "
-        f"By its author's word they were written before the trials ran, in {commits}. Errors are over seeds.</p>"
-        f"<details><summary>Predicted and came</summary>{table(head, lines, text=2 + sweep.has_series)}</details>"
+        f"<h4>Preregistered</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals contain the outcome. According "
+        f"to the author they were written before the trials ran, in {commits}. Errors are over seeds.</p>"
+        f"<details><summary>Predicted and observed</summary>{table(head, lines, text=2 + sweep.has_series)}</details>"
     )
 
 

@@ -74,10 +74,10 @@ def describe_fits(fits: Sequence[CurveFit], isoflop: IsoFlop | None, outcomes: S
         ])  # fmt: skip
     head = ["curve", "over", "L, nats per token", "exponent", "E", "remarks"]
     return (
-        "<p>Fitted is L = E + A x<sup>\u2212\u03b1</sup>, the loss in nats per held-out token over the axis: Huber "
-        "loss in the logarithm, points weighted by the noise that seeds were measured to have. Brackets hold "
-        f"{LEVEL:.0%} of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, this "
-        "tokenizer and this range; beyond its last point it is a guess until a prediction has come true.</p>"
+        "<p>The law is L = E + A x<sup>\u2212\u03b1</sup>: L is the loss in nats per held-out token, x the position on "
+        "the axis. It is fitted by the Huber loss in the logarithm, points weighted by the measured scatter of seeds. "
+        f"Brackets are {LEVEL:.0%} intervals of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, "
+        "this tokenizer and this range; beyond its last point it is an extrapolation, which only predictions can test.</p>"
         f"{drawn}{table(head, lines, text=6)}{_outcomes(outcomes)}{_isoflop(isoflop)}"
     )
 
@@ -104,8 +104,8 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
             html.escape(p.curve), html.escape(p.position), predicted, observed, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
             html.escape("; ".join(o.marks)),
         ])  # fmt: skip
-    head = ["curve", "at", "predicted", "came", "", "seeds", "remarks"]
-    return f"<h3>Written down before</h3>{table(head, lines, text=7)}"
+    head = ["curve", "at", "predicted", "observed", "", "seeds", "remarks"]
+    return f"<h3>Preregistered predictions</h3>{table(head, lines, text=7)}"
 
 
 def _isoflop(isoflop: IsoFlop | None) -> str:
@@ -122,4 +122,4 @@ def _isoflop(isoflop: IsoFlop | None) -> str:
         else f"No power law: {html.escape(isoflop.refused)}."
     )
     head = ["training FLOPs", "sizes", "best trunk parameters", "remarks"]
-    return f"<h3>The best size for a budget</h3><p>{sentence}</p>{table(head, lines, text=4)}"
+    return f"<h3>The best size for each compute budget</h3><p>{sentence}</p>{table(head, lines, text=4)}"

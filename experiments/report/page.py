@@ -157,18 +157,19 @@ def _headline(
             card(f"ΔPSNR, {shown.name}", _at_default(rows, shown.sweep, "delta_psnr"),
                  "dB, last frame: true minus random actions"),
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
-                 "dB, must vanish within its error"),
+                 "dB; should be zero within its error"),
         ]  # fmt: skip
     cards.append(card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"))
     when = result["run"]["finished"] if result else "no trial finished"
     unfinished = sum(state.event != FINISHED for state in states.values())
-    warning = f'<p class="warning">{unfinished} trial(s) have no result; see the table of trials.</p>'
+    lacking = f"{counted(unfinished, 'trial')} {'has' if unfinished == 1 else 'have'} no result"
+    warning = f'<p class="warning">{lacking}; see the table of trials.</p>'
     *others, final = [s.gain or s.axis for s in sweeps]
     gains = f"{', '.join(others)} and {final}" if others else final
     return (
         f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
         f"<p class=lead>What an action-conditioned video model over many robots gains from {html.escape(gains)}: "
-        f"{max(len(p.trial.datasets) for s in sweeps for p in s.points)} dataset(s), "
+        f"{counted(max(len(p.trial.datasets) for s in sweeps for p in s.points), 'dataset')}, "
         f"{all_steps(sweeps)} of {counted(study.train.batch, 'window')} per trial.</p>"
         f"<p class=meta>{html.escape(when)}</p></header>"
         f"<div class=cards>{''.join(cards)}</div>{warning if unfinished else ''}"

@@ -33,7 +33,7 @@ DRAWN = {
 """Metrics with their scope and label, where curves are compared by where they are lowest."""
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
 CAPTION = (
-    "bars: s.e. over seeds; star: lowest, hollow at an end of what was tried\n"
+    "bars: s.e. over seeds; star: lowest, hollow at an end of the grid\n"
     "cross: diverged; dotted: lowest of the base curve"
 )
 

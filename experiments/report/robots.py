@@ -126,7 +126,7 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
 
     columns: dict[str, tuple[Callable[[Robot], str], str]] = {}  # heading -> (cell of a robot, of all)
     if shares:
-        columns["decided by actions"] = (lambda r: f"{shares[r.name]:.0%}" if r.name in shares else "–", "")
+        columns["explained by actions"] = (lambda r: f"{shares[r.name]:.0%}" if r.name in shares else "–", "")
     if are_sorted(robots):
         columns["s.e. above zero"] = (lambda r: _errors(r.errors), "")
     columns |= {FOLLOWS[m]: (partial(followed, metric=m), cell(OVERALL, m)) for m in follows}
@@ -150,20 +150,20 @@ def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames
     lines = [line for robot in robots for line in robot.follows.values()]
     counted = {m: (*count_following(lines, m), expected_by_chance(lines, m)) for m in follows}
     parts = [
-        f"{FOLLOWS[m].split(' (')[0]} of {more} among {of} (chance: {deaf:.1f})"
+        f"{FOLLOWS[m].split(' (')[0]} of {more} of {of} robots (by chance {deaf:.1f})"
         for m, (more, of, deaf) in counted.items()
     ]
     order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
     text = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
-    text += f"Beyond two standard errors lie the {', the '.join(parts)} robots. " if parts else ""
+    text += f"More than two standard errors above zero are: {'; '.join(parts)}. " if parts else ""
     if shares:
-        text += "<em>Decided by actions</em>: the share of the change of its pixels that actions explain in truth. "
+        text += "<em>Explained by actions</em>: the share of the true change of pixels that actions explain. "
     if "retrieval" in follows:
-        text += "<em>Retrieval</em>: how often the true actions are found among all that were tried. "
+        text += "<em>Retrieval</em>: how often the true actions are the most likely of all that were tried. "
     if "counterfactual_gain" in follows:
         text += (
-            "<em>Counterfactual</em>: dB that frames under other actions are nearer to the simulator's under these "
-            "than frames under the recorded ones. "
+            "<em>Counterfactual</em>: PSNR against the simulator's frames under other actions, of frames predicted under "
+            "these minus frames predicted under the recorded ones. "
         )
     if not frames:
         return text + "Errors are standard errors over episodes, and over seeds where there are several."

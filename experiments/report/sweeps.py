@@ -49,7 +49,9 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along
     else:
         numbers = _curve(sweep, rows, along.changes) + _growth(sweep, along.growth)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.single_curve else ""
-    return f"{heading}<p>{html.escape(sweep.question)} Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
+    return (
+        f"{heading}<p>{html.escape(sweep.question)} Averaged over {counted(len(sweep.scope), 'dataset')}.</p>{numbers}"
+    )
 
 
 def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
@@ -65,17 +67,17 @@ def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
     for x, by_metric in points.items():
         cells = [_with_interval(f) if (f := by_metric.get(m)) else "–" for m in metrics]
         any_of = next(iter(by_metric.values()))
-        chosen = any_of.chosen + (" (an end of what was tried)" if any_of.edge else "")
+        chosen = any_of.chosen + (" (an end of the grid)" if any_of.edge else "")
         lines.append([f"{x:,}", *cells, str(any_of.seeds), chosen])
     head = [sweep.axis, *(CHANGED[m] for m in metrics), "seeds", "steps chosen, and how often"]
     return (
-        "<h4>At the number of steps that suits each point</h4>"
+        "<h4>At the best number of steps for each point</h4>"
         + table(head, lines)
         + (
-            "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other, both ways: the "
-            "lowest of several losses on the windows that judge it would flatter a point. Where an end of what was tried "
-            "was chosen, other steps may suit the point better still. Intervals of 95 % are over seeds "
-            "and episodes.</p>"
+            "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other half, and the "
+            "other way round: judged on the windows that chose it, the lowest of several losses would be too low. Where an "
+            "end of the grid was chosen, other numbers of steps may be better still. Intervals of 95 % are over seeds and "
+            "episodes.</p>"
         )
     )
 
@@ -93,15 +95,16 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
     for (series, first, last, data), by_metric in steps.items():
         cells = [_with_interval(f, "+") if (f := by_metric.get(m)) else "–" for m in metrics]
         any_of = next(iter(by_metric.values()))
-        whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} without"
+        whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} with no more"
         lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells, str(any_of.seeds)])
     head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics), "seeds"]
     return (
         "<h4>Robots whose data grows, and others</h4>"
         + table(head, lines, text=3)
         + (
-            "<p>From each point to the next, window by window, of robots that get more trajectories there and of those "
-            "that have no more to give. Intervals of 95 % are over episodes, and over seeds where there are several.</p>"
+            "<p>Changes from each point to the next, paired by window: of robots that have more trajectories there, and of "
+            "robots whose data is exhausted. Intervals of 95 % are over episodes, and over seeds where there are several."
+            "</p>"
         )
     )
 
@@ -143,10 +146,14 @@ def _change(changes: Sequence[Change]) -> str:
         return ""
     ends = changes[0]
     differences = ", ".join(f"{CHANGED[c.metric]} {_with_interval(c, '+', '95 % interval ')}" for c in changes)
-    over = f"seeds ({ends.seeds}) and episodes" if ends.seeds > 1 else "episodes of one seed: it says nothing of others"
+    over = (
+        f"seeds ({ends.seeds}) and episodes"
+        if ends.seeds > 1
+        else "episodes of one seed and leaves out the scatter of seeds"
+    )
     known = any(math.isfinite(c.low) for c in changes)
-    interval = f"The interval is over {over}." if known else "One held-out episode per robot tells no interval."
-    return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {differences}. {interval}</p>"
+    interval = f"The interval is over {over}." if known else "One held-out episode per robot gives no interval."
+    return f"<p>From {ends.first:,} to {ends.last:,}, paired by window: {differences}. {interval}</p>"
 
 
 def _with_interval(estimate: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
@@ -177,14 +184,16 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
         lines.append(["default, shuffled actions", "", *(cell for pair in pairs for cell in pair), "1"])
     head = [sweep.axis, "parameters, all robots"]
     for metric in columns:
-        head += [HEADINGS[metric], "to the default"]
-    judged, whose = "all variants are judged on the same windows", ""
+        head += [HEADINGS[metric], "minus the default"]
+    judged, whose = "all variants are evaluated on the same windows", ""
     if sweep.robots_vary:
-        judged = "each seed judges robots of its own, all variants on the same windows of these"
-        whose = " The default trained on shuffled actions is of one seed and its robots: not to be held against means."
+        judged = "every seed evaluates robots of its own, all variants on the same windows"
+        whose = (
+            " The default trained on shuffled actions has one seed and its robots: do not compare it with the means."
+        )
     return table([*head, "seeds"], lines) + (
-        f"<p>Bold: the default. Errors are standard errors over seeds, as in the figure: {judged}, so that windows do "
-        f"not add to a difference. Differences are taken seed by seed.{whose * any(controls.values())}</p>"
+        f"<p>Bold: the default. Differences are paired by seed, and errors are standard errors over seeds, as in the "
+        f"figure; the choice of windows adds nothing to them, since {judged}.{whose * any(controls.values())}</p>"
     )
 
 
@@ -221,14 +230,13 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
         f"<p>{_transfer(optima, kind)}</p>"
         + table(head, lines, text=3)
         + (
-            f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the "
-            f"loss is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the "
-            "held-out loss is in nats per token; where all rates of both curves have several seeds in "
-            "common, both are chosen by the others and judged on the one left out, elsewhere on those that chose them, which "
-            "makes it too large. Errors are over seeds; the grid is not interpolated. <em>As good</em>: rates that "
-            "seeds do not tell from the best (95 %, paired). "
-            "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
-            "beyond.</p>"
+            "<p><em>As good</em>: rates that the seeds cannot tell from the best (95 %, paired). <em>Steps moved</em>: how "
+            f"many steps of the grid the best rate is from that of the base {kind} (bold). <em>Penalty</em>: by how much the "
+            f"loss is higher at the best rate of the base {kind}; of the held-out loss, in nats per token. Where all rates "
+            "of both curves have several seeds in common, rates are chosen on all seeds but one and judged on the one left "
+            "out; elsewhere they are judged on the seeds that chose them, which makes the penalty too large. Errors are over "
+            "seeds; the grid is not interpolated. <em>Edge</em>: the best rate is the lowest or the highest tried, so the "
+            "true optimum may lie beyond.</p>"
         )
     )
 

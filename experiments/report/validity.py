@@ -53,15 +53,15 @@ class Check:
 def draw_box(checks: Sequence[Check]) -> str:
     bad = sum(c.verdict == "bad" for c in checks)
     unknown = sum(c.verdict == "open" for c in checks)
-    counted = [f"{len(checks) - bad - unknown} of {len(checks)} hold"]
-    counted += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad)
-    counted += [f"{unknown} cannot be checked"] * bool(unknown)
+    verdicts = [f"{len(checks) - bad - unknown} of {len(checks)} hold"]
+    verdicts += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad)
+    verdicts += [f"{unknown} cannot be checked"] * bool(unknown)
     lines = "".join(
         f"<li class={c.verdict}><span class=mark>{MARKS[c.verdict]}</span><div><b>{html.escape(c.name)}</b> "
         f"{html.escape(c.text)}</div></li>"
         for c in checks
     )
-    return section("Can these numbers be believed?", f"<p>{', '.join(counted)}.</p><ul class=checks>{lines}</ul>")
+    return section("Can these numbers be believed?", f"<p>{', '.join(verdicts)}.</p><ul class=checks>{lines}</ul>")
 
 
 def check_study(
@@ -95,7 +95,7 @@ def check_numbers(
 ) -> Check:
     """Whether the table as it was found (`written`) says of finished trials what their results do (`rows`), and these
     what follows from their windows. `group` is the evaluation's perplexity_group."""
-    name = "Every number follows from per-window numbers."
+    name = "Every number follows from those of single windows."
     known, drawn = {_key(r): r for r in rows}, {(r.sweep, r.trial) for r in rows}
     written = [r for r in written if r.metric and r.trial in results and (r.sweep, r.trial) in drawn]
     before = {(r.sweep, r.trial) for r in written}
@@ -114,7 +114,7 @@ def check_numbers(
         what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows."
         return Check(name, "open", what if results else "No trial is finished.")
     count = sum(len(w) for w in windows.values())
-    text = f"Table and results of {len(results)} trials were computed again from {count:,} windows."
+    text = f"Table and results of {len(results)} trials were recomputed from {count:,} windows."
     return Check(name, "good", text)
 
 
@@ -154,7 +154,7 @@ def _trials(states: Mapping[str, State]) -> Check:
     done = len(states) - sum(without.values())
     rest = "".join(f", {n} {event}" for event, n in sorted(without.items()))
     text = f"{done} of {len(states)} finished{rest}."
-    return Check("Every planned trial is here.", "bad" if without else "good", text)
+    return Check("Every planned trial is finished.", "bad" if without else "good", text)
 
 
 def _seeds(sweeps: Sequence[Sweep], rows: Sequence[Row]) -> Check:
@@ -167,12 +167,11 @@ def _seeds(sweeps: Sequence[Sweep], rows: Sequence[Row]) -> Check:
     counts = [len(s) for s in seeds.values()]
     few = [point for point, s in seeds.items() if len(s) < SEEDS]
     least, most = min(counts, default=0), max(counts, default=0)
-    counted = f"{least}" if least == most else f"{least} to {most}"
-    text = f"{counted} per point"
+    text = f"{least} per point" if least == most else f"{least} to {most} per point"
     if few:
         text += (
-            f"; {len(few)} of {len(seeds)} points have fewer than {SEEDS}, so that their errors hold little or nothing "
-            "of what another seed would change"
+            f"; {counted(len(few), 'point')} of {len(seeds)} {'has' if len(few) == 1 else 'have'} fewer than {SEEDS}, so "
+            "the standard error leaves out most or all of the scatter of seeds"
         )
     return Check(f"At least {SEEDS} seeds.", "bad" if few else "good", f"{text}.")
 
@@ -181,7 +180,7 @@ def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
     """At its first step a model has learnt nothing: log V per token, to the rounding of its own numbers."""
     if vocabulary is None:
         return []
-    name, expected = "An untrained model knows nothing.", math.log(vocabulary)
+    name, expected = "An untrained model is at chance.", math.log(vocabulary)
     losses = [r.mean for r in rows if (r.role, r.scope, r.metric) == (UNTRAINED, OVERALL, HELD_OUT)]
     if not losses:
         return [Check(name, "open", "No trial was judged before its first step.")]
@@ -193,7 +192,7 @@ def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
 def _controls(rows: Sequence[Row], metric: str) -> Check:
     """Trials on shuffled actions, each once: their mean has the error of independent ones."""
     label = CONTROLLED[metric]
-    name = f"Without true actions, {label} vanishes."
+    name = f"Trained without true actions, {label} is zero."
     controls: dict[str, Row] = {}
     for r in rows:  # a trial that stands on several axes is tested over the most windows
         if (r.role, r.scope, r.metric) == (CONTROL, OVERALL, metric):
@@ -207,7 +206,7 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
     far = max((abs(_errors(r.mean, r.sem)) for r in known), default=0.0)
     if unknown and far <= EACH:
         text = (
-            f"Of {len(unknown)} of {len(controls)} controls nobody knows the error: one episode per robot tells none."
+            f"The errors of {len(unknown)} of {len(controls)} controls are unknown: one episode per robot gives none."
         )
         return Check(name, "open", text)
     mean = sum(r.mean for r in known) / len(known)
@@ -227,14 +226,14 @@ def _errors(mean: float, sem: float) -> float:
 
 def _copying(robots: Sequence[Robot], whose: str) -> Check:
     """The trials called `whose` against repeating the last frame that was given."""
-    name = "Predicting beats copying the last frame."
+    name = "Prediction beats copying the last frame."
     judged = [r for r in robots if not math.isnan(r.ahead)]
     if not judged:
         return Check(name, "open", f"The {whose} is not finished.")
     better = [r for r in judged if r.ahead > 0]
     sure = [r for r in judged if r.ahead > 2 * r.ahead_sem]
     behind = ", ".join(r.name for r in judged if not r.ahead > 0)
-    text = f"On {len(better)} of {len(judged)} robots the {whose} does, on {len(sure)} by more than two standard errors"
+    text = f"On {len(better)} of {len(judged)} robots the {whose} is ahead, on {len(sure)} by more than two standard errors"
     return Check(name, "bad" if behind else "good", text + (f". Not on {behind}." if behind else "."))
 
 
@@ -249,19 +248,19 @@ def _optima(optima: Sequence[Optimum]) -> list[Check]:
     if not mup:
         return []
     edge = [o.series for o in mup if o.edge]
-    text = f"At the end of what was tried for {', '.join(edge)}." if edge else f"On all {len(mup)} curves with muP."
+    text = f"At an end of the grid for {', '.join(edge)}." if edge else f"On all {len(mup)} curves with muP."
     return [Check("The best learning rate lies inside the grid.", "bad" if edge else "good", text)]
 
 
 def _prediction(outcome: Outcome) -> Check:
     p = outcome.prediction
-    text = f"{p.curve} at {p.position}: {p.mean:.3f} nats, {p.low:.3f} to {p.high:.3f} with {p.level:.0%}"
+    text = f"{p.curve} at {p.position}: predicted {p.mean:.3f} nats ({p.low:.3f} to {p.high:.3f} with {p.level:.0%})"
     if outcome.observed is None:
         verdict: Verdict = "open"
         text += "; its trials have not run."
     else:
         verdict = "bad" if outcome.marks or not outcome.inside else "good"
-        text += f"; came: {outcome.observed:.3f} ({counted(outcome.seeds, 'seed')}), {'inside' if outcome.inside else 'outside'}."
+        text += f"; observed {outcome.observed:.3f} ({counted(outcome.seeds, 'seed')}), {'inside' if outcome.inside else 'outside'}."
     if outcome.marks:
         verdict, text = "bad", f"{text} But: {'; '.join(outcome.marks)}."
-    return Check("A prediction written down before.", verdict, text)
+    return Check("A preregistered prediction holds.", verdict, text)

@@ -60,8 +60,8 @@ def plan(study: Study) -> Sweep:
         study.dataset_names(),
         tuple(points),
         question="How wide should a model be for a given amount of compute? Along a curve every model spends the same "
-        "training FLOPs: wide ones see fewer windows. All have one learning rate, however few their steps: where "
-        "another suits so few better, their loss is an upper bound.",
+        "training FLOPs: wide ones see fewer windows. All have one learning rate, however few their steps: where another "
+        "rate is better for so few, the loss is an upper bound.",
         gain="compute",
         title="Equal compute",
         interior_minimum=True,

@@ -41,7 +41,7 @@ def plan(study: Study) -> Sweep:
         axis="conditioning",
         variants=variants,
         default=study.model.conditioning,
-        question="By which way should actions enter the trunk?",
+        question="How should actions enter the trunk?",
         gain="the way actions enter",
         title="Ablation: action conditioning",
     )

@@ -24,9 +24,9 @@ def plan(study: Study) -> Sweep:
         name="dilution",
         axis="robots in the mixture, total windows fixed",
         steps=dict.fromkeys(study.designs.counts, steps),
-        question="What do robots lose when others share their training? Judged are "
-        f"{study.designs.judged} robots, drawn anew for every seed; every point sees the same number of windows in all, "
-        "so that they see fewer as others join.",
+        question="What do robots lose when others share their training? "
+        f"{study.designs.judged} robots are judged, drawn anew for every seed. Every point sees the same number of windows "
+        "in all, so the judged robots see fewer as others join.",
         gain="sharing a budget",
     )
 

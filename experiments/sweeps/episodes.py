@@ -49,8 +49,8 @@ def plan(study: Study) -> Sweep:
         study.dataset_names(),
         tuple(points),
         question="What does more data per robot buy? Every robot has at most "
-        f"{', '.join(map(str, cutting))} or all of its trajectories, the same for all curves of a seed and "
-        "each lot inside the next; x is how many there are in all. All robots weigh the same everywhere.",
+        f"{', '.join(map(str, cutting))} or all of its trajectories, the same for all curves of a seed, "
+        "each set inside the next; x is the total over robots. All robots are weighted equally everywhere.",
         gain="more data",
         title="Training trajectories",
     )

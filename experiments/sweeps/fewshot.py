@@ -60,9 +60,9 @@ def plan(study: Study) -> Sweep:
         "trajectories of each new robot",
         unseen,
         tuple(points),
-        question=f"How much of a new robot must a trained model see? Judged on {len(unseen)} robots that no model was "
-        f"trained on, after {designs.shots_steps:,} steps in which their own parameters alone are trained; from "
-        "scratch, and where it is said, everything is.",
+        question=f"How much data of a new robot does a trained model need? {len(unseen)} robots are judged that no model was "
+        f"trained on, after {designs.shots_steps:,} steps that train their own parameters alone; from scratch, and where "
+        "the name says so, they train everything.",
         gain="knowing other robots",
         title="New robots from few trajectories",
     )

@@ -27,7 +27,7 @@ def plan(study: Study) -> Sweep:
     points += [point(n, first) for n in study.designs.long if n not in budgets]
     points.append(Point(steps, control_of(reference_trial(study, first)), CONTROL))
     beyond = [f"{n:,}" for n in study.designs.long if n not in budgets]
-    alone = f" Those of {', '.join(beyond)} steps are of one seed." if beyond else ""
+    alone = f" Points of {', '.join(beyond)} steps have one seed." if beyond else ""
     one_run = " The points of a seed are one run, whose rate decays at each."
     shared = one_run if study.train.optimizer.schedule == "wsd" else ""
     return Sweep(

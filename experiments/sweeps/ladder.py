@@ -75,7 +75,8 @@ def plan(study: Study) -> Sweep:
         axis="change",
         variants=VARIANTS,
         default=REFERENCE,
-        question="What makes the model better for as many steps? One change alone, changes tenfold, and the longest runs are of one seed.",
+        question="What makes the model better at the same number of steps? One change alone, changes tenfold, and the longest runs have one "
+        "seed.",
         gain="such changes",
         title="Ladder: what pays",
     )

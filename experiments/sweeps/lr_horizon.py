@@ -48,8 +48,8 @@ def plan(study: Study) -> Sweep:
             for factor in study.designs.rate_factors
             for seed in study.seeds
         ),
-        question="Does the best learning rate stay where it is as training gets longer? muP carries a rate over width, "
-        "nothing over the horizon.",
+        question="Does the best learning rate stay where it is as training gets longer? muP transfers a rate over widths, "
+        "not over horizons.",
         gain="its learning rate",
         title="Learning rate and horizon",
         base=counted(longest, "step"),

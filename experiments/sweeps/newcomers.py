@@ -62,9 +62,9 @@ def plan(study: Study) -> Sweep:
         "the mixture",
         draw_judged(study, study.seeds[0]),
         tuple(points),
-        question=f"Do newcomers with much data help robots with {designs.poor} trajectories each? These are {alone} "
-        "robots, drawn anew for every seed; they see as many windows at every point, but where they are trained alone "
-        "for as long as with all others.",
+        question=f"Do newcomers with much data help robots with {designs.poor} trajectories each? {alone} robots "
+        "are judged, drawn anew for every seed. They see as many windows at every point, except where they are trained "
+        "alone for as long as with all others.",
         gain="newcomers",
         title="Poor robots and newcomers",
         labels=tuple(labels),

@@ -48,8 +48,8 @@ def plan(study: Study) -> Sweep:
         axis="setting",
         variants={name: partial(under, setting) for setting, name in NAMES.items()},
         default=NAMES[default],
-        question="Does it help a video model to be told the actions, or to predict them too? Passive "
-        "prediction sees no actions, so that its ΔPSNR is zero by construction.",
+        question="Does it help a video model to see the actions, or to predict them too? Passive "
+        "prediction sees no actions, so its ΔPSNR is zero by construction.",
         gain="knowing actions",
         title="Ablation: dynamics setting",
     )

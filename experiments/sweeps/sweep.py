@@ -239,6 +239,8 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
 
 
 def all_steps(sweeps: Sequence[Sweep]) -> str:
-    """How many steps trials take, in words: '300 or 1,000 steps'."""
+    """How many steps trials take, in words: '300 or 1,000 steps'; of more than three, '300 to 1,000 steps'."""
     *fewer, most = sorted({point.trial.train.steps for sweep in sweeps for point in sweep.points})
+    if len(fewer) > 2:
+        return f"{fewer[0]:,} to {counted(most, 'step')}"
     return " or ".join([*(f"{n:,}" for n in fewer), counted(most, "step")])

@@ -27,9 +27,9 @@ def plan(study: Study) -> Sweep:
         name="transfer",
         axis="robots in the mixture, windows of the judged fixed",
         steps={count: study.train.steps * count // counts[-1] for count in counts},
-        question="Do other robots' data help, when none is taken away from those that are judged? These are "
-        f"{study.designs.judged} robots, drawn anew for every seed; at every point they see the same number of windows, "
-        "and compute grows.",
+        question="Do other robots' data help when the judged robots keep all of theirs? "
+        f"{study.designs.judged} robots are judged, drawn anew for every seed. They see the same number of windows at every "
+        "point, and compute grows.",
         gain="more robots",
     )
 

@@ -226,9 +226,9 @@ def test_questions_say_what_the_study_does():
     few = replace(CPU_FULL, designs=designs)
     for axis in ("dilution", "transfer", "newcomers"):
         question = find_axis(axis)(few).question
-        assert "3 robots, drawn anew" in question and "five" not in question.lower()
+        assert "3 robots are judged, drawn anew" in question and "five" not in question.lower()
     branches = find_axis("horizon")(few).question
-    assert "one run, whose rate decays" in branches and "Those of 9,000 steps are of one seed" in branches
+    assert "one run, whose rate decays" in branches and "Points of 9,000 steps have one seed" in branches
     cosine = replace(few.train, optimizer=replace(few.train.optimizer, schedule="cosine"))
     assert "one run" not in find_axis("horizon")(replace(few, train=cosine)).question
     assert "is too low" not in find_axis("compute")(few).question

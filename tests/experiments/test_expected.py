@@ -154,7 +154,7 @@ def test_the_page_shows_both_at_the_axis(study):
     page = workspace.report.read_text()
     axis, elsewhere = page.index("<h3>Width</h3>"), page.index("<h2>Elsewhere</h2>")
     of_axis = page[axis : page.index("</section>", axis)]
-    assert "1 of 2 intervals hold what came" in of_axis and "<code>abc1234</code>" in of_axis
+    assert "1 of 2 intervals contain the outcome" in of_axis and "<code>abc1234</code>" in of_axis
     assert "8 beside 16" in of_axis and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
     assert "<strong>Wide</strong> pays &lt;script&gt;." in of_axis and "<td>1</td>" in of_axis
     assert "its figure" not in page and axis < elsewhere

@@ -146,7 +146,7 @@ def test_page_is_self_contained_and_names_what_failed(drawn):
     assert page.count("data:image/png;base64,") >= 1 + 3 * 3  # curves, and three strips of three datasets
     assert 'class="diverged"' in page and "the loss is &lt;nan&gt; at step 2; output in trials/" in page
     assert str(drawn.root) not in page
-    for fact in ("hma study", PROVENANCE.tokenizer, "abacus", "1 trial(s) have no result"):
+    for fact in ("hma study", PROVENANCE.tokenizer, "abacus", "1 trial has no result"):
         assert fact in page
 
 
@@ -345,7 +345,7 @@ def test_what_is_not_the_reference_is_not_called_so(tmp_path, monkeypatch):
     workspace = finished_study(tmp_path, study, axes=("settings",))
     draw(workspace, record_of(study, ("settings",)))
     text = workspace.report.read_text().split("<details><summary>Configuration")[0]
-    for name in ("perplexity, {}", "ΔPSNR, {}", "What it predicts ({})", "first ({})", "robots the {} does"):
+    for name in ("perplexity, {}", "ΔPSNR, {}", "What it predicts ({})", "first ({})", "robots the {} is ahead"):
         assert name.format("default of settings") in text, name
     assert ", reference" not in text and "perplexity, untrained" not in text
 
@@ -395,7 +395,7 @@ def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():
         windows = windows_of(trial)
         alone[id] = replace(windows, episode=np.zeros_like(windows.episode), start=np.arange(len(windows)))
     said = describe(sweep, [], [], AxisStatistics(changes=find_changes([sweep], PROVENANCE, alone)))
-    assert "nats per token \u22120." in said and "One held-out episode per robot tells no interval." in said
+    assert "nats per token \u22120." in said and "One held-out episode per robot gives no interval." in said
     assert "nan" not in said
 
 

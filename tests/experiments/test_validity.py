@@ -23,8 +23,8 @@ from tests.experiments.judged import WIDE, judged_study
 SMALL = replace(WIDE, widths=(8, 16))
 ITEMS = ("trial", "seeds", "numbers", "untrained", "controls", "copying")
 NAMES = dict(zip(ITEMS, (
-    "Every planned trial is here", "At least 3 seeds", "Every number follows", "An untrained model knows nothing",
-    "Without true actions, ΔPSNR vanishes", "Predicting beats copying",
+    "Every planned trial is finished", "At least 3 seeds", "Every number follows", "An untrained model is at chance",
+    "Trained without true actions, ΔPSNR is zero", "Prediction beats copying",
 ), strict=True))  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def test_tables_have_the_control_and_what_changes_along_the_axis(study):
     assert len(errors[POINT]) == len(errors[CONTROL]) == 3
     assert max(errors[POINT]) > 10 and max(map(abs, errors[CONTROL])) < 4
     page = workspace.report.read_text()
-    assert "From 8 to 16, window by window: nats per token \u22120." in page and "seeds (3) and episodes" in page
+    assert "From 8 to 16, paired by window: nats per token \u22120." in page and "seeds (3) and episodes" in page
 
 
 def test_drawing_again_changes_no_byte_of_the_tables(copied):
@@ -214,7 +214,7 @@ def test_a_control_of_one_episode_per_robot_leaves_the_question_open(copied):
     workspace.results.unlink()
     draw(workspace, record)
     assert verdicts(workspace)["controls"] == (
-        "open", ".</b> Of 1 of 1 controls nobody knows the error: one episode per robot tells none.",
+        "open", ".</b> The errors of 1 of 1 controls are unknown: one episode per robot gives none.",
     )  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def test_robots_worse_than_copying_are_named(copied):
     verdict, text = verdicts(workspace)["copying"]
     assert (
         verdict == "bad"
-        and "On 2 of 3 robots the reference does, on 2 by more" in text
+        and "On 2 of 3 robots the reference is ahead, on 2 by more" in text
         and f"Not on {SMALL.datasets[2]}" in text
     )
 

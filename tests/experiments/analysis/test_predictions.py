@@ -82,7 +82,7 @@ def test_a_prediction_comes_true(root, capsys):
     assert width < 0.1 * prediction.mean and abs(outcome.observed - prediction.mean) < width
     draw(Workspace(root), load_record(Workspace(root)))
     page = (root / "report.html").read_text()
-    assert "A prediction written down before." in page and "Written down before" in page
+    assert "A preregistered prediction holds." in page and "Preregistered predictions" in page
 
 
 def test_nothing_is_predicted_of_a_trial_that_exists(root, capsys):
@@ -173,7 +173,7 @@ def test_a_position_that_is_no_whole_number_is_said_as_it_is():
     """A quarter of the data was 'at 0 part of the data'."""
     made = Prediction("own", ("part of the data",), (0.25,), ("a",), 3.0, 2.9, 3.1, 0.9, "", {}, {}, ())
     outcome = Outcome(made, None, 0, ())
-    assert "own at 0.25 part of the data: 3.000" in _prediction(outcome).text
+    assert "own at 0.25 part of the data: predicted 3.000" in _prediction(outcome).text
     assert "<td class=text>0.25 part of the data</td>" in describe_fits([], None, [outcome], "")
     assert replace(made, x=(132480.0,), axes=("trunk parameters",)).position == "132,480 trunk parameters"
 
