@@ -86,7 +86,7 @@ def _draw_outcome(panel: Axes, outcome: Outcome) -> None:
         elinewidth=1.6, zorder=4, label="predicted before it ran",
     )  # fmt: skip
     if outcome.observed is not None:
-        panel.plot(p.x[0], outcome.observed, "*", color=INK, markersize=11, zorder=5, label="what came")
+        panel.plot(p.x[0], outcome.observed, "*", color=INK, markersize=11, zorder=5, label="observed")
 
 
 def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
