@@ -103,6 +103,10 @@ def make_panel(points: Sequence[dict[int, WindowTable]], metric: str, robots: Se
     return Panel(first.dataset, first.episode, rows, tuple(tuple(seeds) for seeds in points))
 
 
+Sums = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""(sums of values [all seeds, episodes], windows [episodes], where each robot's episodes end [robots])."""
+
+
 @dataclass(frozen=True)
 class Draws:
     """What resampling makes of each point: `value` [points] as measured, `drawn` [draws, points]."""
@@ -112,15 +116,17 @@ class Draws:
 
 
 def resample(
-    panel: Panel, draws: int = DRAWS, seed: int = 0, *, over_seeds: bool = True, over_episodes: bool = True
-) -> Draws:
+    panel: Panel, draws: int = DRAWS, seed: int = 0, *, over_seeds: bool = True, over_episodes: bool = True,
+    by_episode: Sums | None = None,
+) -> Draws:  # fmt: skip
     """The mean over robots of each point, as measured and in `draws` resamples; a pure function of its arguments.
+    `by_episode` is the panel's, where it is known already.
 
     A point of one seed keeps it: its draws say nothing of seeds. A robot of one episode cannot be resampled; it
     takes the deviation of another robot, drawn anew each time and scaled to one episode, as `stratified` does.
     """
     rng = np.random.default_rng(seed)
-    sums, counts, ends = _by_episode(panel)
+    sums, counts, ends = by_episode or _by_episode(panel)
     value = _mean_of_robots(sums, counts, ends)  # [all seeds of all points]
     if over_episodes:
         episode_weights, rng.bit_generator.state = _episode_weights(tuple(np.diff(ends, prepend=0)), draws, seed)
@@ -149,11 +155,11 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list
     one seed (`intervals.overall`). Three seeds that happen to agree then make no interval narrow, as one from the
     quantiles of the draws would be.
     """
+    sums, counts, ends = summed = _by_episode(panel)
     both, by_seed, by_episode = (
-        resample(panel, draws, seed, over_seeds=s, over_episodes=e).drawn.std(0, ddof=1)
+        resample(panel, draws, seed, over_seeds=s, over_episodes=e, by_episode=summed).drawn.std(0, ddof=1)
         for s, e in ((True, True), (True, False), (False, True))
     )
-    sums, counts, ends = _by_episode(panel)
     episodes, value, intervals, row = sums.shape[1], _mean_of_robots(sums, counts, ends), [], 0
     for i, seeds in enumerate(panel.seeds):
         own = slice(row, row + len(seeds))
@@ -168,21 +174,25 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list
     return intervals
 
 
-def _by_episode(panel: Panel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(sums of values [all seeds, episodes], windows [episodes], where each robot's episodes end [robots])."""
+def _by_episode(panel: Panel) -> Sums:
     robots = list(dict.fromkeys(panel.robot.tolist()))
     number = {robot: i for i, robot in enumerate(robots)}
     code = np.asarray([number[r] for r in panel.robot.tolist()])
-    names, which = np.unique(np.stack([code, panel.episode]), axis=1, return_inverse=True)
-    values, episodes = np.concatenate(panel.points), names.shape[1]
-    sums = np.stack([np.bincount(which.ravel(), weights=row, minlength=episodes) for row in values])
-    counts = np.bincount(which.ravel(), minlength=episodes).astype(np.float64)
-    return sums, counts, np.cumsum(np.bincount(names[0], minlength=len(robots)))
+    # By robot, then by episode; one number is sorted faster than a pair.
+    episodes, own = np.unique(panel.episode, return_inverse=True)
+    names, which = np.unique(code * len(episodes) + own, return_inverse=True)
+    sums = np.stack([np.bincount(which, weights=row, minlength=len(names)) for row in np.concatenate(panel.points)])
+    counts = np.bincount(which, minlength=len(names)).astype(np.float64)
+    return sums, counts, np.cumsum(np.bincount(names // len(episodes), minlength=len(robots)))
 
 
 def _mean_of_robots(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    starts = np.r_[0, ends[:-1]]
+    starts = _starts(ends)
     return (np.add.reduceat(sums, starts, axis=1) / np.add.reduceat(counts, starts)).mean(1)
+
+
+def _starts(ends: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0], ends[:-1]])
 
 
 def _freedom(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> float:
@@ -191,7 +201,7 @@ def _freedom(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> float:
     0 if no robot has two episodes, infinite if no two of a robot's differ.
     """
     estimates = []
-    for start, end in zip(np.r_[0, ends[:-1]], ends, strict=True):
+    for start, end in zip(_starts(ends), ends, strict=True):
         if (freedom := end - start - 1) > 0:
             own_sums, own_counts = sums[start:end], counts[start:end]
             apart = own_sums - own_counts * own_sums.sum() / own_counts.sum()
@@ -205,7 +215,7 @@ def _resample_episodes(
 ) -> np.ndarray:
     """[draws, all seeds]: the mean over robots, of which each has other episodes in every draw."""
     means, known, alone, draws = [], [], [], len(weights[0])
-    for start, end, weight in zip(np.r_[0, ends[:-1]], ends, weights, strict=True):
+    for start, end, weight in zip(_starts(ends), ends, weights, strict=True):
         own_sums, own_counts = sums[:, start:end], counts[start:end]
         measured = own_sums.sum(1) / own_counts.sum()
         if end - start == 1:

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.stats
 
 from experiments.analysis.measured import Measurements
-from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, predict_log
+from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, fit_values, predict_log
 
 DRAWS, LEVEL = 1000, 0.90
 MIN_POSITIONS = 4
@@ -219,8 +219,7 @@ def _first_position(
     if len(measured.axes) > 1 or len(np.unique(x[keep])) < MIN_POSITIONS:
         return ()
     log_x = np.log(measured.x[keep])
-    values = measured.value[keep]
-    theta, _ = fit_draws(log_x - log_x.mean(0), values, values[None], weight[keep])
+    theta = fit_values(log_x - log_x.mean(0), measured.value[keep], weight[keep])
     alpha = next(c for c in coefficients if c.name == "alpha")
     if alpha.low <= theta[2] <= alpha.high:
         return ()

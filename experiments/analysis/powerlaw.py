@@ -53,9 +53,11 @@ def predict_log(theta: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 def _terms(theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(share of E and of each term in L [1 + K, ..., n], log L [..., n])."""
-    k = z.shape[1]
-    terms = [theta[..., 1 + i, None] - theta[..., 1 + k + i, None] * z[:, i] for i in range(k)]
-    terms = np.stack([np.broadcast_to(theta[..., :1], terms[0].shape), *terms])
+    n, k = z.shape
+    terms = np.empty((1 + k, *theta.shape[:-1], n))
+    terms[0] = theta[..., :1]
+    for i in range(k):
+        terms[1 + i] = theta[..., 1 + i, None] - theta[..., 1 + k + i, None] * z[:, i]
     top = terms.max(0)
     shares = np.exp(terms - top)
     total = shares.sum(0)
@@ -70,7 +72,11 @@ def huber(r: np.ndarray) -> np.ndarray:
 
 def objective(theta: np.ndarray, z: np.ndarray, log_y: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """What is minimised, for parameters [..., p] and values [..., n]: [...]."""
-    return huber(weight * (predict_log(theta, z) - log_y)).sum(-1)
+    return _objective(predict_log(theta, z), log_y, weight)
+
+
+def _objective(log_prediction: np.ndarray, log_y: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return huber(weight * (log_prediction - log_y)).sum(-1)
 
 
 def bounds_of(log_y: np.ndarray, terms: int) -> Bounds:
@@ -100,19 +106,23 @@ def minimise(
 ) -> tuple[np.ndarray, np.ndarray]:
     """From starts [R, p] for values [R, n], each on its own: (parameters [R, p], objective [R])."""
     theta = np.clip(theta, bounds.low, bounds.high)
-    best = objective(theta, z, log_y, weight)
+    shares, log_prediction = _terms(theta, z)
+    best = _objective(log_prediction, log_y, weight)
     damping = np.full(len(theta), 1e-2)
     active = np.arange(len(theta))
     idle = np.zeros(len(theta), int)
     for _ in range(STEPS):
-        now, y = theta[active], log_y[active]
-        step = _step(now, z, y, weight, bounds, damping[active])
-        trial = np.clip(now + step, bounds.low, bounds.high)
-        value = objective(trial, z, y, weight)
-        better = value < best[active]
-        gain = best[active] - value
-        small = better & (gain <= 1e-9 * (best[active] + DELTA**2))
-        theta[active[better]], best[active[better]] = trial[better], value[better]
+        now, y, so_far = theta[active], log_y[active], best[active]
+        r = weight * (log_prediction[active] - y)
+        step = _step(now, shares[:, active], r, z, weight, bounds, damping[active])
+        trial = np.minimum(np.maximum(now + step, bounds.low), bounds.high)
+        trial_shares, trial_prediction = _terms(trial, z)
+        value = _objective(trial_prediction, y, weight)
+        better = value < so_far
+        small = better & (so_far - value <= 1e-9 * (so_far + DELTA**2))
+        taken = active[better]
+        theta[taken], best[taken] = trial[better], value[better]
+        shares[:, taken], log_prediction[taken] = trial_shares[:, better], trial_prediction[better]
         damping[active] = np.clip(np.where(better, damping[active] / 5, damping[active] * 4), 1e-12, 1e12)
         idle[active] = np.where(better & ~small, 0, idle[active] + 1)
         active = active[idle[active] < 8]
@@ -122,22 +132,36 @@ def minimise(
 
 
 def _step(
-    theta: np.ndarray, z: np.ndarray, log_y: np.ndarray, weight: np.ndarray, bounds: Bounds, damping: np.ndarray
-) -> np.ndarray:
-    """A damped step on the reweighted squares, for each of [R, p]; none across a bound that it stands at."""
-    shares, log_prediction = _terms(theta, z)
-    r = weight * (log_prediction - log_y)
-    by_alpha = [-share * column for share, column in zip(shares[1:], z.T, strict=True)]
-    jacobian = weight[:, None] * np.stack([*shares, *by_alpha], axis=-1)  # [R, n, p]
+    theta: np.ndarray, shares: np.ndarray, r: np.ndarray, z: np.ndarray, weight: np.ndarray, bounds: Bounds,
+    damping: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """A damped step on the reweighted squares, for each of [R, p]; none across a bound that it stands at. `shares`
+    [1 + K, R, n] as `_terms` has them, weighted residuals `r` [R, n]."""
+    terms = len(shares)
+    jacobian = np.empty((*r.shape, theta.shape[-1]))  # [R, n, p]
+    for i, share in enumerate(shares):
+        jacobian[..., i] = share
+    for i, share in enumerate(shares[1:]):
+        jacobian[..., terms + i] = -share * z[:, i]
+    jacobian *= weight[:, None]
     reweighted = np.minimum(1.0, DELTA / np.maximum(np.abs(r), 1e-12))[..., None]
     gradient = ((reweighted * r[..., None]).swapaxes(1, 2) @ jacobian)[:, 0]
     blocked = ((theta <= bounds.low) & (gradient > 0)) | ((theta >= bounds.high) & (gradient < 0))
-    jacobian = np.where(blocked[:, None, :], 0.0, jacobian)
-    hessian = (jacobian * reweighted).swapaxes(1, 2) @ jacobian
-    diagonal = np.einsum("rpp->rp", hessian)
-    ridge = damping[:, None] * (diagonal + 1e-10 * diagonal.max(-1, keepdims=True)) + 1e-30 + blocked
-    damped = hessian + ridge[..., None] * np.eye(theta.shape[-1])
+    jacobian[np.broadcast_to(blocked[:, None], jacobian.shape)] = 0.0
+    damped = (jacobian * reweighted).swapaxes(1, 2) @ jacobian
+    diagonal = np.einsum("rpp->rp", damped)  # a view
+    diagonal += damping[:, None] * (diagonal + 1e-10 * diagonal.max(-1, keepdims=True)) + 1e-30 + blocked
     return -np.linalg.solve(damped, np.where(blocked, 0.0, gradient)[..., None])[..., 0]
+
+
+def fit_values(z: np.ndarray, y: np.ndarray, weight: np.ndarray, bounds: Bounds | None = None) -> np.ndarray:
+    """Parameters [p] of the values `y` [n], within `bounds` (None: those of the values)."""
+    log_y = np.log(y)
+    bounds = bounds or bounds_of(log_y, z.shape[1])
+    grid = np.clip(starts(log_y, z), bounds.low, bounds.high)
+    first = np.argsort(objective(grid, z, log_y, weight))[:40]
+    candidates, values = minimise(grid[first], z, np.repeat(log_y[None], len(first), 0), weight, bounds)
+    return candidates[np.argmin(values)]
 
 
 def fit_draws(z: np.ndarray, y: np.ndarray, draws: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -145,9 +169,7 @@ def fit_draws(z: np.ndarray, y: np.ndarray, draws: np.ndarray, weight: np.ndarra
     log_y, log_draws = np.log(y), np.log(draws)
     bounds = bounds_of(np.concatenate([log_y[None], log_draws]), z.shape[1])
     grid = np.clip(starts(log_y, z), bounds.low, bounds.high)
-    first = np.argsort(objective(grid, z, log_y, weight))[:40]
-    candidates, values = minimise(grid[first], z, np.repeat(log_y[None], len(first), 0), weight, bounds)
-    best = candidates[np.argmin(values)]
+    best = fit_values(z, y, weight, bounds)
     # Each draw from the fit of the values themselves and from the grid's best point for it.
     cost = np.stack([objective(g, z, log_draws, weight) for g in grid])  # [G, R]
     both = np.concatenate([np.repeat(best[None], len(draws), 0), grid[np.argmin(cost, 0)]])
