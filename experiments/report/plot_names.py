@@ -26,7 +26,7 @@ CAPTION = (
     "dashed: the default trained on shuffled actions, one seed{whose}"
 )
 JUDGED = {False: "all judged on the same windows", True: "each judged on robots of its own"}
-WHOSE = {False: "", True: " and its robots: not to be held against means"}
+WHOSE = {False: "", True: " and its robots: do not compare it with the means"}
 """Both by whether judged robots are drawn anew for every seed."""
 
 

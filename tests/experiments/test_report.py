@@ -311,7 +311,7 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
         said = describe(sweep, [], [], AxisStatistics())
         assert ("each judged on robots of its own" in caption) == ("robots of its own, all variants" in said) == own
         assert ("all judged on the same windows" in caption) != own
-        assert ("one seed and its robots: not to be held against means" in caption) == own
+        assert ("one seed and its robots: do not compare it with the means" in caption) == own
 
 
 def test_robots_that_are_others_for_every_seed_are_shown_of_the_seed_that_judges_them():
