@@ -157,16 +157,16 @@ def _doubts(summary: dict[str, Any]) -> list[str]:
 
 
 NOTHING = (
-    "Nothing outside the model was compared: there is no true simulator, and no counts of the real robot were given "
-    "(--real). The rates above are those of the model and of who tells success in its frames; "
-    "either may be wrong, of a policy that goes where no recording went most of all. A policy that does as well in the "
-    "control, where another episode's actions are executed, does not succeed by what it does."
+    "The rates are compared with nothing outside the model: there is no true simulator, and no success counts of the real "
+    "robot were given (--real). They come from the model and from the success head on its frames; either may be wrong, most "
+    "of all for a policy that goes where no recording went. If a policy does as well in the control, where another "
+    "episode's actions are executed, its success does not come from its actions."
 )
 
 
 def _agreement(summary: dict[str, Any]) -> str:
     if not summary["agreement"]:
-        return section("Compared with nothing", f"<p><b>{html.escape(NOTHING)}</b></p>")
+        return section("No reference", f"<p><b>{html.escape(NOTHING)}</b></p>")
     measures = list(next(iter(summary["agreement"].values()))["starts"])
     agreed = [
         [html.escape(name), html.escape(over), *(shown(agreement[over][m]) for m in measures)]
@@ -179,13 +179,13 @@ def _agreement(summary: dict[str, Any]) -> str:
         return section(
             "Agreement with the real robot",
             heading,
-            f"<p>Of the {len(counted)} policies that were counted there. Other starts of the model stand beside other "
-            "episodes of the robot, drawn from its rates.</p>",
+            f"<p>Over the {len(counted)} policies with counts of the robot. Intervals over starts resample those of the model "
+            "and draw the robot's successes anew from its rates.</p>",
         )
     return section(
         "Agreement with the true simulator",
         heading,
-        "<p>Model and truth say the same of a policy's episode from a start: "
+        "<p>Share of episodes, by policy and start, with the same outcome in the model and in the true simulator: "
         + "; ".join(f"{html.escape(name)} {shown(x)}" for name, x in summary["episodes alike"].items())
         + ".</p>",
     )
@@ -196,7 +196,7 @@ def _head(summary: dict[str, Any]) -> str:
     return section(
         "The success head",
         f"<p>{html.escape(describe_head(summary))} {html.escape(describe_recorded_head(summary['head']))}</p>"
-        f"<p>Episodes per second, this machine as loaded as it was: {html.escape(rates)}.</p>",
+        f"<p>Episodes per second, beside whatever else the machine did: {html.escape(rates)}.</p>",
     )
 
 
@@ -204,12 +204,12 @@ def describe_head(summary: dict[str, Any]) -> str:
     """A sentence on the accuracy of the success head, or of the user's function, on held-out episodes."""
     measured = summary["head"]
     usual = max(measured["positive"], 1 - measured["positive"])
-    doubt = "" if measured["frame accuracy"] > usual else " It does no better: do not trust the rates that it tells."
+    doubt = "" if measured["frame accuracy"] > usual else " It is no better than that: do not trust the rates."
     return (
         f"{'That of the file with the policies. ' if summary['own success'] else ''}"
         f"On {measured['episodes']:.0f} recorded {'' if 'successes' in measured else 'true '}episodes that no head was "
         f"trained on: accuracy of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of "
-        f"episodes {measured['episode accuracy']:.3f}. To call every frame the same would be right in {usual:.3f}.{doubt}"
+        f"episodes {measured['episode accuracy']:.3f}. The more frequent label is right for {usual:.3f} of the frames.{doubt}"
     )
 
 
@@ -220,8 +220,8 @@ def describe_control(summary: dict[str, Any]) -> str:
         return ""
     return (
         "It is not known that policies succeed more often in the model than in the control, where another episode's actions "
-        f"are executed: they do by {shown(above)} on average over policies. If it is not so, the rates do not show what "
-        "policies do, whatever they are compared with, or all starts are alike: look at the clips."
+        f"are executed: the difference is {shown(above)} on average over policies. If there is none, the rates do not show "
+        "what policies do, whatever they are compared with, or all starts are alike: look at the clips."
     )
 
 
@@ -232,23 +232,23 @@ def describe_recorded_head(measured: dict[str, float]) -> str:
     n, good = round(measured["episodes"]), round(measured["successes"])
     correct = round(measured["successes told"]), round(measured["failures told"])
     accuracy, usual = count_interval(sum(correct), n), max(good, n - good) / n
-    doubt = "" if accuracy.low > usual else " By these few it is not known to be better: do not trust the rates."
+    doubt = "" if accuracy.low > usual else " So few do not show that it is better: do not trust the rates."
     learnt = (
-        f"It learnt from {measured['learnt from']:.0f} recordings, {measured['successes among them']:.0f} of them successes; "
+        f"It was trained on {measured['learnt from']:.0f} recordings, {measured['successes among them']:.0f} of them successes; "
         if "learnt from" in measured
         else "Of the recordings "
     )
     taken = (
-        " No recording says at which frames its goal is reached. It was taken for granted that none of a failure shows it, nor "
-        f"one of the first half of a success, and that the last {measured[LAST]:.0f} of a success do: where a failure passes "
-        "its goal, or a success is there early, the head was taught wrong. Rewards of every step (--reward) would say."
+        " No recording says at which frames its goal is reached. Assumed is that no frame of a failure shows it, none of the "
+        f"first half of a success, and each of the last {measured[LAST]:.0f} of a success. Where a failure passes its goal, or "
+        "a success reaches it early, the head was trained on wrong labels; rewards of every step (--reward) avoid this."
         if LAST in measured
         else ""
     )
     return (
-        f"It tells {correct[0]} of {good} successes and {correct[1]} of {n - good} failures: {accuracy.mean:.2f} "
-        f"({accuracy.low:.2f} to {accuracy.high:.2f}) of all, {measured['episode accuracy, decoded']:.2f} when they are "
-        f"shown as the model's tokenizer draws them. To call every one the same would be right in {usual:.2f}.{doubt} {learnt}"
+        f"It recognises {correct[0]} of {good} successes and {correct[1]} of {n - good} failures: {accuracy.mean:.2f} "
+        f"({accuracy.low:.2f} to {accuracy.high:.2f}) of all, {measured['episode accuracy, decoded']:.2f} of them as the "
+        f"model's tokenizer decodes them. The more frequent outcome is right for {usual:.2f} of them.{doubt} {learnt}"
         f"left out were {measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short.{taken}"
     )
 

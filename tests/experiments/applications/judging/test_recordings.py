@@ -84,9 +84,9 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     out = tmp_path / "out"
     assert judge(study, out, "--frames", "3") == 0
     told = said(capsys)
-    assert "Nothing outside the model was compared" in told and "wild (100%)" in told
-    assert "taken for granted that none of a failure shows it, nor one of the first half" in told
-    assert "and that the last 2 of a success do" in told
+    assert "compared with nothing outside the model" in told and "wild (100%)" in told
+    assert "Assumed is that no frame of a failure shows it, none of the first half" in told
+    assert "and each of the last 2 of a success" in told
     rows = read_outcomes(out / "outcomes.csv")
     policies, starts = (
         ("random", "hma", "low", "high", "wild"),
@@ -103,7 +103,7 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     assert (head["episodes"], head["successes"], head["learnt from"], head["successes among them"]) == (4, 2, 15, 7)
     page = (out / "judge.html").read_text()
     assert "--split train" in page and not any(flag in page for flag in ("--demonstrations", "--steps", "--cloned"))
-    assert "Nothing outside the model was compared" in page and "true" not in page.split("<h1>")[1].split("<pre>")[
+    assert "compared with nothing outside the model" in page and "true" not in page.split("<h1>")[1].split("<pre>")[
         0
     ].replace("true simulator", "")
     first = load_rollout(out / "rollouts" / "low.learned.npz")
@@ -120,7 +120,7 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     assert summary["policies"]["high"]["real robot"]["mean"] == 0.9
     assert summary["policies"]["hma"]["real robot"]["mean"] is None
     page = (out / "judge.html").read_text()
-    assert "Agreement with the real robot" in page and "Nothing outside" not in page and "--real" in page
+    assert "Agreement with the real robot" in page and "nothing outside" not in page and "--real" in page
     assert "agreement with real robot" in said(capsys)
 
 
@@ -132,11 +132,11 @@ def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp
     file.write_text(POLICIES + "\n\ndef success(images, first):\n    return np.ones(len(images), bool)\n")
     for _ in range(2):  # what is finished is found again
         assert judge(study, out, "--frames", "3", "--policies", str(file)) == 0
-        assert "It tells 2 of 2 successes and 0 of 2 failures" in said(capsys)
+        assert "It recognises 2 of 2 successes and 0 of 2 failures" in said(capsys)
     assert [path.name for path in (out / "head").iterdir()] == ["measured.json"]
     assert all(o.success for o in read_outcomes(out / "outcomes.csv"))
     page = (out / "judge.html").read_text()
-    assert "That of the file with the policies." in page and "It learnt from" not in page
+    assert "That of the file with the policies." in page and "It was trained on" not in page
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp
     # From the third frame on: of one held-out success two without the goal, then five at it; of the other seven.
     assert head["frames"] == 4 * 7 and head["positive"] == pytest.approx((5 + 7) / 28)
     assert load_rollout(out / "rollouts" / "low.learned.npz").images.shape[0] == 3
-    assert "--reward 1.0" in (out / "judge.html").read_text() and "taken for granted" not in said(capsys)
+    assert "--reward 1.0" in (out / "judge.html").read_text() and "Assumed is" not in said(capsys)
     assert judge(study, tmp_path / "none", *asked, "2") == 2
     assert "of 20 recordings 0 succeeded and 20 failed" in said(capsys, error=True)
     always = write_rlds(tmp_path / "all", SPEC, [9] * 20, rewards=lambda i: np.r_[np.ones(3), np.full(6, i < 10)])
@@ -333,7 +333,7 @@ def test_success_that_does_not_hang_on_what_policies_do_is_told():
     ]
     assert "not known that policies succeed more often in the model than in the control" in told[0] and told[1] == ""
     unsure = {"above the control": {"mean": 0.3, "low": -0.02, "high": 0.6}}
-    assert "they do by 0.30 (-0.02 to 0.60) on average" in describe_control(unsure), (
+    assert "the difference is 0.30 (-0.02 to 0.60) on average" in describe_control(unsure), (
         "few starts are no proof of the contrary"
     )
 
@@ -353,5 +353,5 @@ def test_a_head_that_is_no_better_than_always_saying_the_same_is_told():
 def test_whoever_tells_success_no_better_than_always_the_same_is_told():
     measured = {"positive": 0.3, "frame accuracy": 0.71, "frame AUROC": 0.6, "episodes": 40.0, "episode accuracy": 0.7}
     said = [describe_head({"head": measured | {"frame accuracy": x}, "own success": True}) for x in (0.71, 0.7)]
-    assert all("To call every frame the same would be right in 0.700" in one for one in said)
+    assert all("The more frequent label is right for 0.700 of the frames" in one for one in said)
     assert "do not trust" not in said[0] and "do not trust" in said[1]
