@@ -4,10 +4,10 @@ Cost: half an hour of one core for forty robots, most of it the detector, which 
 Expected: what moved is found within 2 pixels of 32 of its true place in most last frames of a model that follows
           actions, in nearly none of a still picture.
 
-Held-out episodes of every robot that the suite can simulate go on from a prompt of `START_FRAMES` frames to the end of
-the model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR and
-this much. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it is not there
-yet.
+Held-out episodes of every robot that the suite can simulate go on from a prompt of `START_FRAMES` frames to the end
+of the model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR
+but much of this share. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it
+is not there yet.
 """
 
 from __future__ import annotations
