@@ -15,11 +15,11 @@ import pytest
 from experiments.applications import DRIVEN
 from experiments.presets import PRESETS
 from experiments.report.draw import draw_again
-from experiments.rows import read_rows
 from experiments.running.ledger import FINISHED
 from experiments.running.sealed import read_result
 from experiments.running.workspace import Workspace
 from hma_jax.training.runs import load_run
+from tests.experiments.committed_findings import rows_of
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
 STUDIES = sorted(path.parent.name for path in RESULTS.glob("*/study.json"))
@@ -42,7 +42,7 @@ def test_tables_are_those_that_were_kept():
 
 @pytest.mark.parametrize("name", sorted(p.parent.name for p in RESULTS.glob("*/results.csv")))
 def test_every_trial_of_a_table_is_finished_and_judged(name):
-    rows, trials = read_rows(Workspace(RESULTS / name)), Workspace(RESULTS / name).trials
+    rows, trials = rows_of(name), Workspace(RESULTS / name).trials
     assert {r.status for r in rows} == {FINISHED}
     assert all(r.metric for r in rows)
     assert len({r.manifest for r in rows}) == 1, "judged on different windows"

@@ -43,6 +43,19 @@ def root(before, tmp_path):
     return tmp_path / "study"
 
 
+@pytest.fixture(scope="module")
+def with_prediction(before, tmp_path_factory):
+    """The same once the loss at that width is predicted."""
+    root = shutil.copytree(before, tmp_path_factory.mktemp("predicted") / "study")
+    assert predict(root) == 0
+    return root
+
+
+@pytest.fixture
+def predicted(with_prediction, tmp_path):
+    return shutil.copytree(with_prediction, tmp_path / "study")
+
+
 def command(root, *words):
     return main(["fit", str(root), *words])
 
@@ -101,49 +114,45 @@ def test_nothing_is_predicted_of_a_trial_that_ran_and_was_removed(root, capsys):
     assert not (root / "predictions").exists()
 
 
-def test_a_prediction_is_not_made_twice(root, capsys):
-    assert predict(root) == 0 and predict(root) == 2
+def test_a_prediction_is_not_made_twice(predicted, capsys):
+    assert predict(predicted) == 2
     assert "is an earlier prediction, which is not overwritten" in capsys.readouterr().err
 
 
-def test_a_prediction_that_was_edited_is_refused(root, capsys):
-    predict(root)
-    [path] = (root / "predictions").glob("*.json")
+def test_a_prediction_that_was_edited_is_refused(predicted, capsys):
+    [path] = (predicted / "predictions").glob("*.json")
     values = json.loads(path.read_text())
     path.write_text(json.dumps(values | {"high": values["high"] * 1.001}))
-    assert command(root) == 2
+    assert command(predicted) == 2
     assert "was changed after it was written" in capsys.readouterr().err
     for other in ("null", "[]", "{}"):
         path.write_text(other)
-        assert command(root) == 2
+        assert command(predicted) == 2
         assert f"{path}: the prediction cannot be read" in capsys.readouterr().err
 
 
-def test_what_was_made_from_other_results_is_marked(root):
-    predict(root)
-    [prediction] = load_predictions(root / "predictions").values()
-    directory = root / "trials" / next(iter(prediction.inputs))
+def test_what_was_made_from_other_results_is_marked(predicted):
+    [prediction] = load_predictions(predicted / "predictions").values()
+    directory = predicted / "trials" / next(iter(prediction.inputs))
     result = json.loads((directory / RESULT).read_text())
     result.pop("hash")
     write_result(directory, result | {"parameters": 1})
-    [outcome] = read_numbers(Workspace(root), draws=20).outcomes
+    [outcome] = read_numbers(Workspace(predicted), draws=20).outcomes
     assert any("1 of the 15 results" in mark for mark in outcome.marks)
 
 
-def test_a_prediction_after_the_fact_is_marked(root):
-    predict(root)
-    [prediction] = load_predictions(root / "predictions").values()
-    run_the_rest(root)
+def test_a_prediction_after_the_fact_is_marked(predicted):
+    [prediction] = load_predictions(predicted / "predictions").values()
+    run_the_rest(predicted)
     late = replace(prediction, finished=(*prediction.finished, prediction.trials[0]))
-    save_prediction(root / "predictions" / "late.json", late)
-    marks = {o.prediction.finished: o.marks for o in read_numbers(Workspace(root), draws=20).outcomes}
+    save_prediction(predicted / "predictions" / "late.json", late)
+    marks = {o.prediction.finished: o.marks for o in read_numbers(Workspace(predicted), draws=20).outcomes}
     assert any("no prediction" in mark for mark in marks[late.finished]) and not marks[prediction.finished]
 
 
-def test_a_copy_of_a_prediction_counts_once(root):
+def test_a_copy_of_a_prediction_counts_once(predicted):
     """It was shown twice, as if two had come true."""
-    predict(root)
-    folder = root / "predictions"
+    folder = predicted / "predictions"
     [path] = folder.glob("*.json")
     shutil.copy(path, folder / "a_copy.json")
     [prediction] = load_predictions(folder).values()

@@ -60,6 +60,16 @@ def branches():
     return [Sweep("steps", "steps", ROBOTS, tuple(points))], windows, flops
 
 
+@pytest.fixture(scope="module")
+def fitted(branches):
+    """(fits of these, fits at equal compute), as `fit_study` and `fit_budgets` have them."""
+    sweeps, windows, flops = branches
+    return (
+        fit_study(sweeps, PROVENANCE, windows, draws=30),
+        fit_budgets(sweeps, PROVENANCE, windows, flops, draws=30),
+    )
+
+
 def test_only_the_parameters_that_robots_share_count():
     one = ModelConfig(width=32, layers=2, heads=2, tokens=16)
     assert trunk_parameters(replace(one, layers=4)) == pytest.approx(2 * trunk_parameters(one), rel=0.05)
@@ -116,17 +126,16 @@ def test_seeds_that_judge_other_robots_are_fitted_together(seeds):
     assert ("how hard these are is taken out" in " ".join(fitted.fit.doubts)) == (len(seeds) > 1)
 
 
-def test_branches_of_widths_make_a_surface(branches):
-    sweeps, windows, flops = branches
+def test_branches_of_widths_make_a_surface(branches, fitted):
+    sweeps, windows, _ = branches
     surface = surface_of(sweeps, PROVENANCE)
     assert len(surface) == len(windows) == 90
     curve = next(iter(surface.values()))[1]
     assert curve.axes == (TRUNK, WINDOWS) and len({p.run for p in curve.positions}) == 6
-    first, *_, joint = fit_study(sweeps, PROVENANCE, windows, draws=30)
+    (first, *_, joint), (measured, isoflop) = fitted
     assert first.curve.axes == ("steps",) and first.fit["alpha"].value == pytest.approx(0.4, abs=0.05)
     assert len(set(first.measured.run)) == 1  # one run, of which every step is a branch
     assert (joint.fit["alpha"].value, joint.fit["beta"].value) == (pytest.approx(0.4, abs=0.05),) * 2
-    measured, isoflop = fit_budgets(sweeps, PROVENANCE, windows, flops, draws=30)
     assert measured.axes == (TRUNK, FLOPS)
     assert isoflop.exponent.value == pytest.approx(0.5, abs=0.15)
 
@@ -135,10 +144,9 @@ def test_a_study_without_branches_has_no_surface():
     assert surface_of(plan_sweeps(WIDE, ("width", "trajectories")), PROVENANCE) == {}
 
 
-def test_the_page_shows_fits_and_what_was_refused(branches, tmp_path):
+def test_the_page_shows_fits_and_what_was_refused(branches, fitted, tmp_path):
     sweeps, windows, flops = branches
-    fits = fit_study(sweeps, PROVENANCE, windows, draws=30)
-    _, isoflop = fit_budgets(sweeps, PROVENANCE, windows, flops, draws=30)
+    fits, (_, isoflop) = fitted
     words = describe_fits(fits, isoflop, [], "")
     assert "N<sup>\u22120." in words and "D<sup>\u22120." in words and "The best size grows as C<sup>0." in words
     plot_fits(fits, [], tmp_path / "fits.png")
