@@ -1,7 +1,7 @@
 """The model of `make play`, small enough for the repository, and what it is worth.
 
 Command: hma train --preset play --out runs/play
-         python -m experiments.applications.ship runs/play/model --out runs/play/shipped --unmask-steps 8 --temperature 0.7
+         python -m experiments.applications.ship runs/play/model --out runs/shipped --unmask-steps 8 --temperature 0.7
 Cost: the first an hour and a half of one core and its tokenizer, resumed where it was stopped; the second three
       minutes. Of the model that is served: docs/simulator.md.
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
