@@ -6,8 +6,9 @@ Command: python -m experiments.applications.own_policy
 Cost: forty minutes of one core; goes on where it was stopped.
 Expected: well above random actions; no better than policies made for nothing else.
 
-The world model gets action heads and is post-trained, all of it, to predict what an expert does next (`masking.setting` is
-policy). The others are trained on the same episodes. All begin at the same starts, which no recording has.
+The world model gets action heads and is post-trained, all of it, to predict what an expert does next
+(`masking.setting` is policy). The others are trained on the same episodes. All begin at the same starts, which no
+recording has.
 
 Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts;
 run, the post-trained model, and its tokenizer: a policy, and no simulator any more.
