@@ -125,6 +125,8 @@ def tokenizer_loss(
 
 def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
     """(weighted sum, terms): losses that keep latents [B, S, bits] close to their codes, and all codes in use."""
+    if not (config.entropy_weight or config.commitment_weight):
+        z = jax.lax.stop_gradient(z)  # they are measured only: their gradient, all zeros, is not computed
     uncertainty, diversity = entropies(z, config.factors, config.entropy_temperature)
     commit = commitment(z)
     total = config.entropy_weight * (uncertainty - diversity) + config.commitment_weight * commit

@@ -7,6 +7,7 @@ from hma_jax.kernels.dense import (
     contract,
     from_actions,
     look_up,
+    multiply,
     per_robot,
     per_robot_from_actions,
     per_robot_to_actions,
@@ -33,6 +34,14 @@ def test_contract_sums_in_the_type_it_is_asked_for():
     x, w = jnp.full((1, 4096), 1, jnp.bfloat16), jnp.full((4096, 1), 1 + 2**-7, jnp.bfloat16)
     assert contract(x, w, 1, jnp.float32)[0, 0] == 4096 + 32
     assert contract(x, w).dtype == jnp.bfloat16
+
+
+@pytest.mark.parametrize("sizes", [(48, 256), (7, 5)], ids=str)
+def test_multiply_has_the_gradients_of_a_product_and_transposes_none(sizes: tuple):
+    x, w = drawn(0, 8, 4, 16, sizes[0]), drawn(1, *sizes)
+    check_equal(multiply, jnp.matmul, x, w, tolerance=1e-6)
+    programs = [str(jax.make_jaxpr(jax.grad(lambda w, f=f: f(x, w).sum()))(w)) for f in (multiply, jnp.matmul)]
+    assert ["transpose[" in program for program in programs] == [False, True]
 
 
 def one_by_one(x, w, robots):
