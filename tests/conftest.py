@@ -33,8 +33,6 @@ if tuple(map(int, version("jaxlib").split(".")[:3])) < (0, 11, 1):
 os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
 # Of each operation's origin one line: a tenth of the time.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "1")
-# Tracing makes millions of objects that live on: looking through them again and again took an eighth of all time.
-gc.set_threshold(100_000, 20, 20)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would not hear Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if "HMA_CACHE_DIR" not in os.environ:  # not the user's

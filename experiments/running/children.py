@@ -17,7 +17,7 @@ from pathlib import Path
 
 from experiments.running.slots import Slot
 from hma_jax.runtime.cores import usable_cores
-from hma_jax.runtime.host_memory import KEPT_PAGES, keep_freed_memory
+from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely, keep_freed_memory
 
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
 _PR_SET_PDEATHSIG = 1
@@ -55,6 +55,7 @@ def enter_child() -> None:
         os.sched_setaffinity(0, {int(c) for c in cores.split(",")})
     if usable_cores() == 1:
         keep_freed_memory()
+    collect_rarely()
     parent = int(os.environ.get(_PARENT, "0"))
     if parent:
         _die_with(parent)

@@ -1,4 +1,5 @@
-"""How a process holds host memory: in huge pages, and without returning freed memory to the kernel.
+"""How a process holds host memory: in huge pages, without returning freed memory to the kernel, and with few searches
+for garbage.
 
 XLA's CPU backend takes its temporary buffers anew for every call. glibc gives blocks of that
 size back to the kernel and asks for them again, and the page faults are then a third of a
@@ -10,6 +11,7 @@ one another: that is for processes of one core. docs/performance.md has the figu
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import platform
 import sys
@@ -23,6 +25,10 @@ TUNABLES = (
 
 KEPT_PAGES = {"GLIBC_TUNABLES": ":".join(TUNABLES)}
 """Environment that a process starts with to hold memory so; glibc reads it before anything of ours runs."""
+
+NEW_OBJECTS = 10_000
+"""Python looks for garbage when so many objects were made since, less those that were freed. At 700, its default, it
+took a tenth of the time of importing and tracing, which make millions of objects that stay."""
 
 # Names and numbers of malloc.h.
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
@@ -48,6 +54,12 @@ def keep_freed_memory() -> None:
     mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(_M_TOP_PAD, 64 * 2**20)
     mallopt(_M_ARENA_MAX, 1)
+
+
+def collect_rarely() -> None:
+    """Has Python look for garbage at `NEW_OBJECTS` only. Leaves a higher number alone, and 0, which is never."""
+    if 0 < gc.get_threshold()[0] < NEW_OBJECTS:
+        gc.set_threshold(NEW_OBJECTS)
 
 
 def _is_glibc() -> bool:

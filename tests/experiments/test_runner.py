@@ -1,5 +1,6 @@
 """The runner survives crashes, interruptions and its own death, and repeats nothing."""
 
+import gc
 import json
 import os
 import platform
@@ -18,7 +19,7 @@ from experiments.running.children import child_environment
 from experiments.running.ledger import Ledger
 from experiments.running.runner import TRIES, Job, Monitor, run_missing
 from hma_jax.runtime import locks
-from hma_jax.runtime.host_memory import KEPT_PAGES
+from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely
 from tests.experiments import fake_trial
 
 
@@ -203,6 +204,17 @@ def test_a_trial_that_lost_its_lease_stops_for_the_one_that_took_over(tmp_path, 
         with attempt(tmp_path), pytest.raises(trial_main.TakenOver, match="another attempt"):
             report("training", 2, 2)
     assert json.loads((tmp_path / "progress.json").read_text())["done"] == 1
+
+
+@pytest.mark.parametrize(("asked", "kept"), [(700, 10_000), (50_000, 50_000), (0, 0)])
+def test_garbage_is_looked_for_rarely_or_as_the_user_said(asked, kept):
+    before = gc.get_threshold()
+    try:
+        gc.set_threshold(asked)
+        collect_rarely()
+        assert gc.get_threshold()[0] == kept
+    finally:
+        gc.set_threshold(*before)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the setting is glibc's")
