@@ -22,6 +22,7 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     """And what the suite's simulator says of other actions, once it has given back what was recorded."""
     study = override(get_preset("smoke-continuous"), ["dataset_counts=1"])
     workspace, model = Workspace(tmp_path), study.model
+    monkeypatch.setattr("experiments.preparing.tokenizer.QUALITY_FRAMES", 8)
     prepare(study, workspace)
     prepared = open_prepared_data(workspace)
     store = prepared.store

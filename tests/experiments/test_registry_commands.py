@@ -35,6 +35,7 @@ from tests.experiments.fakes import PROVENANCE, STUDY
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
     monkeypatch.setattr(registry_table, "_registered", {})
+    monkeypatch.setattr("experiments.preparing.tokenizer.QUALITY_FRAMES", 8)
 
 
 @pytest.fixture
@@ -92,7 +93,6 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
     )
     tokenise = shlex.split(said.splitlines()[-1].removeprefix("next: hma "))
     small = ["--set", "tokenizer_train.steps=1", "--set", "store.min_val=2"]
-    monkeypatch.setattr("experiments.preparing.tokenizer.QUALITY_FRAMES", 8)
     assert main([*tokenise, *small]) == 0
 
 
