@@ -1,1 +1,27 @@
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+
+import pytest
+
+from data_pipelines.suite.simulator import suite_starts
+from experiments.applications import simulators
+from hma_jax.simulator.starts import Start
 from tests.hma_jax.simulator.compiled import shared_programs  # noqa: F401  a fixture
+
+
+@functools.cache
+def simulated(*what: object, **how: object) -> tuple[Start, ...]:
+    starts = tuple(suite_starts(*what, **how))
+    for start in starts:
+        start.images.flags.writeable = start.actions.flags.writeable = False  # other tests are given them, too
+    return starts
+
+
+@pytest.fixture(autouse=True)
+def shared_starts() -> Iterator[None]:
+    """The suite's held-out episodes are simulated once: most tests begin at the same ones."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulators, "suite_starts", lambda *what, **how: list(simulated(*what, **how)))
+        yield
