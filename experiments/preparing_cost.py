@@ -6,12 +6,13 @@ no data is read. What the registry does not say of a dataset (episodes, length) 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from experiments.study import Study
-from hma_jax.config import TokenizerConfig
+from hma_jax.config import AnyTokenizerConfig, TokenizerConfig
 
 SIMULATED = 3000.0
 """Native frames of the suite that two cores simulate, draw and write in a second."""
@@ -58,7 +59,7 @@ def estimate_preparing(
     counts = {name: count_frames(study, name) for name in study.all_names()}
     known = [frames for frames in counts.values() if frames]
     kept = sum(frames.kept for frames in known)
-    encode, step = (flops / LARGE_PRODUCTS for flops in tokenizer_flops(study))
+    encode, step = (flops / LARGE_PRODUCTS for flops in tokenizer_flops(study.tokenizer))
     rate, train = study.flops_per_second, study.tokenizer_train
     training = train.steps * train.batch * (step / rate + 1 / DECODED)
     return PreparingCost(
@@ -91,7 +92,8 @@ def count_frames(study: Study, name: str) -> Frames | None:
     return Frames(native, native / every, robot is not None)
 
 
-def tokenizer_flops(study: Study) -> tuple[float, float]:
+@functools.cache
+def tokenizer_flops(config: AnyTokenizerConfig) -> tuple[float, float]:
     """(to encode an image, to train on one) by counting matrix products; 0 for a tokenizer that is not declared here,
     whose time is then that of reading frames alone."""
     import jax
@@ -102,7 +104,6 @@ def tokenizer_flops(study: Study) -> tuple[float, float]:
     from hma_jax.tokenizers.network import from_pixels
     from hma_jax.tokenizers.train import tokenizer_loss
 
-    config = study.tokenizer
     if not isinstance(config, TokenizerConfig):
         return 0.0, 0.0
     declared = declare_tokenizer(config)
