@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import scipy.stats
+from scipy.special import stdtrit  # not scipy.stats, which takes most of a second to import
 
 from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference, of_sweep
 from experiments.running.ledger import DIVERGED, FINISHED
@@ -119,7 +119,7 @@ def as_good(point: CurvePoint, best: CurvePoint) -> bool:
         return True
     mean, error = difference(point, best)
     seeds = len(point.seeds.keys() & best.seeds.keys())
-    return seeds > 1 and not mean > scipy.stats.t.isf(0.05, seeds - 1) * error
+    return seeds > 1 and not mean > -stdtrit(seeds - 1, 0.05) * error
 
 
 def cross_validated_penalty(

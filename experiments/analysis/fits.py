@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+from scipy.special import fdtrc  # not scipy.stats, which takes most of a second to import
 
 from experiments.analysis.measured import Measurements
 from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, fit_values, predict_log
@@ -203,7 +203,7 @@ def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
     if left < 1 or free < 2 or scatter == 0:
         return ()
     ratio = float((count * mean**2).sum()) / left / (scatter / free)
-    chance = float(scipy.stats.f.sf(ratio, left, free))
+    chance = float(fdtrc(left, free, ratio))
     if chance >= LACK_OF_FIT_P:
         return ()
     doubt = f"points lie off the curve by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"

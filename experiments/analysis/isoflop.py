@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
-from scipy.interpolate import Akima1DInterpolator
+from scipy.special import fdtrc  # not scipy.stats, which takes most of a second to import
 
 from experiments.analysis.fits import DRAWS, LACK_OF_FIT_P, OPEN_SHARE, Coefficient, interval
 from experiments.analysis.measured import Measurements
@@ -116,6 +115,8 @@ class _Line:
         inside = np.clip(flops, self.flops[0], self.flops[-1])
         if len(self.flops) == 1 or inside in self.flops:
             return self.logs[np.searchsorted(self.flops, inside)]
+        from scipy.interpolate import Akima1DInterpolator  # most reports need none, and it is slow to import
+
         return Akima1DInterpolator(np.log(self.flops), self.logs, axis=0, method="makima")(np.log(inside))
 
 
@@ -171,7 +172,7 @@ def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:
     if min(seeds) < 2 or scatter == 0:
         return ""
     ratio = float((residuals[:, 0] ** 2).sum()) / scatter
-    chance = float(scipy.stats.f.sf(ratio, len(seeds) - 3, sum(seeds) - len(seeds)))
+    chance = float(fdtrc(len(seeds) - 3, sum(seeds) - len(seeds), ratio))
     if chance >= LACK_OF_FIT_P:
         return ""
     return f"sizes lie off the parabola by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"
