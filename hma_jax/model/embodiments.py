@@ -7,7 +7,7 @@ the only place where the order of the embodiment axis E is decided.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -145,6 +145,16 @@ class EmbodimentTable:
     def alive(self) -> np.ndarray:
         """bool [E, U]: values that carry a signal, neither padding nor a dead dimension."""
         return self.statistics()[1] > 0
+
+    def standardised(self) -> EmbodimentTable:
+        """The table of the same robots for actions that are normalised already: its `normalise` leaves them as they
+        are. Tables that differ in their statistics alone become equal."""
+        return EmbodimentTable(
+            tuple(
+                replace(e, mean=(0.0,) * e.action_dim, std=tuple(float(s > DEAD_STD) for s in e.std), low=(), high=())
+                for e in self.entries
+            )
+        )
 
     def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """Raw chunks [B, ..., U] on each robot's own scale: see `Embodiment`.

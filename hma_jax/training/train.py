@@ -68,13 +68,18 @@ def train_model(
     shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0)
 
     rows = len(own_rows(device_mesh, config.batch))
+    # The seed is no constant of the program, nor are the robots' statistics: runs of others share it. Not so with
+    # action heads, whose losses would have other last bits if their targets came normalised.
+    shared = not model.action_heads
+    normalise = _normaliser(table) if shared else dict
+    known = table.standardised() if shared else table
 
     def put(batch: Any) -> Any:
         return put_batch(batch, device_mesh)
 
     def put_checked(batch: Any) -> Any:
         check_batch(batch, rows, model, table)
-        return put(batch) | {"seed": seed}
+        return put(normalise(batch)) | {"seed": seed}
 
     def modernised(described: dict[str, Any]) -> dict[str, Any]:
         today = modernise(described)
@@ -82,7 +87,7 @@ def train_model(
 
     everywhere = NamedSharding(device_mesh, PartitionSpec())
     with jax.set_mesh(device_mesh):
-        step = _jitted_step(make_train_step, model, table, replace(config, seed=0), execution, device_mesh)
+        step = _jitted_step(make_train_step, model, known, replace(config, seed=0), execution, device_mesh)
         seed = jax.device_put(jax.random.key_data(key_of(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
@@ -131,6 +136,18 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
         require_below(count, batch[name], f"a batch has {what}")
 
 
+def _normaliser(table: EmbodimentTable) -> Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]]:
+    """A batch of the host with its actions as `table.normalise` has them, by the same operations in float32."""
+    centre_EU, unit_EU = table.scale()
+    factor_EU = np.where(unit_EU > 0, np.float32(1) / np.where(unit_EU > 0, unit_EU, np.float32(1)), np.float32(0))
+
+    def normalise(batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        centre, factor = (x[batch["embodiment"]][:, None] for x in (centre_EU, factor_EU))
+        return {**batch, "actions": (np.asarray(batch["actions"], np.float32) - centre) * factor}
+
+    return normalise
+
+
 @lru_cache(maxsize=4)
 def _jitted_step(
     make: Callable[..., Callable],
@@ -140,7 +157,8 @@ def _jitted_step(
     execution: ExecutionConfig,
     device_mesh: Mesh,
 ) -> Callable:
-    """The step that `make` makes, of runs of any seed, which comes with the batch.
+    """The step that `make` makes, of runs of any seed, which comes with the batch. With a `table` that is standardised
+    the actions come normalised.
 
     Kept for the next run of the same process, which is often the same one, resumed, or one of another seed: tracing
     and compiling a step takes seconds.

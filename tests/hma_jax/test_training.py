@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig, OptimizerConfig
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.divergence import DivergedError
@@ -15,17 +16,19 @@ from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.runs import load_run
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
-from hma_jax.training.train import train_model
+from hma_jax.training.train import _normaliser, train_model
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, model_config, random_batch, train_config
 
 MODEL = model_config(**SMALLER)
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
 
 
-def train(run_dir: Path, *, config=None, make=None, options=EVERY_TWO, provenance=None, **kwargs):
+def train(
+    run_dir: Path, *, model=MODEL, table=TABLE, config=None, make=None, options=EVERY_TWO, provenance=None, **kwargs
+):
     return train_model(
-        MODEL,
-        TABLE,
+        model,
+        table,
         config or train_config(),
         make or batches(MODEL),
         run_dir=run_dir,
@@ -213,17 +216,49 @@ def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):
     assert equal_trees(given, before) and not equal_trees(given, result.state.params)
 
 
-def test_runs_of_other_seeds_are_one_program(monkeypatch):
-    """So that a sweep over seeds compiles once."""
+@pytest.mark.parametrize("other", ["seeds", "statistics of actions"])
+def test_runs_that_differ_only_in_this_are_one_program(other: str, monkeypatch):
+    """So that a sweep over seeds, or over how many trajectories there are, compiles once."""
     texts = set()
 
     def compile_only(step, shapes, init, make, *, put_batch, **kwargs):
         texts.add(step.lower(shapes, put_batch(next(make(0)))).as_text())
 
     monkeypatch.setattr("hma_jax.training.train.fit", compile_only)
-    for seed in (0, 1):
-        train(Path("never written"), config=dataclasses.replace(train_config(), seed=seed))
+    if other == "seeds":
+        for seed in (0, 1):
+            train(Path("never written"), config=dataclasses.replace(train_config(), seed=seed))
+    else:
+        for table in (TABLE, other_statistics(TABLE)):
+            train(Path("never written"), model=dataclasses.replace(MODEL, action_heads=False), table=table)
     assert len(texts) == 1
+
+
+def other_statistics(table: EmbodimentTable) -> EmbodimentTable:
+    """The same robots, of other episodes; every second one on the scale of quantiles."""
+
+    def moved(number: int, robot: Embodiment) -> Embodiment:
+        mean, std = (
+            [scale * x + shift for x in xs] for xs, scale, shift in ((robot.mean, 3, 0.7), (robot.std, 1.7, 0))
+        )
+        bounds = {"low": [m - 1 for m in mean], "high": [m + 3 for m in mean]} if number % 2 else {}
+        return dataclasses.replace(robot, mean=mean, std=std, **bounds)
+
+    return EmbodimentTable(tuple(moved(*pair) for pair in enumerate(table.entries)))
+
+
+def test_actions_are_normalised_before_a_step_as_in_it():
+    """To the last bit: no number of a run depends on where it is done."""
+    rng = np.random.default_rng(0)
+    for table in (TABLE, other_statistics(TABLE)):
+        robots = np.arange(table.size)
+        actions = rng.normal(0, 100, (table.size, 5, table.action_width)).astype(np.float32)
+        given = _normaliser(table)({"actions": actions, "embodiment": robots, "tokens": 1})
+        want = jax.jit(table.normalise)(actions, robots)
+        np.testing.assert_array_equal(given["actions"], want)
+        np.testing.assert_array_equal(jax.jit(table.standardised().normalise)(given["actions"], robots), want)
+        np.testing.assert_array_equal(table.standardised().alive(), table.alive())
+        assert given["tokens"] == 1
 
 
 @pytest.mark.slow  # the draws of a run with its seed in the batch are on record: tests/golden/test_first_steps.py
