@@ -18,8 +18,7 @@ CONTRAST = 0.6
 
 @dataclass(frozen=True)
 class Appearance:
-    """What differs between episodes: colours float32 [n, ., 4] 0..255 (the fourth channel is
-    unused) and a gradient of the light [n, 2]."""
+    """What differs between episodes: colours float32 [n, ., 3] 0..255, and a gradient of the light [n, 2]."""
 
     floor: np.ndarray
     outside: np.ndarray
@@ -39,8 +38,7 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
 
     def colours(base: np.ndarray) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
-        lit = np.clip(128 + CONTRAST * (base * light - 128), 8, 247)
-        return np.pad(lit, ((0, 0), (0, 0), (0, 1))).astype(np.float32)
+        return np.clip(128 + CONTRAST * (base * light - 128), 8, 247).astype(np.float32)
 
     floor, objects = np.array([palette.floor]), np.array(palette.objects, float)[order]
     owner = objects[:, :1] if spec.task.marks_object else np.array(palette.robot[:1])
