@@ -88,18 +88,23 @@ class Body:
     def speed(self) -> np.ndarray:
         return np.array([j.speed for j in self.joints])
 
+    @cached_property
+    def _stops(self) -> tuple[np.ndarray, np.ndarray]:
+        """The limits at which joints stop, infinite for those that wrap."""
+        wraps = np.array([j.wraps for j in self.joints])
+        return np.where(wraps, -np.inf, self.low), np.where(wraps, np.inf, self.high)
+
     def beyond(self, q: np.ndarray) -> np.ndarray:
         """bool [n, C]: entries of q past a limit at which they stop."""
-        stops = np.array([not j.wraps for j in self.joints])
-        return stops & ((q < self.low) | (q > self.high))
+        low, high = self._stops
+        return (q < low) | (q > high)
 
     def confine(self, q: np.ndarray) -> None:
         """Brings q [n, C] back within the limits, in place."""
+        np.clip(q, *self._stops, out=q)
         for c, joint in enumerate(self.joints):
             if joint.wraps:
                 q[:, c] = joint.low + (q[:, c] - joint.low) % (joint.high - joint.low)
-            else:
-                np.clip(q[:, c], joint.low, joint.high, out=q[:, c])
 
     @cached_property
     def _chains(self) -> tuple[tuple[int, ...], ...]:
@@ -130,9 +135,9 @@ class Body:
     def pose(self, q: np.ndarray) -> Pose:
         """Forward kinematics of configurations q [n, C]."""
         n, count = len(q), len(self.links)
-        origin, tip = np.zeros((count, n, 2)), np.zeros((count, n, 2))
-        angle = np.zeros((count, n))
-        cos, sin = np.ones((count + 1, n)), np.zeros((count + 1, n))  # the last row is the world
+        # The last row, which -1 means, is the world.
+        origin, tip = np.zeros((count + 1, n, 2)), np.zeros((count + 1, n, 2))
+        angle, cos, sin = np.zeros((count + 1, n)), np.ones((count + 1, n)), np.zeros((count + 1, n))
         for i, link in enumerate(self.links):
             p = link.parent
             x, y = link.mount
@@ -141,17 +146,22 @@ class Body:
                 x = x + value
             elif link.kind == "slide_y":
                 y = y + value
-            start = tip[p] if p >= 0 else 0.0
-            origin[i, :, 0] = cos[p] * x - sin[p] * y
-            origin[i, :, 1] = sin[p] * x + cos[p] * y
-            origin[i] += start
-            angle[i] = link.angle + (angle[p] if p >= 0 else 0.0)
+            if link.kind == "turn" and x == y == 0:
+                origin[i] = tip[p]
+            else:
+                origin[i, :, 0] = cos[p] * x - sin[p] * y + tip[p, :, 0]
+                origin[i, :, 1] = sin[p] * x + cos[p] * y + tip[p, :, 1]
             if link.kind == "turn":
-                angle[i] += value
-            cos[i], sin[i] = np.cos(angle[i]), np.sin(angle[i])
-            tip[i, :, 0] = origin[i, :, 0] + link.length * cos[i]
-            tip[i, :, 1] = origin[i, :, 1] + link.length * sin[i]
-        return Pose(origin.swapaxes(0, 1), angle.swapaxes(0, 1), tip.swapaxes(0, 1))
+                angle[i] = link.angle + angle[p] + value
+            else:
+                angle[i] = link.angle + angle[p]
+            np.cos(angle[i], out=cos[i])
+            np.sin(angle[i], out=sin[i])
+            tip[i] = origin[i]
+            if link.length:
+                tip[i, :, 0] += link.length * cos[i]
+                tip[i, :, 1] += link.length * sin[i]
+        return Pose(origin[:-1].swapaxes(0, 1), angle[:-1].swapaxes(0, 1), tip[:-1].swapaxes(0, 1))
 
     def tool_points(self, pose: Pose) -> np.ndarray:
         """[n, M, 2]"""

@@ -17,8 +17,8 @@ from data_pipelines.suite.appearance import Appearance
 from data_pipelines.suite.bodies import Pose
 from data_pipelines.suite.spec import IMAGE_SIZE, Camera, EmbodimentSpec
 
-CHUNK = 48
-"""Frames drawn together: about what keeps canvas and windows in the cache."""
+CHUNK = 128
+"""Frames drawn together: enough that numpy's work outweighs its calls, and few enough for the cache."""
 
 LIGHT = np.array([-0.6, 0.8])
 """Where the light comes from, on the floor."""
@@ -211,7 +211,8 @@ def _paint(canvas, view: View, centre, angle, half, radius: float, colour, relie
     windows = sliding_window_view(canvas, size[::-1], axis=(2, 3), writeable=True)
     where = np.arange(frames), slice(None), corner[:, 1], corner[:, 0]
     under = windows[where]
-    windows[where] = under + (paint - under) * cover[:, None]
+    under += (paint - under) * cover[:, None]
+    windows[where] = under
 
 
 def _tone(u, v, distance, radius: float, angle, half) -> np.ndarray:
@@ -223,5 +224,6 @@ def _tone(u, v, distance, radius: float, angle, half) -> np.ndarray:
         cos, sin = np.cos(angle), np.sin(angle)
         slope = (cos * x + sin * y).astype(np.float32)[:, None, None] * u
         slope = slope + (cos * y - sin * x).astype(np.float32)[:, None, None] * v
-    tone = 1.05 + 0.22 * slope / radius - 0.2 * np.minimum(distance / radius, 1) ** 4
+    rim = np.square(np.square(np.minimum(distance / radius, 1)))  # ** 4 takes twenty times as long
+    tone = 1.05 + 0.22 * slope / radius - 0.2 * rim
     return np.clip(tone, 0.5, 1.3).astype(np.float32)

@@ -122,7 +122,10 @@ class World:
         )  # fmt: skip
         self.pose = body.pose(draws[0])
         for _ in range(60):  # random places overlap; apart, things do not move by themselves
+            before = objects.copy()
             self._separate(self.pose.origin, self.pose.tip, 1.0, START_GAP)
+            if np.array_equal(objects, before):  # where they go depends on where they are alone
+                break
         self._state.object_v[:] = 0
         self._state.hand = np.linalg.norm(self.tools - objects[:, :1], axis=-1).argmin(1)
         self._state.pending = np.repeat(self._idle()[:, None], self.spec.delay, 1)
@@ -193,7 +196,7 @@ class World:
         """Objects that nobody holds go on as they went, slower by friction."""
         s = self._state
         held = (s.held[:, :, None] == np.arange(s.objects.shape[1])).any(1)[..., None]
-        speed = np.linalg.norm(s.object_v, axis=-1, keepdims=True)
+        speed = np.sqrt(_dot(s.object_v, s.object_v))
         slower = np.maximum(speed - self.spec.physics.friction * h, 0.0) / np.maximum(speed, 1e-9)
         s.objects += np.where(held, 0.0, s.object_v * (1 + slower) / 2 * h)
         s.object_v *= np.where(held, 1.0, slower)
@@ -206,24 +209,27 @@ class World:
             link = self.body.links[i]
             a, b = self.pose.origin[:, i, None], self.pose.tip[:, i, None]
             along = b - a
-            t = ((s.objects - a) * along).sum(-1, keepdims=True) / max(link.length**2, 1e-9)
-            t = np.clip(t, 0.0, 1.0)
+            t = np.clip(_dot(s.objects - a, along) / max(link.length**2, 1e-9), 0.0, 1.0)
             near = a + t * along
-            before = old_origin[:, i, None] * (1 - t) + old_tip[:, i, None] * t
             away = s.objects - near
-            distance = np.linalg.norm(away, axis=-1, keepdims=True)
-            normal = away / np.maximum(distance, 1e-6)
+            distance = np.sqrt(_dot(away, away))
             overlap = np.maximum(size + link.radius + link.half_width + gap - distance, 0.0)
+            if not overlap.any():
+                continue
+            before = old_origin[:, i, None] * (1 - t) + old_tip[:, i, None] * t
+            normal = away / np.maximum(distance, 1e-6)
             s.objects += normal * overlap
-            closing = ((s.object_v - (near - before) / h) * normal).sum(-1, keepdims=True)
+            closing = _dot(s.object_v - (near - before) / h, normal)
             s.object_v -= np.where((overlap > 0) & (closing < 0), (1 + bounce) * closing, 0.0) * normal
         for k in range(s.objects.shape[1]):
             for j in range(k):
                 away = s.objects[:, k] - s.objects[:, j]
-                distance = np.linalg.norm(away, axis=1, keepdims=True)
-                normal = away / np.maximum(distance, 1e-6)
+                distance = np.sqrt(_dot(away, away))
                 overlap = np.maximum(2 * size + gap - distance, 0.0)
-                closing = ((s.object_v[:, k] - s.object_v[:, j]) * normal).sum(-1, keepdims=True)
+                if not overlap.any():
+                    continue
+                normal = away / np.maximum(distance, 1e-6)
+                closing = _dot(s.object_v[:, k] - s.object_v[:, j], normal)
                 push = np.where((overlap > 0) & (closing < 0), -(1 + bounce) * closing / 2, 0.0)  # of equal mass
                 for which, sign in ((k, 0.5), (j, -0.5)):
                     s.objects[:, which] += normal * overlap * sign
@@ -232,3 +238,9 @@ class World:
         outward = (np.abs(s.objects) > wall) & (s.objects * s.object_v > 0)
         s.object_v[outward] *= -bounce
         np.clip(s.objects, -wall, wall, out=s.objects)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[..., 1], the scalar product of vectors [..., 2]: numpy is slow at sums over so short an axis."""
+    product = a * b
+    return product[..., :1] + product[..., 1:]
