@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import ConfigError, require
+
+Array = TypeVar("Array", jax.Array, np.ndarray)
 
 DEAD_STD = 1e-6
 """A dimension whose standard deviation is below this (in raw units) carries no signal."""
@@ -176,6 +179,7 @@ class EmbodimentTable:
         return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.scale())
 
 
-def normalise(actions: jax.Array, centre: jax.Array, unit: jax.Array) -> jax.Array:
-    """Raw values in units of `unit` from `centre`, which broadcast; 0 where `unit` is 0."""
-    return (actions - centre) * jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1), 0)
+def normalise(actions: Array, centre: Array, unit: Array, xp: Any = jnp) -> Array:
+    """Raw values in units of `unit` from `centre`, which broadcast; 0 where `unit` is 0. `xp` numpy: of its arrays, with
+    the same bits."""
+    return (actions - centre) * xp.where(unit > 0, 1 / xp.where(unit > 0, unit, 1), 0)

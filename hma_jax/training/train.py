@@ -16,7 +16,7 @@ from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.base import require_shapes
 from hma_jax.config.json import to_dict
 from hma_jax.kernels.random import key_of
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import EmbodimentTable, normalise
 from hma_jax.model.flops import train_flops_per_step
 from hma_jax.model.given import require_below
 from hma_jax.model.hma import declare_model
@@ -68,18 +68,16 @@ def train_model(
     shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0)
 
     rows = len(own_rows(device_mesh, config.batch))
-    # The seed is no constant of the program, nor are the robots' statistics: runs of others share it. Not so with
-    # action heads, whose losses would have other last bits if their targets came normalised.
-    shared = not model.action_heads
-    normalise = _normaliser(table) if shared else dict
-    known = table.standardised() if shared else table
+    # Neither the seed nor the robots' statistics are constants of the program, so that runs of others share it. With
+    # action heads the statistics are: the loss would have other last bits if its targets came normalised.
+    scale, known = (None, table) if model.action_heads else (table.scale(), table.standardised())
 
     def put(batch: Any) -> Any:
         return put_batch(batch, device_mesh)
 
     def put_checked(batch: Any) -> Any:
         check_batch(batch, rows, model, table)
-        return put(normalise(batch)) | {"seed": seed}
+        return put(batch if scale is None else _normalised(batch, scale)) | {"seed": seed}
 
     def modernised(described: dict[str, Any]) -> dict[str, Any]:
         today = modernise(described)
@@ -136,16 +134,10 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
         require_below(count, batch[name], f"a batch has {what}")
 
 
-def _normaliser(table: EmbodimentTable) -> Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]]:
-    """A batch of the host with its actions as `table.normalise` has them, by the same operations in float32."""
-    centre_EU, unit_EU = table.scale()
-    factor_EU = np.where(unit_EU > 0, np.float32(1) / np.where(unit_EU > 0, unit_EU, np.float32(1)), np.float32(0))
-
-    def normalise(batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        centre, factor = (x[batch["embodiment"]][:, None] for x in (centre_EU, factor_EU))
-        return {**batch, "actions": (np.asarray(batch["actions"], np.float32) - centre) * factor}
-
-    return normalise
+def _normalised(batch: Mapping[str, np.ndarray], scale: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+    """A batch of the host with its actions as `EmbodimentTable.normalise` has them; `scale` is the table's."""
+    of_rows = [x[batch["embodiment"]][:, None] for x in scale]
+    return {**batch, "actions": normalise(np.asarray(batch["actions"], np.float32), *of_rows, xp=np)}
 
 
 @lru_cache(maxsize=4)

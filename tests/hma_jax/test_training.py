@@ -16,7 +16,7 @@ from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.runs import load_run
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
-from hma_jax.training.train import _normaliser, train_model
+from hma_jax.training.train import _normalised, train_model
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, model_config, random_batch, train_config
 
 MODEL = model_config(**SMALLER)
@@ -253,7 +253,7 @@ def test_actions_are_normalised_before_a_step_as_in_it():
     for table in (TABLE, other_statistics(TABLE)):
         robots = np.arange(table.size)
         actions = rng.normal(0, 100, (table.size, 5, table.action_width)).astype(np.float32)
-        given = _normaliser(table)({"actions": actions, "embodiment": robots, "tokens": 1})
+        given = _normalised({"actions": actions, "embodiment": robots, "tokens": 1}, table.scale())
         want = jax.jit(table.normalise)(actions, robots)
         np.testing.assert_array_equal(given["actions"], want)
         np.testing.assert_array_equal(jax.jit(table.standardised().normalise)(given["actions"], robots), want)
