@@ -116,17 +116,26 @@ class Draws:
 
 
 def resample(
-    panel: Panel, draws: int = DRAWS, seed: int = 0, *, over_seeds: bool = True, over_episodes: bool = True,
-    by_episode: Sums | None = None,
-) -> Draws:  # fmt: skip
+    panel: Panel, draws: int = DRAWS, seed: int = 0, *, over_seeds: bool = True, over_episodes: bool = True
+) -> Draws:
     """The mean over robots of each point, as measured and in `draws` resamples; a pure function of its arguments.
-    `by_episode` is the panel's, where it is known already.
 
     A point of one seed keeps it: its draws say nothing of seeds. A robot of one episode cannot be resampled; it
     takes the deviation of another robot, drawn anew each time and scaled to one episode, as `stratified` does.
     """
+    return _resample(panel.seeds, _by_episode(panel), draws, seed, over_seeds, over_episodes)
+
+
+def _resample(
+    seeds_of_points: Sequence[tuple[int, ...]],
+    by_episode: Sums,
+    draws: int,
+    seed: int,
+    over_seeds: bool,
+    over_episodes: bool,
+) -> Draws:
     rng = np.random.default_rng(seed)
-    sums, counts, ends = by_episode or _by_episode(panel)
+    sums, counts, ends = by_episode
     value = _mean_of_robots(sums, counts, ends)  # [all seeds of all points]
     if over_episodes:
         episode_weights, rng.bit_generator.state = _episode_weights(tuple(np.diff(ends, prepend=0)), draws, seed)
@@ -135,7 +144,7 @@ def resample(
         drawn = np.tile(value, (draws, 1))
     weights: dict[tuple[int, ...], np.ndarray] = {}
     drawn_means, points, row = [], [], 0
-    for seeds in panel.seeds:
+    for seeds in seeds_of_points:
         own = slice(row, row + len(seeds))
         row += len(seeds)
         if seeds not in weights:
@@ -157,7 +166,7 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list
     """
     sums, counts, ends = summed = _by_episode(panel)
     both, by_seed, by_episode = (
-        resample(panel, draws, seed, over_seeds=s, over_episodes=e, by_episode=summed).drawn.std(0, ddof=1)
+        _resample(panel.seeds, summed, draws, seed, over_seeds=s, over_episodes=e).drawn.std(0, ddof=1)
         for s, e in ((True, True), (True, False), (False, True))
     )
     episodes, value, intervals, row = sums.shape[1], _mean_of_robots(sums, counts, ends), [], 0

@@ -181,5 +181,5 @@ class EmbodimentTable:
 
 def normalise(actions: Array, centre: Array, unit: Array, xp: Any = jnp) -> Array:
     """Raw values in units of `unit` from `centre`, which broadcast; 0 where `unit` is 0. Given `xp` numpy, it computes
-    on numpy's arrays, to the same bits."""
+    on numpy's arrays, on a CPU to the same bits."""
     return (actions - centre) * xp.where(unit > 0, 1 / xp.where(unit > 0, unit, 1), 0)
