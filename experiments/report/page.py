@@ -28,7 +28,7 @@ from experiments.report.plot_style import drawn_metrics
 from experiments.report.robots import Robot, are_sorted, describe_robots, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import AxisStatistics, describe
-from experiments.report.validity import Check, check_study, draw_box
+from experiments.report.validity import EACH, Check, check_study, draw_box
 from experiments.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
 from experiments.running.agreement import describe as describe_sources
 from experiments.running.agreement import group_by_sources
@@ -157,7 +157,7 @@ def _headline(
             card(f"ΔPSNR, {shown.name}", _at_default(rows, shown.sweep, "delta_psnr"),
                  "dB, last frame: true minus random actions"),
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
-                 "dB; should be zero within its error"),
+                 f"dB; a control: should be zero within {EACH:g} standard errors"),
         ]  # fmt: skip
     cards.append(card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"))
     when = result["run"]["finished"] if result else "no trial finished"
@@ -288,7 +288,7 @@ def _origin(
         "version of the results": str(provenance.results),
         "sources": counted + "; ".join(describe_sources(ran)) if ran else "unknown",
         "commit": _each([m.get("commit") or "unknown" for m in machines]),
-        "processor": _each([f"{m.get('processor', 'unknown')}, {m.get('cores', '?')} cores" for m in machines]),
+        "processor": _each([_processor(m) for m in machines]),
         "devices": _each([", ".join(m.get("devices", [])) or "unknown" for m in machines]),
         "software": _each([", ".join(f"{k} {v}" for k, v in m.get("packages", {}).items()) for m in machines]),
         "numbers": workspace.results.name,
@@ -296,6 +296,12 @@ def _origin(
     items = "".join(f"<dt>{html.escape(k)}</dt><dd><code>{html.escape(v)}</code></dd>" for k, v in facts.items())
     config = html.escape(to_json(record.study))
     return f"<dl>{items}</dl><details><summary>Configuration</summary><pre>{config}</pre></details>"
+
+
+def _processor(machine: Mapping[str, Any]) -> str:
+    """What one trial ran on: its slot has a part of the machine's cores where several ran at a time."""
+    name, cores = machine.get("processor", "unknown"), machine.get("cores")
+    return f"{name}, {counted(cores, 'core') if cores else '? cores'} per trial"
 
 
 def _repeatable(command: str) -> str:

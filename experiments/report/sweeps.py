@@ -251,7 +251,11 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
             # Whichever lies at an end: what is best beyond it may have moved further than `far`.
             open_ended = ", some at an end of the grid, so perhaps further" if any(o.edge for o in own) else ""
             steps = counted(round(abs(far.moved)), "step")
-            parts.append(f"{words}: the best rate of {len(own)} {kind}s moves by at most {steps}{open_ended}")
+            span = counted(round(max(o.moved for o in own) - min(o.moved for o in own)), "step")
+            parts.append(
+                f"{words}: the best rate of {len(own)} {kind}s is at most {steps} from that of the base {kind}, and "
+                f"moves by {span} in all{open_ended}"
+            )
     return f"{'; '.join(parts)} (held-out loss)." if parts else ""
 
 
