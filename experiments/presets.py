@@ -118,7 +118,7 @@ CPU = Study(
 
 CPU_FULL = replace(
     CPU,
-    name="cpu-full",  # the evidence: two cores, half a day; every point of three seeds, every axis with controls
+    name="cpu-full",  # the evidence: two cores, 17 hours; every point of three seeds, every axis with controls
     # From 128 trajectories, so that none is learnt by heart within the long runs (docs/designs.md), to 2,000.
     suite=SuiteConfig(scale=4.0, fewest=128),
     trajectory_counts=(2000,),
