@@ -205,6 +205,8 @@ def test_the_page_of_speed_shows_products_of_two_cores():
                 (smallest if sizes.groups() == ("320", "256", "256") else rates).append(rate)
     slow, *others = sorted(rates)
     page = " ".join(SPEED.read_text().split())
+    turns = ", ".join(f"{release[OUR_PREFIX + stage][0]:.2f}" for stage in ("forward", "fill", "slide"))
+    assert f"at this commit, ours took {turns} and {release[OUR_PREFIX + 'step'][0]:.2f} s" in page
     said = (
         "products with weights: {:.0f} to {:.0f}; the smallest, of a matrix 256 wide with one frame, {:.0f} to {:.0f}; one of "
         "the step's {:.0f}; * a plain square product: {:.0f} to {:.0f}; * attention within frames: {:.0f} to {:.0f} (a head "
