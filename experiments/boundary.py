@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import select
 import sys
-import warnings
 from collections.abc import Callable
 
 from experiments.progress import errors
 from experiments.run_study import TrialsFailed
+from experiments.running.children import silence_background
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
 
@@ -30,7 +29,7 @@ def guarded(
     out records that cannot be read."""
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
-        _silence_background()
+        silence_background()
     try:
         with sigterm_as_interrupt():
             try:
@@ -89,16 +88,6 @@ def _end_together(error: BaseException | None = None, code: int = Exit.DONE, sho
 
     # A stop that was asked for is one of all processes, after the same step.
     end(None if isinstance(error, Interrupted) else error, code, show)
-
-
-def _silence_background() -> None:
-    """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
-    pages of their own, from threads and destructors where nothing can catch it, until the very
-    end. The error message says it once.
-    """
-    sys.unraisablehook = lambda _: None
-    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
-    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
 
 
 def _exit_code(error: Exception) -> Exit | None:

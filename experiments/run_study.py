@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console, say
 from experiments.report.draw import draw
+from experiments.running.apart import call_apart
 from experiments.running.attempts import RESULT, State, read_states
 from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
@@ -18,6 +19,7 @@ from experiments.running.ledger import FINISHED, MISSING, PREEMPTED, REFUSED, Le
 from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import share_runs
+from experiments.running.slots import find_accelerators
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
@@ -28,6 +30,9 @@ from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
 
 
 class TrialsFailed(Exception):
@@ -50,7 +55,6 @@ def run_study(
     directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
     changed, or if trials ran other sources than today's and `accept_code` is not given.
     """
-    from experiments.preparing.pipeline import prepare
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
@@ -65,7 +69,7 @@ def run_study(
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked():
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
-        provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
+        provenance = prepare_apart(setting, replace)
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
             what = (
@@ -88,6 +92,26 @@ def run_study(
         states = run_jobs(jobs, workspace, launcher, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
+
+
+def prepare_apart(setting: Setting, replace: Step | None) -> Provenance:
+    """Prepares the study. Where there are accelerators, in a process of its own: JAX keeps them for the process that it
+    computes in, and the trials need them."""
+    if find_accelerators() is None:
+        return _prepare(setting, replace)
+    from data_pipelines.registry import find_spec
+
+    specs = [find_spec(name) for name in setting.study.all_names()]
+    return call_apart("prepares the data", _prepare, setting, replace, [spec for spec in specs if spec is not None])
+
+
+def _prepare(setting: Setting, replace: Step | None, specs: Sequence[DatasetSpec] = ()) -> Provenance:
+    """`specs`: registry entries, of which a new process lacks the user's own."""
+    from data_pipelines.registry import register
+    from experiments.preparing.pipeline import prepare
+
+    register(specs)
+    return prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
 
 
 def make_jobs(

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import faulthandler
+import logging
 import os
 import signal
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 
 from experiments.running.slots import Slot
@@ -43,8 +45,9 @@ def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str
     return environment
 
 
-def enter_child() -> None:
-    """Called first in a child: takes its cores, arranges to die with its parent and to end in order when asked to."""
+def enter_child(parent: int = 0) -> None:
+    """Called first in a child: takes its cores, arranges to die with its `parent` (0: which the environment names) and
+    to end in order when asked to."""
     faulthandler.enable()  # a library that ends the process by a signal is named by what its threads did
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked
@@ -56,9 +59,26 @@ def enter_child() -> None:
     if usable_cores() == 1:
         keep_freed_memory()
     collect_rarely()
-    parent = int(os.environ.get(_PARENT, "0"))
+    parent = parent or int(os.environ.get(_PARENT, "0"))
     if parent:
         _die_with(parent)
+
+
+def silence_background() -> None:
+    """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
+    pages of their own, from threads and destructors where nothing can catch it, until the very
+    end. The error message says it once.
+    """
+    sys.unraisablehook = _say_nothing
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+
+
+def background_is_silent() -> bool:
+    return sys.unraisablehook is _say_nothing
+
+
+def _say_nothing(_: object) -> None: ...
 
 
 def _die_with(parent: int) -> None:
