@@ -10,15 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_pipelines.registry.angles import TURN, AngleUnit
+from data_pipelines.registry.angles import SWITCH_SHARE, AngleUnit, find_turns
 from hma_jax.model.embodiments import DEAD_STD
 
-SWITCH_SHARE = 0.8
-"""A value that takes one of two numbers in at least this share of the steps is a switch."""
-
-
 WRAPPING: dict[AngleUnit, str] = {"radian": "wrapping angle", "degree": "wrapping angle in degrees"}
-"""Hints for angles, by their unit. (An angle in turns cannot be told from a switch.)"""
+"""Hints for angles, by their unit."""
 
 
 QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
@@ -82,7 +78,7 @@ def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, 
         ends = all(not column[:-1].any() for column in columns) and any(column[-1] for column in columns)
         return "end flag" if ends else "switch"
     for unit, words in WRAPPING.items():
-        if _wraps(columns, TURN[unit]):
+        if _wraps(columns, unit):
             return words
     # Targets drift slowly about wherever the robot is; changes jump about zero.
     if smoothness < 0.2 or abs(mean) > 2 * std:
@@ -90,9 +86,6 @@ def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, 
     return "delta" if abs(mean) < 0.5 * std else ""
 
 
-def _wraps(columns: list[np.ndarray], turn: float) -> bool:
-    """Whether values stay within one turn, about 0 or from 0 on, and jump from one end to the other."""
-    low, high = min(c.min() for c in columns), max(c.max() for c in columns)
-    near = 0.002 * turn
-    inside = (low > -turn / 2 - near and high < turn / 2 + near) or (low > -near and high < turn + near)
-    return inside and any(np.abs(np.diff(c)).max(initial=0) > 0.9 * turn for c in columns)
+def _wraps(columns: list[np.ndarray], unit: AngleUnit) -> bool:
+    low, high = np.array(min(c.min() for c in columns)), np.array(max(c.max() for c in columns))
+    return bool(find_turns(low, high, np.array(max(np.abs(np.diff(c)).max(initial=0) for c in columns)), unit))

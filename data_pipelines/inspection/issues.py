@@ -12,7 +12,7 @@ from data_pipelines.inspection.duplicates import Fingerprint
 from data_pipelines.inspection.inspect import ActionFacts, Facts
 from data_pipelines.inspection.suggest import NO_CAMERA, WindowFacts
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.registry.angles import TURN
+from data_pipelines.registry.angles import TURN, angle_lines
 from data_pipelines.sources.rlds.schema import field_slice
 
 MISFIT = "entry does not fit"
@@ -164,15 +164,14 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Issue]:
         issues.append(Issue("error", "not finite", text))
     start = _first_value(field.key, entry)
     handled = set(entry.angles) if entry is not None and entry.angle_form != "as_recorded" else set()
-    wraps = [i for i, d in enumerate(field.dimensions) if d.hint in WRAPPING.values() and start + i not in handled]
-    if wraps:
-        numbers = ", ".join(str(start + i) for i in wraps)
-        text = (
-            f"{_values(field, wraps)} jump{'s' if len(wraps) == 1 else ''} by a whole turn; to correct this, add "
-            f'angles = [{numbers}] and angle_form = "sine_cosine" (or "unwrapped") to the entry'
-        )
-        issues.append(Issue("warning", "wrapping angle", text))
     for unit, hint in WRAPPING.items():
+        wraps = [i for i, d in enumerate(field.dimensions) if d.hint == hint and start + i not in handled]
+        if wraps:
+            text = (
+                f"{_values(field, wraps)} jump{'s' if len(wraps) == 1 else ''} by a whole turn; to correct this, add "
+                f"{angle_lines([start + i for i in wraps], unit)} to the entry"
+            )
+            issues.append(Issue("warning", "wrapping angle", text))
         other = [i for i, d in enumerate(field.dimensions) if d.hint == hint and start + i in handled]
         if other and unit != entry.angle_unit:
             text = (

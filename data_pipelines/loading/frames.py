@@ -78,7 +78,7 @@ def make_frame_loader(
                 reasons[spec.name] += f": {skipped if all_held_out.any() else none}; {bound}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)
-        streams[spec.name] = _Stream(source, spec.image_key, episodes, order)
+        streams[spec.name] = _Stream(source, spec, episodes, order)
     mixture = make_mixture(counts, tau, reasons)
     group = math.gcd(batch, FRAMES_PER_READ)
     draws = Draws(mixture.weights, f"frames/{split}/{seed}")
@@ -115,7 +115,7 @@ class _Stream:
     """Endless shuffled episodes of one dataset."""
 
     source: EpisodeSource
-    image_key: str
+    spec: DatasetSpec
     episodes: np.ndarray  # int64, those of the split
     seed: int
 
@@ -125,7 +125,7 @@ class _Stream:
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
             try:
-                return self.source.frames(episode, self.image_key, lambda n: (draws % n).tolist(), size)
+                return self.source.frames(episode, self.spec.image_key, lambda n: (draws % n).tolist(), size)
             except EpisodeError as error:
                 self.source.skip(episode, error)
         raise DataError(f"{self.source.name}: none of its {len(self.episodes)} episodes can be read")
@@ -164,7 +164,7 @@ class _Batches:
         row = 0
         for d, i, drawn in zip(streams.tolist(), positions.tolist(), draws, strict=True):
             for image in self.streams[d].read(i, drawn, self.size):
-                frames[row] = fit_image(image, self.size)
+                frames[row] = self.streams[d].spec.correct(fit_image(image, self.size))
                 row += 1
         return frames
 

@@ -18,6 +18,31 @@ TURN: dict[AngleUnit, float] = {"radian": 2 * np.pi, "degree": 360.0, "turn": 1.
 """One whole turn in each unit."""
 
 
+RECOGNISED: tuple[AngleUnit, ...] = ("radian", "degree")
+"""Units of wrapping angles that are found in data. (An angle in turns cannot be told from a switch.)"""
+
+SWITCH_SHARE = 0.8
+"""A value that takes one of two numbers in at least this share of the steps is a switch, and no angle."""
+
+
+def find_turns(low: np.ndarray, high: np.ndarray, jump: np.ndarray, unit: AngleUnit) -> np.ndarray:
+    """bool [A]: which values stay within one turn, about 0 or from 0 on, and jump from one end of it to the other.
+
+    Of each value the smallest, the largest and the largest change from a step to the next.
+    """
+    turn = TURN[unit]
+    near = 0.002 * turn
+    about_zero = (low > -turn / 2 - near) & (high < turn / 2 + near)
+    from_zero = (low > -near) & (high < turn + near)
+    return (about_zero | from_zero) & (jump > 0.9 * turn)
+
+
+def angle_lines(values: Sequence[int], unit: AngleUnit) -> str:
+    """What an entry says of such values, in words."""
+    also = "" if unit == "radian" else f' and angle_unit = "{unit}"'
+    return f'angles = [{", ".join(map(str, values))}] and angle_form = "sine_cosine" (or "unwrapped"){also}'
+
+
 def angle_width(width: int, angles: Sequence[int], form: AngleForm) -> int:
     """Values of an action of `width` recorded ones, of which `angles` are given as `form`."""
     return width + (len(angles) if form == "sine_cosine" else 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -24,9 +24,12 @@ FRAME_RATE = 2.0
 
 NOT_OF_ACTIONS = (
     "name", "image_key", "hz", "rate", "camera", "split", "note", "video_targets", "version", "unverified",
-    "episodes", "median_steps", "mean_steps", "val_split",
+    "episodes", "median_steps", "mean_steps", "val_split", "image_corrections",
 )  # fmt: skip
 """Fields of an entry that do not affect the meaning of action values."""
+
+
+ImageCorrection = Literal["rotate_180", "swap_red_blue"]
 
 
 def stride_of(hz: float, rate: float | None = FRAME_RATE) -> int:
@@ -80,6 +83,8 @@ class DatasetSpec:
     median_steps: float = 0.0  # of an episode
     mean_steps: float = 0.0
     val_split: str = ""  # the part of `split` ("train+val") that is held out; "": episodes chosen by hash
+    # What is done to every frame that is read: for a camera that hangs upside down, or colours written as BGR.
+    image_corrections: tuple[ImageCorrection, ...] = ()
 
     def __post_init__(self):
         name = self.name
@@ -119,6 +124,12 @@ class DatasetSpec:
         require(
             bool(self.angles) or self.angle_form == "as_recorded",
             f"dataset {name!r}: angle_form {self.angle_form!r} needs the list of values that are angles: add `angles`",
+        )
+        known = get_args(ImageCorrection)
+        require(
+            list(self.image_corrections) == [c for c in known if c in self.image_corrections],
+            f"dataset {name!r}: image_corrections may list {', '.join(known)}, in this order and each once, got "
+            f"{self.image_corrections}",
         )
 
     @property
@@ -184,6 +195,20 @@ class DatasetSpec:
     def convert(self, actions: np.ndarray) -> np.ndarray:
         """float32 [N, action_dim]: the actions of an episode [N, sum(action_dims)], as the model is given them."""
         return convert_angles(actions, self.angles, self.angle_form, self.angle_unit)
+
+    @property
+    def camera_key(self) -> str:
+        """`image_key` and `image_corrections` in one text: equal for equal frames. Without corrections it is the key,
+        as in earlier records of what was made from frames."""
+        return " ".join((self.image_key, *self.image_corrections))
+
+    def correct(self, images: np.ndarray) -> np.ndarray:
+        """uint8 [..., H, W, 3]: frames of its camera, after `image_corrections`; without any the array itself."""
+        if "rotate_180" in self.image_corrections:
+            images = images[..., ::-1, ::-1, :]
+        if "swap_red_blue" in self.image_corrections:
+            images = images[..., ::-1]
+        return np.ascontiguousarray(images) if self.image_corrections else images
 
     def facts(self) -> DatasetSpec:
         """This entry without the fields that only describe it and do not affect the data."""

@@ -43,6 +43,7 @@ ADDED_FIELDS = (
     ("spec", "median_steps", 0.0),
     ("spec", "mean_steps", 0.0),
     ("spec", "val_split", ""),
+    ("spec", "image_corrections", []),
     ("settings", "max_val_fraction", 0.5),
 )
 """Fields that were added to the format, with the value that holds for older stores. A field that has this value is left

@@ -11,7 +11,7 @@ and offset.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +39,7 @@ from data_pipelines.tokens.manifest import (
 )
 from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
+from data_pipelines.tokens.turns import TurnWatch
 from hma_jax.config import require
 from hma_jax.runtime.cores import usable_cores
 
@@ -68,6 +69,7 @@ def tokenize_dataset(
     overwrite: bool = False,
     wait: bool = True,
     progress: Progress | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> Manifest | None:
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
@@ -75,7 +77,8 @@ def tokenize_dataset(
     divide. 1 stores all frames and serves every rate. `batch` images are encoded at a time, `threads` (default: as
     many as cores, up to 8) decode. If the store already has this dataset, made from the same shards in the same way,
     nothing is done. Any number of processes may run the same call, start and be killed at any time: each makes parts
-    that no other one makes. `progress(done, total)` counts the episodes of all processes. With `wait` it waits for
+    that no other one makes. `progress(done, total)` counts the episodes of all processes; `warn` is told of values of
+    the action that look like wrapping angles, in the parts that this process makes. With `wait` it waits for
     the parts of other processes; without, it returns None while parts are missing. The bytes of the dataset depend
     on `spec`, source, tokenizer, `part_size` and the settings of JobSettings only.
 
@@ -90,7 +93,8 @@ def tokenize_dataset(
         spec, source, tokenizer, val_fraction, min_val, max_val,
         max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
     )  # fmt: skip
-    work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8))
+    watch = TurnWatch(spec, warn or (lambda _: None))
+    work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8), watch)
     skipped = [
         SkippedEpisodes(_without_location(reason, source), episodes=count)
         for reason, count in sorted(source.skipped.items())
@@ -107,6 +111,7 @@ def tokenize_dataset(
         progress=progress,
     )
     source.save_steps()
+    watch.look()
     return manifest
 
 
@@ -188,9 +193,17 @@ class _Pending:
 class _Work:
     """Makes the parts of one dataset."""
 
-    def __init__(self, source: EpisodeSource, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int):
+    def __init__(
+        self,
+        source: EpisodeSource,
+        plan: Manifest,
+        tokenizer: Tokenizer,
+        batch: int,
+        threads: int,
+        watch: TurnWatch,
+    ):
         s = plan.settings
-        self._source, self._plan, self._threads = source, plan, threads
+        self._source, self._plan, self._threads, self._watch = source, plan, threads, watch
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
         self._numbers = source.numbers
@@ -203,7 +216,7 @@ class _Work:
         items = frames_ahead(
             part.episodes,
             lambda i: self._source.open_episode(i, spec.image_key, spec.action_keys),
-            lambda image: fit_image(image, size),
+            lambda image: spec.correct(fit_image(image, size)),
             3 * size * size,
             self._plan.frame_step,
             self._threads,
@@ -241,6 +254,7 @@ class _Work:
                 yield self._skip(episode.end.error)
                 continue
             begin = episode.begin
+            self._watch.see(begin.actions)
             frames = np.stack(episode.frames) if episode.keep else None
             episode.frames.clear()
             yield (

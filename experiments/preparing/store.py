@@ -50,6 +50,7 @@ def make_store(
             spec, path, made_with, workspace.store, **settings, **how, rate=study.rate,
             overwrite=may_replace("tokens", replace), wait=wait,
             progress=lambda done, total: update(done, total, f"{note}{eta(done, total)}"),
+            warn=lambda text: say(f"warning: {text}"),
         )  # fmt: skip
         return manifest is not None
 

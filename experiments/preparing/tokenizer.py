@@ -48,8 +48,8 @@ QUALITY_FRAMES = 1024
 HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
 """Settings of the store that say which episodes no tokenizer is trained on."""
 
-OF_FRAMES = ("image_key", "split", "val_split")
-"""Facts of a registry entry that say which frames a dataset has for a tokenizer."""
+OF_FRAMES = ("split", "val_split")
+"""Facts of a registry entry that say which frames a dataset has for a tokenizer, beside its camera."""
 
 SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames", "data_pipelines.sources.open")
 """The modules that train it; what they import follows (`running.closure`), of these three in functions as well: readers
@@ -70,6 +70,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     data = {
         spec.name: {
             "shards": open_source((spec, path), settings).fingerprint(),
+            "image_key": spec.camera_key,
             **{name: getattr(spec, name) for name in OF_FRAMES},
         }
         for spec, path in sources

@@ -10,6 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from data_pipelines.inspection.action_stats import QUANTILES
 from data_pipelines.inspection.inspect import ActionFacts, Facts, Sample
 from data_pipelines.inspection.issues import Issue, chosen_actions
@@ -38,6 +40,9 @@ CLIP_FRAMES = 24
 
 TALL, SMALL = 168, 84
 """Pixels of the clips of the camera in use, and of the others."""
+
+CORRECTED = {"rotate_180": "turned by 180 degrees", "swap_red_blue": "red and blue exchanged"}
+"""`DatasetSpec.image_corrections` in words."""
 
 PAGE_CSS = """
 .error, .warning { border-left: 4px solid var(--bad); background: var(--soft); border-radius: 4px;
@@ -148,8 +153,9 @@ def _read_as(d: DatasetView) -> str:
     if d.entry.angle_form != "as_recorded":
         numbers = ", ".join(map(str, d.entry.angles))
         form = f", values {numbers} {'as sine and cosine' if d.entry.angle_form == 'sine_cosine' else 'unwrapped'}"
+    done = " and ".join(CORRECTED[one] for one in d.entry.image_corrections)
     return (
-        f"<p>{whose} reads <code>{html.escape(d.entry.image_key)}</code> and <code>{html.escape(action)}</code>"
+        f"<p>{whose} reads <code>{html.escape(d.entry.image_key)}</code>{f' ({done})' * bool(done)} and <code>{html.escape(action)}</code>"
         f" ({d.entry.action_dim} values{form}) at {d.entry.hz:g} Hz.</p>"
     )
 
@@ -170,7 +176,12 @@ def _episode(d: DatasetView, example: ExampleEpisode) -> str:
     used = d.entry.image_key if d.entry else ""
     cameras = sorted((c for c in example.frames if c not in blank), key=lambda c: (c != used, c))
     clips = [
-        clip(example.frames[c], seconds / speed, TALL if n == 0 else SMALL, f"{c} of episode {example.index}")
+        clip(
+            _corrected(d, c, example.frames[c]),
+            seconds / speed,
+            TALL if n == 0 else SMALL,
+            f"{c} of episode {example.index}",
+        )
         for n, c in enumerate(cameras)
     ]
     words = [f"<b>episode {example.index}</b>", f"{example.steps} steps"]
@@ -183,6 +194,12 @@ def _episode(d: DatasetView, example: ExampleEpisode) -> str:
     drawn = "".join(_curves(field, example) for field in chosen_actions(d.facts, d.entry))
     pictures = "".join(clips[:1]) + f"<div class=clips>{''.join(clips[1:])}</div>"
     return f"<div class=episode>{pictures}<p>{' · '.join(words)}</p>{instruction}{drawn}</div>"
+
+
+def _corrected(d: DatasetView, camera: str, frames: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+    """Frames of the camera in use as a model is shown them."""
+    used = d.entry is not None and camera == d.entry.image_key
+    return [d.entry.correct(frame) for frame in frames] if used else frames
 
 
 def _curves(field: ActionFacts, example: ExampleEpisode) -> str:

@@ -2,11 +2,12 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from data_pipelines.registry import get_spec
+from data_pipelines.registry import get_spec, register
 from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
 from experiments.cli.main import main
@@ -247,6 +248,14 @@ def test_a_corrected_image_key_does_not_keep_a_tokenizer_of_the_wrong_camera(hma
     assert code == 2 and f"data of {ARM.name}.image_key: '{wrong}' -> '{ARM.image_key}'" in said
     assert "--replace tokenizer" in said and f"--tokenizer {out / 'tokenizer'}" in said
     assert contents(out).keys() == before.keys()
+
+
+def test_corrected_images_do_not_keep_a_tokenizer_of_others(hma, out, monkeypatch):
+    monkeypatch.setattr("data_pipelines.registry.table._registered", {})
+    register([replace(ARM, image_corrections=("rotate_180",))])
+    code, said = hma("tokenize")
+    assert code == 2
+    assert f"data of {ARM.name}.image_key: '{ARM.image_key}' -> '{ARM.image_key} rotate_180'" in said
 
 
 def test_tokenizer_and_windows_copied_to_another_place_are_those_of_the_study(hma, out, made, tmp_path):

@@ -107,6 +107,27 @@ def test_page_is_one_file_with_clips_curves_and_statistics(toy, tmp_path, capsys
     assert "--set model.frames=4" in command and "--registry" in command and str(directory) in command
 
 
+def test_the_camera_in_use_is_shown_as_the_entry_corrects_it(tmp_path, capsys):
+    half = np.zeros((8, 8, 3), np.uint8)
+    half[:4] = 255
+
+    def draw(_, features):
+        features["steps/observation/image"] = [png(half)] * len(features["steps/observation/image"])
+
+    directory, brighter = write_rlds(tmp_path, SPEC, [20], change=draw), {}
+    for corrections in ((), ("rotate_180",)):
+        (tmp_path / "my.toml").write_text(to_toml(replace(SPEC, image_corrections=corrections)))
+        out = tmp_path / "page.html"
+        assert main(["data", "view", str(directory), "--registry", str(tmp_path / "my.toml"), "--out", str(out)]) == 0
+        text = out.read_text()
+        assert ("(turned by 180 degrees)" in text) == bool(corrections)
+        (clip,) = (source for source in Page(text).sources if source.startswith("data:"))
+        with Image.open(io.BytesIO(base64.b64decode(clip.split(",")[1]))) as image:
+            rows = np.asarray(image.convert("L")).mean(1)
+        brighter[corrections] = rows[0] > rows[-1]
+    assert brighter == {(): True, ("rotate_180",): False}
+
+
 def test_a_dataset_without_windows_gets_a_command_that_finds_some(toy, tmp_path, capsys):
     directory, entries = toy
     arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]

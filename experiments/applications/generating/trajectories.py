@@ -96,7 +96,7 @@ class RldsTrajectories(Trajectories):
     def __getitem__(self, i: int) -> Trajectory:
         spec = self.spec
         episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
-        images = fit_images(episode.images, self._size)
+        images = spec.correct(fit_images(episode.images, self._size))
         instructions: Sequence[bytes] = ()
         if INSTRUCTION_KEY in self._source.features:
             instructions = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())
@@ -251,5 +251,5 @@ def rewards_of_frames(native_N: np.ndarray, stride: int) -> np.ndarray:
 def describe(trajectories: Trajectories) -> dict[str, Any]:
     """What tells these recordings, and what is taken of them, from others."""
     spec = trajectories.spec
-    taken = {"image_key": spec.image_key, "action_layout": spec.action_layout()}
+    taken = {"image_key": spec.camera_key, "action_layout": spec.action_layout()}
     return {"dataset": trajectories.name, "split": trajectories.split, "contents": trajectories.fingerprint, **taken}

@@ -38,6 +38,13 @@ def test_frames_are_uint8_squares_of_the_asked_size(batch):
     assert frames.shape == (batch, 16, 16, 3) and frames.dtype == np.uint8 and frames.std() > 10
 
 
+def test_frames_are_corrected_as_the_entry_says(rlds):
+    (plain,), (swapped,) = (
+        take([(spec, rlds)], 1) for spec in (SPEC, replace(SPEC, image_corrections=("swap_red_blue",)))
+    )
+    assert plain.any() and np.array_equal(swapped, plain[..., ::-1])
+
+
 def test_splits_share_no_episode_and_cover_all_frames(rlds):
     mask = held_out("toy", RldsDataset(rlds).ids)
     seen = {}

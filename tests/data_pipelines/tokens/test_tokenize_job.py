@@ -13,7 +13,7 @@ from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
-from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, png, write_rlds
 
 SPEC = make_spec(hz=4)  # stride 2
 FILES = ["train-00000-of-00001.array_record", "train-00000-of-00001.moments.npy", "val-00000-of-00001.array_record"]
@@ -66,6 +66,26 @@ def test_latents_are_stored_in_half_precision_with_their_own_frames(tmp_path, rl
         assert tokens.dtype == np.float16 and tokens.shape == (len(steps), 4, 3)
         assert (tokens[..., 0] == number).all() and (tokens[..., 1] == steps[:, None]).all()
         assert np.array_equal(tokens[..., 2], np.float16(np.float32(steps[:, None]) / 3).repeat(4, 1))
+
+
+def test_frames_are_stored_corrected_and_other_tokens_are_refused(tmp_path):
+    corrected = replace(SPEC, image_corrections=("rotate_180", "swap_red_blue"))
+    picture = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
+
+    def draw(_, features):
+        features["steps/observation/image"] = [png(picture)] * len(features["steps/observation/image"])
+
+    directory, frames = write_rlds(tmp_path, SPEC, [6] * 8, change=draw), {}
+    for name, entry in (("plain", SPEC), ("corrected", corrected)):
+        manifest = tokenize_dataset(entry, directory, FakeTokenizer(), tmp_path / name, keep_frames="all")
+        stored = TokenStore(tmp_path / name).episode("toy", "train", 0)
+        frames[name], text = stored.frames[0], (tmp_path / name / "toy" / "manifest.json").read_text()
+        assert manifest.spec.image_corrections == entry.image_corrections
+        assert ("image_corrections" in text) == (name == "corrected")  # so that older stores keep their hash
+    assert np.array_equal(frames["plain"], picture)
+    assert np.array_equal(frames["corrected"], picture[::-1, ::-1, ::-1])
+    with pytest.raises(ConfigError, match="spec.image_corrections"):
+        tokenize_dataset(corrected, directory, FakeTokenizer(), tmp_path / "plain", keep_frames="all")
 
 
 def test_ids_are_not_taken_for_latents(tmp_path, rlds):
