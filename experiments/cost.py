@@ -45,8 +45,7 @@ def estimate(trial: Trial) -> Cost:
     """The cost of one trial, by formula (`hma_jax.model.flops`, `hma_jax.generation.flops`)."""
     from hma_jax.model.flops import train_flops_per_step
 
-    names = trial.datasets if trial.source is None else (*trial.source.datasets, *trial.datasets)
-    table, config = declared_table(names, trial.rate), trial.eval
+    table, config = _table_of(trial), trial.eval
     windows = len(trial.evaluated) * config.windows_per_dataset
     batches = -(-windows // config.batch)  # the last one is filled up
     if trial.measure_untrained:
@@ -57,6 +56,16 @@ def estimate(trial: Trial) -> Cost:
         train_flops=train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         evaluation_flops=batches * config.batch * evaluation_flops_per_window(trial, table),
     )
+
+
+def count_parameters(trial: Trial) -> int:
+    """Of its model, with its own mixture."""
+    return _count_parameters(trial.model, _table_of(trial))
+
+
+def _table_of(trial: Trial) -> EmbodimentTable:
+    names = trial.datasets if trial.source is None else (*trial.source.datasets, *trial.datasets)
+    return declared_table(names, trial.rate)
 
 
 @functools.cache

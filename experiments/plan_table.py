@@ -17,7 +17,7 @@ from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial
-from experiments.words import counted
+from experiments.words import counted, in_thousands
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def plan_table(
         table.add_row(
             escape(name + place + seed),
             *columns,
-            _count(cost.parameters),
-            _count(cost.parameters_one_robot),
+            in_thousands(cost.parameters),
+            in_thousands(cost.parameters_one_robot),
             "" if over else _flops(plan.flops).removesuffix("FLOP"),
             over or _duration(plan.seconds),
         )
@@ -155,10 +155,6 @@ def _places(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
         if sweep.fittable
         for point in sweep.points
     }
-
-
-def _count(parameters: int) -> str:
-    return f"{parameters / 1e6:,.1f} M" if parameters >= 1e6 else f"{parameters / 1e3:,.1f} k"
 
 
 def _short_count(n: int) -> str:

@@ -272,6 +272,10 @@ PRESETS = {
 }  # fmt: skip
 
 
+ON_ACCELERATORS = {"smoke": "accelerator", "cpu": "accelerator", "cpu-full": "accelerator", "play": "play-gpu"}
+"""What takes the place of a preset that is made for a processor where there is a GPU or TPU."""
+
+
 def get_preset(name: str) -> Study:
     """Raises ConfigError, listing the names, when there is none of that name."""
     if name not in PRESETS:

@@ -58,6 +58,7 @@ def run_study(
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
+    from experiments.scale import say_scale, say_unused
     from experiments.trainable import require_trainable
 
     study, workspace = setting.study, setting.workspace
@@ -65,6 +66,9 @@ def run_study(
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
     require_trainable(study, sweeps, launcher_options)
+    if setting.data:
+        say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
+        say_unused(study)
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked():
         require_same_windows(study, workspace, replace)

@@ -16,6 +16,11 @@ def counted(n: int, thing: str) -> str:
     return f"{n:,} {thing}{'s' * (n != 1)}"
 
 
+def in_thousands(n: int) -> str:
+    """'48.0 k', '1.2 M'."""
+    return f"{n / 1e6:,.1f} M" if n >= 1e6 else f"{n / 1e3:,.1f} k"
+
+
 def number(value: float, error: float, sign: str = "") -> str:
     """`value` to two digits of its standard error, and four after the point at most; what rounds to zero has no minus.
     `sign`: "+" for one before every value."""

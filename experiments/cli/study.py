@@ -79,12 +79,16 @@ def _run(
     if running.dry_run:
         from experiments.done import find_done
         from experiments.plan_table import Devices, plan_table
+        from experiments.scale import say_scale, say_unused
         from experiments.trainable import check_trials
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
         devices = Devices(check_trials(setting.study, sweeps, launcher_options.share()), launcher_options.at_once)
         done = find_done(setting, sweeps, running.retry_failed, running.accept_code)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))
+        if given:
+            say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
+            say_unused(setting.study)
         return
     from experiments.run_study import run_study
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from contextlib import ExitStack
 from typing import Annotated
@@ -15,6 +16,7 @@ from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
 from experiments.running.workspace import Busy, Workspace
 from experiments.setting import Setting, make_setting, short
+from experiments.sweeps.sweep import reference_trial
 from experiments.wrote import wrote
 from hma_jax.config import require
 
@@ -49,6 +51,11 @@ def prepare_together(
 
     for option, value in (("--batch", batch), ("--threads", threads)):  # before a tokenizer is trained for hours
         require(value is None or value >= 1, f"{option} must be at least 1, got {value}")
+    if setting.data:
+        from experiments.scale import say_scale
+
+        whole = reference_trial(setting.study, setting.study.seeds[0])
+        say_scale(setting, [dataclasses.replace(whole, max_trajectories=None)])
     with ExitStack() as stack:
         try:
             stack.enter_context(setting.workspace.locked())

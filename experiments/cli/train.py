@@ -72,6 +72,8 @@ def train(
     if dry_run:
         _check(setting, run, model.trajectories, options, trained)
         _print_cost(setting, _single_trial(setting, model.trajectories), run, hosts.count())
+        if trained is None:
+            _say_scale(setting, model.trajectories)
         return
     train_model(setting, run, options, trajectories=model.trajectories, replace=replacement.replace, initial=trained)
 
@@ -126,6 +128,8 @@ def train_model(
     the run `initial` on where one is given, which knows its robots."""
     origin = _check(setting, run, trajectories, options, initial)
     _require_devices(setting)
+    if initial is None:
+        _say_scale(setting, trajectories)
     _prepare(setting, replace)
     start = {}
     if initial is not None:
@@ -287,6 +291,13 @@ def _prepare(setting: Setting, replace: Step | None) -> None:
         if is_writer():
             with setting.workspace.locked():
                 prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
+
+
+def _say_scale(setting: Setting, trajectories: int | None) -> None:
+    from experiments.scale import say_scale
+
+    if setting.data:
+        say_scale(setting, [_single_trial(setting, trajectories)])
 
 
 def _single_trial(setting: Setting, trajectories: int | None) -> Trial:

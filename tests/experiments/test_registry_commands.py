@@ -87,11 +87,13 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
     assert main(["data", "inspect", "data/my_robot", *arguments]) == 0
     said = capsys.readouterr().out
     directory = tmp_path / "data" / "my_robot" / "1.0.0"
-    assert said.splitlines()[-1] == (
-        f"next: hma tokenize --preset cpu --out runs/cpu --data {directory} --registry 'my entries.toml' "
-        "--set model.frames=3 --set eval.prompt_frames=1"
-    )
-    tokenise = shlex.split(said.splitlines()[-1].removeprefix("next: hma "))
+    *_, here, there = said.splitlines()
+    for line, when, preset in ((here, "next", "cpu"), (there, "or, on a GPU or TPU", "accelerator")):
+        assert line == (
+            f"{when}: hma tokenize --preset {preset} --out runs/{preset} --data {directory} --registry 'my entries.toml' "
+            "--set model.frames=3 --set eval.prompt_frames=1"
+        )
+    tokenise = shlex.split(here.removeprefix("next: hma "))
     small = ["--set", "tokenizer_train.steps=1", "--set", "store.min_val=2"]
     assert main([*tokenise, *small]) == 0
 

@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.presets import get_preset
-from experiments.setting import StudyArguments, command
+from rich.text import Text
+
+from experiments.presets import ON_ACCELERATORS, get_preset
+from experiments.progress import console
+from experiments.setting import Preset, StudyArguments, command
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts
@@ -17,15 +20,34 @@ ENTRIES = "my_robots.toml"
 """Where entries are written if there is no file of them yet: a command takes one."""
 
 
+def say_next(
+    datasets: Sequence[Facts], frames: int, registry: Path | None, longest: int, rate: float | None = None
+) -> None:
+    """Prints the command that tokenises `datasets`, by the preset that is the default and by the one for a GPU or TPU,
+    or what to do before. The other arguments are those of `tokenize_command`."""
+    if first := single_episode(datasets):
+        console.print(Text(f"next: {first}"), soft_wrap=True)
+        return
+    default = StudyArguments.preset
+    for preset, when in ((default, "next"), (ON_ACCELERATORS[default], "or, on a GPU or TPU")):
+        words = tokenize_command(preset, [facts.directory for facts in datasets], frames, registry, longest, rate)
+        console.print(Text(f"{when}: {words}"), soft_wrap=True)
+
+
 def tokenize_command(
-    directories: Sequence[str], frames: int, registry: Path | None, longest: int, rate: float | None = None
+    preset_name: Preset,
+    directories: Sequence[str],
+    frames: int,
+    registry: Path | None,
+    longest: int,
+    rate: float | None,
 ) -> str:
-    """The command that tokenises datasets for windows of `frames`, by the preset that is the default.
+    """The command that tokenises datasets for windows of `frames`.
 
     `longest`: frames of the longest episode at that rate; the prompt leaves one of them to judge. `rate`: of
     frames in Hz, if it is not the preset's.
     """
-    preset = get_preset(StudyArguments.preset)
+    preset = get_preset(preset_name)
     changes: dict[str, object] = {}
     if frames != preset.model.frames:
         changes["model.frames"] = frames
@@ -36,7 +58,7 @@ def tokenize_command(
     if rate is not None:
         changes["rate"] = f"{rate:g}"
     settings = tuple(f"{name}={value}" for name, value in changes.items())
-    arguments = StudyArguments(data=tuple(directories), registry=registry, set=settings).anywhere()
+    arguments = StudyArguments(preset_name, data=tuple(directories), registry=registry, set=settings).anywhere()
     return command("tokenize", *arguments.words())
 
 

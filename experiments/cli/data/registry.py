@@ -14,7 +14,7 @@ from rich.text import Text
 from tyro.conf import Positional, arg
 
 from data_pipelines.errors import MAX_LISTED
-from experiments.cli.data.next_command import no_window, other_rate, single_episode, tokenize_command
+from experiments.cli.data.next_command import no_window, other_rate, say_next
 from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, say_unmatched, use_entries
 from experiments.wrote import wrote
@@ -40,7 +40,7 @@ def data_list(
 
     Args:
         words: List only entries with all these words in name, note, camera or group ("open-x", "franka").
-        mixture: List only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
+        mixture: List only the datasets of this mixture: dataset5, 10, 20, 30, 40, dataset40_published or dataset30_vae.
         registry: TOML file with your own registry entries.
     """
     from data_pipelines.registry import MIXTURES, get_mixture, known_groups
@@ -289,11 +289,8 @@ def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, f
     what comes before either."""
     if windows is None:
         return
-    if first:
-        words = first
-    elif windows.total:
-        spans = facts.lengths.longest // windows.stride
-        words = single_episode([facts]) or tokenize_command((facts.directory,), windows.frames, entries, spans)
+    if windows.total and not first:
+        say_next([facts], windows.frames, entries, facts.lengths.longest // windows.stride)
     else:
-        words = no_window(facts, windows.stride, entries)
-    console.print(Text(f"next: {words}"), soft_wrap=True)
+        words = first or no_window(facts, windows.stride, entries)
+        console.print(Text(f"next: {words}"), soft_wrap=True)

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, single_episode, tokenize_command
+from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, say_next
 from experiments.progress import console, step
 from experiments.setting import UNSET, command, say_unmatched, use_entries
 from experiments.wrote import wrote
@@ -175,7 +175,4 @@ def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None)
             continue
         console.print(Text(f"next for {f.name}: {after}"), soft_wrap=True)
     for rate, facts in usable.items():
-        words = single_episode(facts) or tokenize_command(
-            [f.directory for f in facts], frames, registry, longest[rate], rate
-        )
-        console.print(Text(f"next: {words}"), soft_wrap=True)
+        say_next(facts, frames, registry, longest[rate], rate)

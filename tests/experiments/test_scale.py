@@ -1,0 +1,112 @@
+"""Whoever gives data learns, before anything is made of it, how large a model is trained, and on how much of it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.toml_file import to_toml
+from experiments.cli.main import main
+from experiments.cost import count_parameters
+from experiments.presets import ON_ACCELERATORS, PRESETS
+from experiments.study import on_user_data
+from experiments.sweeps.sweep import reference_trial
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import make_spec, write_rlds
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setattr(registry_table, "_registered", {})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> list[str]:
+    """A dataset of four episodes whose entry says that it has 95,000, and one that does not say it."""
+    root, specs = tmp_path_factory.mktemp("data"), [make_spec("large"), make_spec("small")]
+    places = [str(write_rlds(root, spec, [30] * 4)) for spec in specs]
+    large = replace(specs[0], episodes=95_000)
+    (root / "my.toml").write_text(to_toml(large) + to_toml(specs[1]))
+    return ["--data", *places, "--registry", str(root / "my.toml")]
+
+
+def said_by(capsys, *words: str) -> list[str]:
+    assert main(list(words)) == 0
+    return notes(capsys)
+
+
+def notes(capsys) -> list[str]:
+    return [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+
+
+def test_a_dry_run_says_what_the_default_preset_is_made_for(data, capsys, tmp_path):
+    out = ["--out", str(tmp_path)]
+    first, second = said_by(capsys, "study", "--dry-run", *data, *out)
+    assert re.fullmatch(
+        r"note: preset cpu trains models of up to [\d.]+ [kM] parameters on images of 32 x 32 pixels, for 2,500 steps of "
+        r"4 windows, with at most 500 trajectories of each dataset\. It is made for a processor: on a GPU or TPU take "
+        r"--preset accelerator",
+        first,
+    )
+    every = "4,32,500,95000"
+    assert second == (
+        "note: large has 95,000 trajectories, of which a trial takes 500 at most; to use all, with one more point on the "
+        f"axis trajectories: --set trajectory_counts={every}"
+    )
+    (alone,) = said_by(capsys, "sweep", "width", "--dry-run", *data, *out, "--set", f"trajectory_counts={every}")
+    assert "with at most 95,000 trajectories of each dataset" in alone
+    (model,) = said_by(capsys, "train", "--dry-run", *data, *out)
+    assert "trains a model of" in model and "with all trajectories of each dataset" in model
+    (model,) = said_by(capsys, "train", "--dry-run", *data, *out, "--trajectories", "7")
+    assert "with at most 7 trajectories" in model
+
+
+def test_what_is_made_for_an_accelerator_names_no_other(data, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.plan_table.plan_table", lambda *_, **__: "")
+    first, _ = said_by(capsys, "study", "--dry-run", "--preset", "accelerator", *data, "--out", str(tmp_path))
+    assert "for 20,000 steps of 64 windows, with at most 1,000 trajectories" in first and first.endswith("each dataset")
+
+
+def test_the_simulated_suite_needs_no_such_note(capsys, tmp_path):
+    assert said_by(capsys, "train", "--preset", "smoke", "--dry-run", "--out", str(tmp_path)) == []
+
+
+@pytest.mark.parametrize(("command", "lines"), [("study", 2), ("sweep width", 2), ("train", 1), ("tokenize", 1)])
+def test_it_is_said_before_anything_is_made(command, lines, data, capsys, tmp_path, monkeypatch):
+    def stop(*_, **__):
+        raise ConfigError("stop here")
+
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", stop)
+    assert main([*command.split(), "--preset", "smoke", *data, "--out", str(tmp_path / "out")]) == 2
+    said = notes(capsys)
+    assert len(said) == lines and "take --preset accelerator" in said[0]
+
+
+def test_presets_for_a_processor_name_one_that_is_larger():
+    for name, other in ON_ACCELERATORS.items():
+        assert PRESETS[other].flops_per_second > 1e12 > PRESETS[name].flops_per_second
+        assert PRESETS[other].model.width > PRESETS[name].model.width
+        assert (PRESETS[other].model.diffusion is None) == (PRESETS[name].model.diffusion is None)
+
+
+def test_the_page_says_how_large_the_models_are():
+    page = " ".join((Path(__file__).parents[2] / "docs" / "own_data.md").read_text().split())
+    for name, begin in (("cpu", "unless you say otherwise: "), ("accelerator", "take `--preset accelerator` (")):
+        study = on_user_data(PRESETS[name], ["bridge_dataset"])
+        millions, train = count_parameters(reference_trial(study, 0)) / 1e6, study.train
+        assert f"{begin}{millions:.2g} M parameters" in page
+        assert f"{train.steps:,} steps of {train.batch} windows" in page
+        assert f"`{name}` {study.trajectory_counts[-1]:,}" in page
+
+
+def test_parameters_are_those_of_the_dry_run(data, capsys, tmp_path):
+    """The note gives the largest model of the table."""
+    assert main(["sweep", "width", "--dry-run", *data, "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    (told,) = re.findall(r"models of up to ([\d.]+ [kM]) parameters", said)
+    rows = [line for line in said.splitlines() if re.search(r"\b48\b", line) and told in line]
+    assert rows, said
