@@ -1,4 +1,4 @@
-"""Named lists of datasets: the official release's splits (reference section 5.4).
+"""Named lists of datasets: the official release's splits (reference section 5.4), and what is published of its forty.
 
 `FORTY` is ordered such that its first 5, 10 and 20 are the release's own subsets. Its list of
 thirty holds one dataset that its forty lack; the thirty of `FORTY` are 29 of those and one more.
@@ -62,12 +62,17 @@ _NOT_FOR_VAE = (
     "conq_hose_manipulation", f"usc_cloth_sim{_LONG}", "metaworld", "epic_kitchen", "ego4d", "exoego4d",
 )  # fmt: skip
 
+_NOT_AS_RLDS = ("metaworld", "robomimic", "epic_kitchen", "ego4d", "exoego4d")
+_PUBLISHED_AS = {"imperial_wrist_dataset": "imperialcollege_sawyer_wrist_cam"}
+
 MIXTURES: dict[str, tuple[str, ...]] = {
     "dataset5": FORTY[:5],
     "dataset10": FORTY[:10],
     "dataset20": FORTY[:20],
     "dataset30": (*FORTY[:29], f"cmu_franka_exploration_dataset{_LONG}"),
     "dataset40": FORTY,
+    # What of the forty anybody can download as RLDS, under the names that its files have (docs/sweeps.md).
+    "dataset40_published": tuple(_PUBLISHED_AS.get(name, name) for name in FORTY if name not in _NOT_AS_RLDS),
     # The thirty of the released continuous model.
     "dataset30_vae": tuple(name for name in FORTY if name not in _NOT_FOR_VAE),
 }

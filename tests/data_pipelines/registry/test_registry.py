@@ -69,12 +69,28 @@ def test_every_name_is_registered_once():
 
 def test_mixtures_are_the_release_s_lists():
     sizes = {name: len(set(names)) for name, names in MIXTURES.items()}
+    assert sizes.pop("dataset40_published") == 35
     assert sizes == {f"dataset{n}": n for n in (5, 10, 20, 30, 40)} | {"dataset30_vae": 30}
     for small, large in (("dataset5", "dataset10"), ("dataset10", "dataset20"), ("dataset20", "dataset30")):
         assert set(MIXTURES[small]) < set(MIXTURES[large])
     (extra,) = set(MIXTURES["dataset30"]) - set(MIXTURES["dataset40"])  # the release's own inconsistency
     assert extra.startswith("cmu_franka_exploration")
     assert [get_spec(name).name for names in MIXTURES.values() for name in names]
+
+
+def test_what_is_published_of_the_forty_is_in_their_order_and_downloadable():
+    """A study of it adds datasets as one of the forty does, and each is in the public bucket under its name."""
+    published, forty = MIXTURES["dataset40_published"], MIXTURES["dataset40"]
+    named = [name if name in forty else "imperial_wrist_dataset" for name in published]
+    assert named == [name for name in forty if name in named]
+    assert {name for name in forty if name not in named} == {
+        "metaworld",
+        "robomimic",
+        "epic_kitchen",
+        "ego4d",
+        "exoego4d",
+    }
+    assert {name for name in published if name not in EPISODES} == {"bridge_data_v2"}  # of which tfds gives no count
 
 
 def test_unknown_mixture_lists_the_known():
@@ -219,12 +235,33 @@ def test_unknown_name_suggests_the_closest():
         get_spec("zzzzz")
 
 
+def test_images_are_corrected_as_the_entry_says():
+    spec = get_spec("bridge_dataset")
+    images = np.arange(2 * 3 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 3)
+    assert spec.correct(images) is images
+    turned = replace(spec, image_corrections=("rotate_180",)).correct(images)
+    assert np.array_equal(turned, images[:, ::-1, ::-1]) and turned.flags.c_contiguous
+    swapped = replace(spec, image_corrections=("swap_red_blue",)).correct(images)
+    assert np.array_equal(swapped, images[..., [2, 1, 0]])
+    both = replace(spec, image_corrections=("rotate_180", "swap_red_blue"))
+    assert np.array_equal(both.correct(images[0]), images[0, ::-1, ::-1, ::-1])
+    assert both.action_layout() == spec.action_layout() and both.facts() != spec.facts()
+    assert spec.camera_key == spec.image_key != both.camera_key
+
+
+@pytest.mark.parametrize("wrong", [("flip",), ("swap_red_blue", "rotate_180"), ("rotate_180", "rotate_180")])
+def test_corrections_that_there_are_not_are_refused(wrong):
+    with pytest.raises(ConfigError, match="image_corrections may list rotate_180, swap_red_blue"):
+        replace(get_spec("bridge_dataset"), image_corrections=wrong)
+
+
 # --- entries outside the project --------------------------------------------------------------
 
 
 def test_entry_survives_its_toml_file(tmp_path):
     rare = DatasetSpec("rare", "observation/\U0001f916", ("action\u00e9",), (7,), 10)
-    for spec in (*all_specs(), rare):
+    upside_down = replace(rare, image_corrections=("rotate_180",))
+    for spec in (*all_specs(), rare, upside_down):
         (tmp_path / "one.toml").write_text(to_toml(spec), encoding="utf-8")
         assert load_entries(tmp_path / "one.toml") == (spec,)
 
