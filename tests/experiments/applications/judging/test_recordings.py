@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -11,7 +12,12 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import DatasetSpec, get_spec
-from experiments.applications.generating.trajectories import Outline, RldsTrajectories, rewards_of_frames
+from experiments.applications.generating.trajectories import (
+    Outline,
+    RldsTrajectories,
+    describe,
+    rewards_of_frames,
+)
 from experiments.applications.judging.agreement import agree, agree_with_counts, mean_above
 from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
@@ -228,6 +234,14 @@ def test_every_format_says_how_long_a_recording_is_and_whether_it_succeeded(tmp_
         recorded = RldsTrajectories(str(place), "train", spec, Robot(spec.name, 2, zeros, zeros, zeros), 8)
         assert [recorded.outline(i) for i in range(2)] == [Outline(*one) for one in outlines]
         assert len(recorded[0]) == outlines[0][0] and len(set(recorded.ids().tolist())) == len(recorded)
+
+
+def test_recordings_are_shown_as_their_entry_corrects_them(tmp_path):
+    place, robot = str(write_rlds(tmp_path, SPEC, [5])), Robot(SPEC.name, 2, *[(0.0,) * SPEC.action_dim] * 3)
+    corrected = replace(SPEC, image_corrections=("swap_red_blue",))
+    plain, swapped = (RldsTrajectories(place, "train", spec, robot, 8) for spec in (SPEC, corrected))
+    assert plain[0].images.any() and np.array_equal(swapped[0].images, plain[0].images[..., ::-1])
+    assert describe(plain)["image_key"] == SPEC.image_key != describe(swapped)["image_key"]
 
 
 def test_a_frame_has_the_reward_of_the_action_before_it_and_the_last_one_what_came_after():
