@@ -113,7 +113,12 @@ def train_trial(
         table,
         trial.train,
         lambda start: make_loader(
-            store, table, loader, start_step=start, rows=own_rows(execution.mesh, trial.train.batch)
+            store,
+            table,
+            loader,
+            start_step=start,
+            rows=own_rows(execution.mesh, trial.train.batch),
+            threads=execution.loader_threads,
         ),
         execution=execution,
         run_dir=run_dir,

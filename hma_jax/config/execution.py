@@ -66,9 +66,12 @@ class ExecutionConfig:
     # Evaluation: windows per device that are in memory at the same time. Each is continued under
     # 1 + eval.random_actions action sequences, and the caches of those are most of the memory.
     windows_at_once: int = 4
+    # Threads that read training windows ahead, two batches each. More of them where batches come late: long episodes,
+    # latents, slow disks.
+    loader_threads: int = 2
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
     def __post_init__(self):
         check_fields(self)
-        require(self.accumulate >= 1, f"execution.accumulate must be at least 1, got {self.accumulate}")
-        require(self.windows_at_once >= 1, f"execution.windows_at_once must be at least 1, got {self.windows_at_once}")
+        for name in ("accumulate", "windows_at_once", "loader_threads"):
+            require(getattr(self, name) >= 1, f"execution.{name} must be at least 1, got {getattr(self, name)}")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from data_pipelines.loading import loader
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.windows.evalset import freeze_manifest
 from experiments.cli.initial_model import new_datasets, setting_of
@@ -166,6 +167,14 @@ def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, s
     assert all(0 < line["loss"] < 10 and 0 <= line["accuracy"] <= 1 for line in lines)
     assert train.phases[0] == "training"
     assert train.phases[-1] == (f"training, held-out loss {lines[0]['loss']:.4f}" if steps else "training")
+
+
+def test_windows_are_read_by_as_many_threads_as_asked_for(train, monkeypatch):
+    threads, real = [], loader.make_loader
+    monkeypatch.setattr(loader, "make_loader", lambda *a, **how: threads.append(how["threads"]) or real(*a, **how))
+    train("--set", "train.steps=1")
+    train("--set", "train.steps=2", "--set", "execution.loader_threads=5")
+    assert threads == [2, 5]
 
 
 def test_a_run_that_another_process_trains_is_refused(where, tmp_path, capsys):
