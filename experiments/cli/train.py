@@ -330,9 +330,17 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
     from experiments.running.run_trial import open_prepared_data, train_trial
     from hma_jax.runtime.processes import is_writer
+    from hma_jax.training.step_trace import PROFILE, SETTLED
 
     prepared = open_prepared_data(setting.workspace)
     say_data(trial, prepared)
+    profile = run / PROFILE
+    if options.trace and is_writer():
+        say(
+            f"note: {counted(options.trace, 'step')} will be profiled, after {SETTLED} others, in {short(profile)}. To see "
+            f"that: pip install xprof, then xprof --logdir {short(profile)}; or open its perfetto_trace.json.gz at "
+            "https://ui.perfetto.dev"
+        )
     each = counted(trial.train.batch, "window")
     with step(f"train width {trial.model.width} for {counted(trial.train.steps, 'step')} of {each}") as update:
         result = train_trial(
@@ -347,7 +355,7 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
     if not is_writer():
         return
     console.print(f"loss {result.losses[-1]:.4f} after {counted(len(result.losses), 'step')}")
-    wrote(run, then=setting.command("evaluate", run.absolute()))
+    wrote(run, *[profile] * bool(options.trace), then=setting.command("evaluate", run.absolute()))
 
 
 def say_data(trial: Trial, prepared: PreparedData) -> None:

@@ -1,4 +1,4 @@
-"""Options of one training run, of `hma train` and `hma adapt`: checkpoints and validation."""
+"""Options of one training run, of `hma train` and `hma adapt`: checkpoints, validation and a profile."""
 
 from __future__ import annotations
 
@@ -41,6 +41,9 @@ class RunOptions:
     ] = None
     """Steps between evaluations of the loss on held-out windows; 0: none.
     They are written to RUN/validation.jsonl."""
+    trace: Annotated[int | None, arg(metavar="STEPS"), UNSET] = None
+    """Record a profile of so many steps with JAX's profiler, after the first ten, in RUN/profile
+    (docs/performance.md)."""
 
     def check(self) -> None:
         """Raises ConfigError, in the words of the command line."""
@@ -48,7 +51,8 @@ class RunOptions:
         for name, more in (("checkpoint_every", hint), ("checkpoint_minutes", hint), ("validate_every", "")):
             value, flag = getattr(self, name), "--" + name.replace("_", "-")
             require(value is None or value >= 0, f"{flag} must not be negative, got {value}{more}")
-        require(self.keep_checkpoints >= 1, f"--keep-checkpoints must be at least 1, got {self.keep_checkpoints}")
+        for flag, value in (("--keep-checkpoints", self.keep_checkpoints), ("--trace", self.trace)):
+            require(value is None or value >= 1, f"{flag} must be at least 1, got {value}")
 
     def steps_between(self, steps: int) -> tuple[int, int]:
         """(checkpoints, validations) of a run of `steps`; 0: none."""

@@ -138,6 +138,7 @@ def train_trial(
             keep_checkpoints=options.keep_checkpoints,
             keep_steps=keep,
             skip_damaged=options.skip_damaged,
+            trace_steps=options.trace or 0,
         ),
         validation=Validation(validate_every, lambda: validation_batches(trial, prepared, table, execution))
         if validate_every

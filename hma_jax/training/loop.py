@@ -10,6 +10,7 @@ Files of a run directory:
     timing.jsonl      seconds, throughput, utilisation: whatever depends on the machine
     execution.jsonl   one line per start of the run: from which step, how and on what it is computed
     tensorboard/      the same for TensorBoard
+    profile/          what devices and host did in some steps, where that was asked for, see `step_trace`
     checkpoints/      see `checkpoints`; damaged/ holds those that were skipped
     diverged.json     of the last step that was not finite: its number, and the records of its batch
     .lock             held by the process that trains, see `run_lock`
@@ -39,6 +40,7 @@ from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Progress, RunLog, SilentLog, open_log
 from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 from hma_jax.training.state import FINITE
+from hma_jax.training.step_trace import PROFILE, StepTrace
 
 
 class Interrupted(RuntimeError):
@@ -62,6 +64,7 @@ class LoopOptions:
     keep_steps: tuple[int, ...] = ()  # saved after these too, and kept: others go on from there
     skip_damaged: bool = False  # go on from the newest checkpoint that is whole
     log_every: int = 10  # steps between lines of timing.jsonl
+    trace_steps: int = 0  # so many steps after a start are profiled
     flops_per_step: float = 0.0  # by formula, for achieved FLOP/s; 0: unknown
     peak_flops: float | None = None  # of all devices together, for MFU
     # may_change(the checkpoint's description, its step) -> names of fields that may differ when a run resumes.
@@ -71,6 +74,7 @@ class LoopOptions:
     def __post_init__(self):
         for name in ("keep_checkpoints", "log_every"):
             require(getattr(self, name) >= 1, f"LoopOptions.{name} must be at least 1, got {getattr(self, name)}")
+        require(self.trace_steps >= 0, f"LoopOptions.trace_steps must not be negative, got {self.trace_steps}")
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ class RunInfo:
 class FitResult:
     state: Any = field(repr=False)
     losses: list[float]  # one per step, from the first step of the run (processes but 0: of this start)
-    seconds: float  # spent in steps by this process, without compiling and validating
+    seconds: float  # spent in steps by this process, without compiling, validating and writing a profile
     compile_seconds: float
     resumed_from: int
 
@@ -150,7 +154,8 @@ def fit(
             clock=clock,
             progress=progress,
         )
-        with closing(log):
+        traced = options.trace_steps if is_writer() else 0
+        with closing(log), StepTrace(run_dir / PROFILE, traced, start, steps) as trace:
             if start >= steps:
                 return FitResult(state, log.losses, 0.0, 0.0, start)
             log.write_start(_describe_start(start, info.execution))
@@ -163,7 +168,7 @@ def fit(
             barrier("compiled")
 
             began = saved = clock()
-            validation_seconds = 0.0
+            seconds_aside = 0.0
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
 
@@ -171,9 +176,19 @@ def fit(
                 return STOP if stop.is_set() else SAVE if _is_late(clock() - saved, options) else 0
 
             for step in range(start + 1, steps + 1):
-                state, metrics = compiled(state, batch)
-                if step < steps:
-                    batch = put_batch(_next(batches, step, steps))
+                if step == trace.first:
+                    jax.block_until_ready(state)
+                    trace.start()
+                with jax.profiler.StepTraceAnnotation("train", step_num=step):
+                    state, metrics = compiled(state, batch)
+                    if step < steps:
+                        batch = put_batch(_next(batches, step, steps))
+                if step == trace.last:
+                    jax.block_until_ready(state)
+                    before = clock()
+                    trace.stop()
+                    log.discount(clock() - before)
+                    seconds_aside += clock() - before
                 if pending is not None:
                     _report(log, *pending, info.records)
                 pending = (step, metrics)
@@ -189,7 +204,7 @@ def fit(
                     before = clock()
                     log.write_validation(step, validation.measure(state))
                     log.discount(clock() - before)
-                    validation_seconds += clock() - before
+                    seconds_aside += clock() - before
                 if to_save:
                     log.flush()
                     _require_held(lock, run_dir, step)
@@ -202,7 +217,7 @@ def fit(
                         f"stopped at step {step} of {steps}; the same command resumes from {run_dir}", stop.exit
                     )
             jax.block_until_ready(state)
-            seconds = clock() - began - validation_seconds
+            seconds = clock() - began - seconds_aside
             checkpoints.wait()
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 

@@ -169,6 +169,13 @@ def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, s
     assert train.phases[-1] == (f"training, held-out loss {lines[0]['loss']:.4f}" if steps else "training")
 
 
+def test_steps_are_profiled_as_asked_for_and_the_place_is_said(train, tmp_path):
+    said, _, _ = train("--set", "train.steps=3", "--trace", "2")
+    profile = tmp_path / "run" / "profile"
+    assert f"note: 2 steps will be profiled, after 10 others, in {profile}. To see that: pip install xprof" in said
+    assert f"wrote {profile}" in said and list(profile.glob("plugins/profile/*/*.xplane.pb"))
+
+
 def test_windows_are_read_by_as_many_threads_as_asked_for(train, monkeypatch):
     threads, real = [], loader.make_loader
     monkeypatch.setattr(loader, "make_loader", lambda *a, **how: threads.append(how["threads"]) or real(*a, **how))
@@ -214,7 +221,7 @@ def test_the_average_of_the_weights_is_evaluated_unless_told_otherwise(train, wh
     "setting",
     [
         ["--trajectories", "0"], ["--checkpoint-every", "-1"], ["--checkpoint-minutes", "-1"],
-        ["--keep-checkpoints", "0"], ["--validate-every", "-1"],
+        ["--keep-checkpoints", "0"], ["--validate-every", "-1"], ["--trace", "0"],
     ],
 )  # fmt: skip
 def test_settings_of_its_own_are_checked_before_any_work(setting, where, capsys):

@@ -1,0 +1,48 @@
+"""A profile of some steps of a run, which JAX records: what devices and host did when.
+
+It is written for XProf and TensorBoard, and once more for https://ui.perfetto.dev (docs/performance.md).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+
+PROFILE = "profile"
+"""Folder of a run directory."""
+
+SETTLED = 10
+"""Steps after a start that are not recorded, if there are others: buffers fill in them, libraries choose programs."""
+
+
+class StepTrace:
+    """Records `count` steps of a run that goes from step `start` to `steps`: from `first` to `last`, both 0 for none.
+
+    Use it as a context manager: a recording that is not finished ends with the block.
+    """
+
+    def __init__(self, directory: Path, count: int, start: int, steps: int):
+        self.directory = directory
+        self.first = self.last = 0
+        if count:
+            self.first = 1 + max(min(start + SETTLED, steps - count), start)
+            self.last = min(self.first + count - 1, steps)
+        self._recording = False
+
+    def start(self) -> None:
+        """Before the first step, when the device has nothing to do."""
+        jax.profiler.start_trace(self.directory, create_perfetto_trace=True)
+        self._recording = True
+
+    def stop(self) -> None:
+        """Writes the profile, when the last step is computed."""
+        self._recording = False
+        jax.profiler.stop_trace()
+
+    def __enter__(self) -> StepTrace:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._recording:
+            self.stop()
