@@ -9,8 +9,8 @@ PRESET ?= cpu
 WORKERS ?= 2
 PORT ?= 8765
 EXTRA ?=
-ifneq ($(EXTRA),$(filter cuda tpu,$(EXTRA)))
-$(error EXTRA is '$(EXTRA)': give cuda or tpu, or leave it out for the processor)
+ifneq ($(EXTRA),$(filter cuda cuda12 tpu,$(EXTRA)))
+$(error EXTRA is '$(EXTRA)': give cuda, cuda12 or tpu, or leave it out for the processor)
 endif
 
 # What is imported is compiled once and kept in .venv: hundreds of processes of the tests would each compile it again.
@@ -19,13 +19,13 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help study play test test-slow clean
 
 help:
-	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS); EXTRA=cuda or tpu)"
+	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS); EXTRA=cuda, cuda12 or tpu)"
 	@echo "make play       drive a trained model in the browser (RUN=a training run, PORT=$(PORT))"
 	@echo "make test       run the tests that take less than about 20 s each"
 	@echo "make test-slow  run the others too"
 	@echo "make clean      remove the environment and caches; results under runs/ stay"
 
-# EXTRA is what JAX computes on: nothing for the processor, cuda or tpu.
+# EXTRA is what JAX computes on: nothing for the processor, cuda (CUDA 13), cuda12 (for older drivers) or tpu.
 study: $(VENV)/installed$(addprefix -,$(EXTRA))
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
