@@ -36,8 +36,8 @@ def test_lerobot_and_robomimic_go_from_inspection_and_view_to_tokens(tmp_path, c
     assert "rate 4 Hz (registry), although its files say 20: stride 2" in capsys.readouterr().out
     common = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--registry", str(entries), "--data", *data]
     assert main(["tokenize", *common, "--set", "model.frames=4"]) == 0
-    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
-    assert notes == [
+    size, *notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert size.startswith("note: preset smoke trains a model of") and notes == [
         "note: robomimic_lift: its files say 20 Hz, but its registry entry 4 Hz, which is used; if the files are right, correct the "
         "entry"
     ]
