@@ -85,9 +85,10 @@ def _named(visible: str) -> tuple[str, ...]:
 
 
 @cache
-def _gpus() -> tuple[str, ...]:
-    if shutil.which("nvidia-smi") is None:
-        return ()
+def _gpus(devices: Path = Path("/dev")) -> tuple[str, ...]:
+    if shutil.which("nvidia-smi") is None:  # a container may have the devices alone, and numbers them anew
+        found = [device for device in devices.glob("nvidia*") if device.name.removeprefix("nvidia").isdigit()]
+        return tuple(map(str, range(len(found))))
     command = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)

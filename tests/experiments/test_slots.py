@@ -67,6 +67,13 @@ def test_what_the_user_allows_is_what_is_divided(environment, found, monkeypatch
     assert find_accelerators(environment) == found
 
 
+def test_gpus_are_counted_by_their_devices_where_a_container_has_no_program_that_lists_them(tmp_path, monkeypatch):
+    for name in ("nvidia3", "nvidia5", "nvidiactl", "nvidia-uvm", "null"):
+        (tmp_path / name).touch()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert slots._gpus(tmp_path) == ("0", "1")
+
+
 def test_tpu_chips_are_counted_on_the_bus(tmp_path):
     for number, (vendor, device) in enumerate(
         [
