@@ -2,6 +2,7 @@
 
 import ast
 import io
+import re
 import subprocess
 import sys
 import tokenize
@@ -11,6 +12,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+TWICE = re.compile(r"\b(\w+(?: \w+)+),? \1\b|(-[a-z]+)\2|\w([a-z]{2,})\3\3")
+"""Words that follow themselves, or an ending that does: what is left of replacing them again and again."""
 
 
 @pytest.mark.parametrize("command", [("check",), ("format", "--check")], ids=" ".join)
@@ -40,3 +43,33 @@ def test_docstrings_and_comments_are_no_wider_than_the_code():
         if beyond := {n for n, line in enumerate(text.split("\n"), 1) if len(line) > most}:
             wide += [f"{path.relative_to(ROOT)}:{n}" for n in sorted(beyond & lines_to_read(text))]
     assert not wide, f"break these lines at {most} characters: {', '.join(wide)}"
+
+
+def texts(tree: ast.AST) -> list[tuple[int, str]]:
+    """(line, text) of every text of a program but docstrings; what an f-string inserts is left out."""
+    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            found.append((node.lineno, "".join(p.value if isinstance(p, ast.Constant) else "{}" for p in node.values)))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+            found.append((node.lineno, node.value))
+    return found
+
+
+def test_nothing_that_is_printed_says_its_words_twice():
+    for text in (
+        "not little-endian-endian",
+        "nested too deeplylyly",
+        "which is 4, which is 4",
+        "cost of the cost of the",
+    ):
+        assert TWICE.search(text)
+    files = [p for f in ("hma_jax", "data_pipelines", "experiments") for p in sorted((ROOT / f).rglob("*.py"))]
+    twice = [
+        f"{path.relative_to(ROOT)}:{line}: {found[0]!r}"
+        for path in files
+        for line, text in texts(ast.parse(path.read_text(encoding="utf-8")))
+        if (found := TWICE.search(text))
+    ]
+    assert not twice, "; ".join(twice)

@@ -147,7 +147,7 @@ class _Compact:
 
     def _read(self, kind: int, depth: int) -> Any:
         if depth > MAX_DEPTH:
-            raise ValueError("it is nested too deeplylylylyly")
+            raise ValueError("it is nested too deeply")
         if kind in (I16, I32, I64):
             return self._integer()
         if kind in (TRUE, FALSE, BYTE):

@@ -157,7 +157,7 @@ def _print_layouts(name: str, made: Plan) -> None:
 
     sizes = " x ".join(f"{axis} {size}" for axis, size in made.mesh.items())
     _print_lines(
-        f"{name}: sharding of the sharding of the parameters on a mesh of {sizes}, and what one device stores",
+        f"{name}: sharding of the parameters on a mesh of {sizes}, and what one device stores",
         describe_sharding(made.decisions),
     )
 

@@ -150,10 +150,8 @@ def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
             require(len(pickles) == 1, f"{path} is a zip file without a torch state dict{advice}")
             root = pickles[0].removesuffix("data.pkl")
             if f"{root}byteorder" in archive.namelist():
-                require(
-                    archive.read(f"{root}byteorder") == b"little",
-                    f"{path}: its byte order is not little-endian-endian-endian",
-                )
+                little = archive.read(f"{root}byteorder") == b"little"
+                require(little, f"{path}: its byte order is not little-endian; save it on a little-endian machine")
             state = _Reader(path, archive, root, whole=within is not None).load()
     except _Refused:
         raise

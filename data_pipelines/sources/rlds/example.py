@@ -202,9 +202,7 @@ def _numbers(data: bytes | FileView, parts: array, single: int) -> bytes | bytea
                 raise ValueError(f"a list of numbers runs past the end of its message at byte {end}")
             if single == _FIXED32 and (at - start) % 4:
                 raise ValueError(
-                    f"a list of floats at byte {start} is {at - start} bytes long, which is not a multiple of 4, "
-                    "which is not a multiple of 4, which is not a multiple of 4, which is not a multiple of 4, which "
-                    "is not a multiple of 4"
+                    f"a list of floats at byte {start} is {at - start} bytes long, which is not a multiple of 4"
                 )
             if single == _VARINT and at > start and data[at - 1] >= 0x80:
                 raise ValueError("a varint is cut off")

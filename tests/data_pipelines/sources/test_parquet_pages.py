@@ -93,5 +93,5 @@ def test_a_file_that_is_cut_off_is_refused(table, kept):
 def test_a_footer_that_would_be_read_for_ever_is_refused(table):
     nested = b"\x1c" * 100
     table.write_bytes(b"PAR1" + nested + len(nested).to_bytes(4, "little") + b"PAR1")
-    with pytest.raises(ValueError, match="nested too deeply"):
+    with pytest.raises(ValueError, match="nested too deeply$"):
         check(table)

@@ -74,12 +74,12 @@ def rebuild(storage: Storage, shape, stride, offset=0, function="_rebuild_tensor
     return Call(Global("torch._utils", function), storage, offset, shape, stride, False, empty)
 
 
-def write_torch(path: Path, state, elements: dict[str, bytes], root: str = "archive") -> Path:
+def write_torch(path: Path, state, elements: dict[str, bytes], root: str = "archive", order: str = "little") -> Path:
     buffer = io.BytesIO()
     Writer(buffer, protocol=2).dump(state)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(f"{root}/data.pkl", buffer.getvalue())
-        archive.writestr(f"{root}/byteorder", "little")
+        archive.writestr(f"{root}/byteorder", order)
         for key, data in elements.items():
             archive.writestr(f"{root}/data/{key}", data)
     return path
@@ -190,6 +190,8 @@ def test_other_files_and_other_contents_are_named(tmp_path):
         read_torch(write_torch(tmp_path / "x.bin", {"step": 3}, {}))
     with pytest.raises(ConfigError, match="cannot be read"):
         read_torch(write_torch(tmp_path / "y.bin", {"w": rebuild(Storage("FloatStorage", "9", 1), (1,), (1,))}, {}))
+    with pytest.raises(ConfigError, match="its byte order is not little-endian; save it on"):
+        read_torch(write_torch(tmp_path / "big.bin", {}, {}, order="big"))
     with zipfile.ZipFile(tmp_path / "z.bin", "w") as archive:
         archive.writestr("readme", "")
     with pytest.raises(ConfigError, match="without a torch state dict"):
