@@ -149,7 +149,8 @@ def inspect_dataset(
     Raises DataError for a directory that is no dataset or has no readable episode, ConfigError for an
     unknown split.
     """
-    require(episodes >= 1 and frames >= 2, f"episodes and frames must be at least 1, got {episodes} and {frames}")
+    require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
+    require(frames >= 2, f"frames must be at least 2, got {frames}: a camera's first and last are compared")
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
     _require_steps(source, fields)

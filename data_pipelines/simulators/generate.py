@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from pathlib import Path
@@ -118,13 +118,22 @@ def generate_sim(
 
     fingerprints = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
     with ExitStack() as locks:
-        run = _Run(root, fingerprints, episodes, size, seed, len(specs) * episodes, progress, locks)
+        run = _Run(
+            root=root,
+            fingerprints=fingerprints,
+            episodes=episodes,
+            size=size,
+            seed=seed,
+            total=len(specs) * episodes,
+            progress=progress,
+            stack=locks,
+        )
         jobs = [job for spec in specs for job in run.plan(spec)]
         failures = run.work(jobs, workers)
     if failures:
         raise DataError(
             f"{len(failures)} of {len(specs)} datasets could not be made; the others are complete. "
-            + " ".join(failures)
+            + " ".join(failures.values())
             + " The same command tries them again."
         )
     return [root / spec.name / VERSION for spec in specs]
@@ -134,7 +143,16 @@ class _Run:
     """One call of `generate_sim`: what is finished, and the running processes."""
 
     def __init__(
-        self, root: Path, fingerprints: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack
+        self,
+        *,
+        root: Path,
+        fingerprints: Mapping[str, str],
+        episodes: int,
+        size: int,
+        seed: int,
+        total: int,
+        progress: Progress | None,
+        stack: ExitStack,
     ):
         self.root, self.fingerprints, self.episodes, self.size, self.seed = root, fingerprints, episodes, size, seed
         self.done, self.total, self.progress = 0, total, progress
@@ -179,17 +197,18 @@ class _Run:
     def missing(self, name: str) -> list[int]:
         return [i for i in range(self.episodes) if not record_path(self.staging(name), i).is_file()]
 
-    def work(self, jobs: Sequence[Job], workers: int) -> list[str]:
-        """Runs `jobs` and returns what failed. When it is interrupted its processes are ended."""
+    def work(self, jobs: Sequence[Job], workers: int) -> dict[str, str]:
+        """Runs `jobs` and returns for each dataset that one of them failed for what is to be said of it, once for all
+        of them. When it is interrupted its processes are ended."""
         with ThreadPoolExecutor(workers) as pool:
-            running = [pool.submit(self.run, job) for job in jobs]
+            running = {pool.submit(self.run, job): job.name for job in jobs}
             try:
-                failures = [job.result() for job in as_completed(running)]
+                outcomes = [(running[job], job.result()) for job in as_completed(running)]
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 self.stop()
                 raise
-        return sorted({failure for failure in failures if failure})
+        return dict(sorted((name, failure) for name, failure in outcomes if failure))
 
     def run(self, job: Job) -> str:
         """One process. Returns what is to be said if it failed, nothing if not."""

@@ -86,6 +86,14 @@ def test_sample_is_bounded_in_episodes_and_bytes(toy):
     assert facts.sampled == 1 and facts.stopped and not sample.facts.stopped
 
 
+@pytest.mark.parametrize(
+    "asked, message", [({"episodes": 0}, "episodes .* 1, got 0"), ({"frames": 1}, "frames .* 2, got 1")]
+)
+def test_too_few_episodes_or_frames_are_refused_each_by_its_name(toy, asked, message):
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        inspect_dataset(toy, **asked)
+
+
 def test_frames_that_are_read_one_by_one_count_as_what_is_read(tmp_path):
     """Of a video its pixels; of images in a table, and of an HDF5 file, all that lies in the group that is read."""
     pytest.importorskip("av")

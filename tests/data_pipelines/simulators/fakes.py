@@ -38,13 +38,13 @@ class FakeProcess:
     """Stands for a worker process: makes its episodes, or dies on the way."""
 
     made: list[int] = []
-    dies_at: int | None = None
+    dies_at: tuple[int, ...] = ()
 
     def __init__(self, command, stdout, stderr, env, text):
         job = Job.from_json(command[-1])
         self.code, lines = 0, []
         for i in job.episodes:
-            if i == self.dies_at:
+            if i in self.dies_at:
                 stderr.write(b"cannot draw\n")
                 stderr.flush()
                 self.code = -11
@@ -59,8 +59,8 @@ class FakeProcess:
 
 
 def fake_workers(monkeypatch) -> type[FakeProcess]:
-    """Simulations of `pusht` are fakes; `made` lists their episodes, `dies_at` names one that fails."""
-    FakeProcess.made, FakeProcess.dies_at = [], None
+    """Simulations of `pusht` are fakes; `made` lists their episodes, `dies_at` names those that fail."""
+    FakeProcess.made, FakeProcess.dies_at = [], ()
     monkeypatch.setattr(generate.subprocess, "Popen", FakeProcess)
     monkeypatch.setattr(generate, "require_packages", lambda specs: None)
     monkeypatch.setattr(packages.importlib.metadata, "version", lambda name: "1.0")

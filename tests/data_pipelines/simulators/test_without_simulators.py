@@ -55,7 +55,8 @@ def test_what_was_simulated_is_read_back(home):
 def test_tfds_decodes_the_records(home):
     import tensorflow_datasets as tfds
 
-    from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
+    from data_pipelines.sources.rlds.tfrecord import read_record
+    from tests.data_pipelines.shards import index_shard
 
     features = tfds.builder_from_directory(str(home / "pusht" / "1.0.0")).info.features
     shard = index_shard(next((home / "pusht" / "1.0.0").glob("*.tfrecord-*")))
@@ -159,7 +160,7 @@ def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
     assert sorted(fake.made) == list(range(12))
 
     fake.made.clear()
-    fake.dies_at = 4
+    fake.dies_at = (4,)
     message = "pusht: its simulator ended with exit code -11: cannot draw.*tries them again"
     with pytest.raises(DataError, match=message):
         run(tmp_path / "cut")
@@ -167,7 +168,7 @@ def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
     assert not (tmp_path / "cut" / "pusht" / "1.0.0").exists()
 
     fake.made.clear()
-    fake.dies_at = None
+    fake.dies_at = ()
     seen = []
     run(tmp_path / "cut", progress=lambda name, done, total: seen.append((done, total)))
     assert sorted(fake.made) == list(range(4, 10)), "episodes were made again"
@@ -177,6 +178,15 @@ def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
     fake.made.clear()
     run(tmp_path / "cut")
     assert fake.made == []
+
+
+def test_datasets_that_could_not_be_made_are_counted_not_their_processes(tmp_path, fake):
+    fake.dies_at = (4, 10)  # of both jobs
+    with pytest.raises(
+        DataError, match="^1 of 1 datasets could not be made; .* pusht: its simulator .* tries"
+    ) as error:
+        run(tmp_path)
+    assert str(error.value).count("cannot draw") == 1
 
 
 def test_a_dataset_of_other_settings_or_of_others_is_not_replaced(tmp_path, fake):
