@@ -14,12 +14,9 @@ import numpy as np
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
 from hma_jax.config.base import require_choice
-from hma_jax.simulator.interface import Actions, chosen_episodes, each_start, whole_numbers
+from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_start, read_only, whole_numbers
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
-
-HISTORY = 600
-"""Frames that an episode can be taken back by, as many as in a learned simulator: older states are not kept."""
 
 
 class World(Protocol):
@@ -85,7 +82,7 @@ class TrueSimulator(ABC, Generic[W]):
 
     @property
     def images(self) -> np.ndarray:
-        return self._images
+        return read_only(self._images)
 
     def reset(
         self,
@@ -130,7 +127,7 @@ class TrueSimulator(ABC, Generic[W]):
         self.clipped = clipped
         for b, (world, chunk) in asked.items():
             self._before[b].append(world.get_state())
-            del self._before[b][:-HISTORY]
+            del self._before[b][:-HISTORY]  # as many as a learned simulator keeps
             for action in chunk:
                 world.step(action)
             self._draw(b, world)

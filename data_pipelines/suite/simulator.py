@@ -70,10 +70,11 @@ def _keys(spec: EmbodimentSpec) -> tuple[tuple[float, ...], ...]:
 def suite_starts(
     name: str, count: int, frames: int, *, stride: int | None = None, seed: int = 0, most: int | None = None
 ) -> list[Start]:
-    """The first `frames` frames of those of the first `count` held-out episodes of a suite made with `seed` that are
-    long enough, at most of `most` of them (None: of all).
+    """The first `frames` frames of episodes that begin as the first `count` held-out ones of a suite made with `seed`:
+    of those that are long enough, at most of `most` of them (None: of all).
 
-    A frame is seen every `stride` native steps; None: as nearly twice a second as they can be.
+    Their actions are drawn anew: they are not those of the suite's episodes, and depend on `count`. A frame is seen
+    every `stride` native steps; None: as nearly twice a second as they can be.
     """
     spec = SPECS[name]
     stride, numbers = stride or stride_of(spec.hz), episode_seeds(spec, count, seed, "val")

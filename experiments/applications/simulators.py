@@ -120,8 +120,8 @@ def in_suite(robot: Robot) -> bool:
 
 
 def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int = 0) -> list[Start]:
-    """`frames` frames, of `size`, of the robot's held-out episodes: those of the suite's first `count` that are long
-    enough, or so many new ones of its physics simulator."""
+    """`frames` frames, of `size`, of episodes that begin as the robot's held-out ones (`suite_starts`): of the suite's
+    first `count` those that are long enough, or so many new ones of its physics simulator."""
     if not in_suite(robot):
         return physics_starts(robot.name, count, frames, stride=robot.stride, image_size=size, seed=seed)
     made = suite_starts(robot.name, count, frames, stride=robot.stride, seed=seed)

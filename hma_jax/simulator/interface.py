@@ -47,6 +47,17 @@ class AnySimulator(Protocol):
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray: ...
 
 
+HISTORY = 600
+"""Frames that an episode can be rewound by, by default."""
+
+
+def read_only(images: np.ndarray) -> np.ndarray:
+    """A view that cannot be written to: callers of a simulator see its frames, and do not change them."""
+    view = images.view()
+    view.flags.writeable = False
+    return view
+
+
 def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
     """`values` as ints. Raises ConfigError for anything else: 0.5 is not truncated to 0."""
     try:

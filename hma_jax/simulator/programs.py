@@ -7,7 +7,7 @@ the last donate it. The first three work on some of the episodes, and are compil
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -69,9 +69,9 @@ class Programs:
         self.weights = ProgramParams(model.params, tokenizer.params)
         declared, capacity = model.declared, model.config.frames - 1
         hidden = model.run.train.masking.ignores_actions
-        to_images: Callable[[ProgramParams, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(
-            w.tokenizer, x
-        )
+
+        def to_images(weights: ProgramParams, tokens: jax.Array) -> jax.Array:
+            return tokenizer.decode_uint8_fn(weights.tokenizer, tokens)
 
         def fresh(weights: ProgramParams, tokens: jax.Array, at: ResetInputs) -> Episodes:
             chunks, robots = jnp.asarray(at.chunks), jnp.asarray(at.robots)

@@ -20,7 +20,7 @@ from hma_jax.config.base import require_choice, require_seed
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, find_robots, find_starts, find_tokenizer
-from hma_jax.simulator.interface import Actions, chosen_episodes, each_start, whole_numbers
+from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_start, read_only, whole_numbers
 from hma_jax.simulator.programs import Programs, ResetInputs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -29,9 +29,6 @@ from hma_jax.training.runs import Model, load_model, require_frames
 
 Rate = Literal["model", "native"]
 """Whether a step is a frame of the model, or one native action: then a frame comes with every stride-th."""
-
-HISTORY = 600
-"""Frames that an episode can be rewound by, by default."""
 
 log = logging.getLogger(__name__)
 
@@ -117,13 +114,12 @@ class Simulator:
     @property
     def images(self) -> np.ndarray:
         """The present frames, uint8 [B, H, W, 3]; black where none has begun. Read-only."""
-        view = self._images.view()
-        view.flags.writeable = False
-        return view
+        return read_only(self._images)
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Frames of each episode so far, those that it began with included; 0: it has not begun."""
+        """Frames of each episode so far, those of its start that the model did not see excluded; 0: it has not
+        begun."""
         return tuple(0 if e is None else e.count for e in self._episodes)
 
     @property

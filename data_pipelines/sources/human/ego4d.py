@@ -122,10 +122,10 @@ class Ego4dSource:
             for frame in action.get("frames") or ():
                 row = self._centres(frame, size, f"{where}, frame {frame.get('frame_number')}")
                 if row is not None:
-                    number = self._field(frame, "frame_number", where)
-                    if type(number) is not int or not 0 <= number < video.max_frames:
-                        raise UnitError(f"{self.path}: {where} has frame_number {quote(number)}. {ADVICE}")
-                    found.setdefault(number, row)
+                    frame_number = self._field(frame, "frame_number", where)
+                    if type(frame_number) is not int or not 0 <= frame_number < video.max_frames:
+                        raise UnitError(f"{self.path}: {where} has frame_number {quote(frame_number)}. {ADVICE}")
+                    found.setdefault(frame_number, row)
         numbers = sorted(found)
         return np.array(numbers) / rate, np.array([found[n] for n in numbers]).reshape(-1, 4)
 

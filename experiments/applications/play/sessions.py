@@ -115,7 +115,7 @@ class SessionManager:
     # --- Coming and going --------------------------------------------------------------------------
 
     def connect(self, token: str | None) -> Visitor:
-        """The visitor with this token, if there still is one, or a new one. Raises Full."""
+        """The visitor with this token, if there still is one, or a new one. Raises NoFreeSession."""
         now = time.monotonic()
         if token in self.visitors:
             visitor = self.visitors[token]

@@ -18,7 +18,7 @@ PUSHER, ARM = robot("pusher_sand", 2, 2), robot("arm_chalk", 3, 2)
 
 
 @pytest.mark.parametrize("asked, stride", [(None, 2), (1, 1), (3, 3)])
-def test_a_start_goes_on_as_the_recorded_episode_did(asked, stride):
+def test_a_start_goes_on_as_its_own_actions_did(asked, stride):
     start = suite_starts("pusher_sand", 8, 4, stride=asked)[0]
     begun = SuiteSimulator([robot("pusher_sand", 2, stride, 1e9)])
     seen = begun.reset(type(start)(start.robot, start.images[:2], start.actions[:stride], start.seed))
@@ -30,6 +30,7 @@ def test_episodes_are_apart_clipped_and_taken_back(monkeypatch):
     sim = SuiteSimulator([PUSHER, ARM], episodes=2)
     starts = [suite_starts("pusher_sand", 8, 1)[0], suite_starts("arm_chalk", 8, 1)[0]]
     first = sim.reset(starts)
+    assert not first.flags.writeable and not sim.images.flags.writeable, "as of a learned simulator"
     images = sim.step([np.array([5.0, 0.0]), None])
     assert sim.clipped == [("xy x",), ()] and (images[0] != first[0]).any()
     np.testing.assert_array_equal(images[1], first[1])
