@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError
+from hma_jax.runtime.files import sync
 
 MAGIC = b"HMACOLS1"
 ALIGNMENT = 64
@@ -57,11 +58,7 @@ def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync(path.parent)
 
 
 class Columns:
@@ -90,16 +87,6 @@ class Columns:
             raise self._damaged(f"its header is not a table ({error})") from error
         self._begin, self._size = _aligned(_START + length), size
         self._mapped: dict[str, np.ndarray] = {}
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self._table)
-
-    def __len__(self) -> int:
-        return len(self._table)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._table
 
     def digest(self, name: str) -> str:
         """SHA-256 of a column as it was written, without reading it."""

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.registry.angles import SWITCH_SHARE, AngleUnit, find_turns
+from data_pipelines.tokens.row_sample import QUANTILES
 from hma_jax.model.embodiments import DEAD_STD
 
 WRAPPING: dict[AngleUnit, str] = {"radian": "wrapping angle", "degree": "wrapping angle in degrees"}
 """Hints for angles, by their unit."""
 
-
-QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
 
 BINS = 24
 """Of the histogram, from the smallest value to the largest."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.sources.rlds.images import fit_image
+from hma_jax.model.embodiments import DEAD_STD
 
 SIDE = 16
 """A picture is compared as SIDE x SIDE grey cells of its central square."""
@@ -64,7 +65,7 @@ def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, 
         return []
     rows = _finite(np.stack([e.actions for e in episodes]))
     scale = rows.std(axis=(0, 1))
-    alive = scale > 1e-6
+    alive = scale > DEAD_STD
     actions = (rows[:, :, alive] / scale[alive]).reshape(len(episodes), -1)
     groups: dict[int, list[Fingerprint]] = {}  # by the number of the first of each
     firsts: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # of those as long, and of as many cameras

@@ -20,7 +20,7 @@ from data_pipelines.publishing.output_lock import OutputLock
 from data_pipelines.simulators.record import build_features
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.simulators.worker import facts_path, record_path
-from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.tfrecord import payload_bytes, write_shard
 from data_pipelines.sources.rlds.writer import VERSION, shard_name, write_info
 from data_pipelines.suite.write import SHARD_FRAMES
 from hma_jax.runtime.files import write_file
@@ -45,7 +45,7 @@ def write_dataset(
         path = scratch / shard_name(spec.name, k, shards)
         records = (record_path(staging, i).read_bytes() for i in range(bounds[k], bounds[k + 1]))
         lengths.append(write_shard(path, records))
-        payload += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
+        payload += payload_bytes(path, lengths[-1])
     layout = ", ".join(f"{what} {dim}" for what, dim in spec.layout)
     write_info(
         scratch,

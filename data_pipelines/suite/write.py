@@ -14,7 +14,7 @@ import numpy as np
 
 from data_pipelines.sources.rlds import writer as rlds_writer
 from data_pipelines.sources.rlds.example import encode_example
-from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.tfrecord import payload_bytes, write_shard
 from data_pipelines.sources.rlds.writer import (
     STEP_FIELDS,
     TEXT,
@@ -89,7 +89,7 @@ def _write_split(
     for k in range(shards):
         path = directory / shard_name(spec.name, k, shards, split)
         lengths.append(write_shard(path, _records(spec, rollout, bounds[k], bounds[k + 1])))
-        size += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
+        size += payload_bytes(path, lengths[-1])
     return lengths, size
 
 

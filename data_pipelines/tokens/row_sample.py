@@ -22,7 +22,7 @@ ROWS = 4096
 """Largest number of rows that a dataset's quantiles are computed from."""
 
 QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
-"""The quantiles that a manifest stores."""
+"""The quantiles that a manifest stores, and an inspection shows."""
 
 MAX_STEPS = np.uint64(2**32)
 """Steps of an episode, so that episode * MAX_STEPS + step is unique."""

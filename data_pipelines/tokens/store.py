@@ -15,6 +15,7 @@ from array_record.python import array_record_module
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE
+from data_pipelines.sources.rlds.array_record import READ_OPTIONS
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
@@ -26,8 +27,6 @@ from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import DEAD_STD, EmbodimentTable
 
 _File = tuple[str, str, int]  # dataset, split, part
-
-READ_OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 
 MAX_OPEN_FILES = 512
 """Files kept open. Opening one again takes about as long as two windows: mixed from 40 datasets of

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_pipelines.inspection.action_stats import QUANTILES
 from data_pipelines.inspection.inspect import ActionFacts, Facts, Sample
 from data_pipelines.inspection.issues import Issue, chosen_actions
 from data_pipelines.inspection.sample import ExampleEpisode
 from data_pipelines.inspection.suggest import WindowFacts, window_facts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.schema import field_slice
+from data_pipelines.tokens.row_sample import QUANTILES
 from experiments.report.drawings import clip, curves, histogram, lengths
 from experiments.report.pieces import table
 from experiments.report.style import CSS

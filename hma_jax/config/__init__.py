@@ -11,14 +11,12 @@ from hma_jax.config.execution import Dtype, ExecutionConfig, MeshConfig
 from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
 from hma_jax.config.pretrained_tokenizers import (
     AnyTokenizerConfig,
-    ImageSize,
     Latents,
     Magvit2Config,
     PixelsConfig,
     SvdVaeConfig,
-    TokenGrid,
 )
-from hma_jax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
+from hma_jax.config.tokenizer import ImageSize, TokenGrid, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.config.training import (
     MaskingConfig,
     OptimizerConfig,

@@ -12,59 +12,7 @@ from typing import Literal
 
 from hma_jax.config.base import check_fields, require
 from hma_jax.config.execution import Dtype
-from hma_jax.config.tokenizer import TokenizerConfig
-
-ImageSize = int | tuple[int, int]
-"""Pixels along the sides of an image: one number for a square, else (height, width)."""
-
-
-class TokenGrid:
-    """What follows from `image_size` and `token_size`: tokens on a grid, row by row."""
-
-    image_size: ImageSize
-
-    @property
-    def token_size(self) -> int:
-        """Pixels along one side of a token, which is square."""
-        raise NotImplementedError
-
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
-        size = self.image_size
-        return (size, size) if isinstance(size, int) else size
-
-    @property
-    def grid_shape(self) -> tuple[int, int]:
-        """(rows, columns) of tokens."""
-        height, width = self.image_shape
-        return height // self.token_size, width // self.token_size
-
-    @property
-    def grid(self) -> int:
-        """Tokens along one side of a square image. Raises ConfigError for images that are not square."""
-        rows, columns = self.grid_shape
-        require(
-            rows == columns,
-            f"the grid of {rows} x {columns} tokens is not square, so it has no single side; use grid_shape",
-        )
-        return rows
-
-    @property
-    def tokens(self) -> int:
-        """S: tokens per frame."""
-        rows, columns = self.grid_shape
-        return rows * columns
-
-    def _check_size(self, name: str) -> None:
-        height, width = self.image_shape
-        require(
-            min(height, width) >= 1 and height % self.token_size == 0 == width % self.token_size,
-            f"{name}.image_size {self.image_size} is not a multiple of {self.token_size}, a token's side",
-        )
-        if height == width:
-            # One way to write a square: equal settings have one identity.
-            object.__setattr__(self, "image_size", height)
+from hma_jax.config.tokenizer import ImageSize, TokenGrid, TokenizerConfig
 
 
 class Ids(TokenGrid):

@@ -1,4 +1,4 @@
-"""The tokenizer that is trained here, and its training."""
+"""What all tokenizers say of their tokens; the tokenizer that is trained here, and its training."""
 
 from __future__ import annotations
 
@@ -6,9 +6,61 @@ from dataclasses import dataclass
 
 from hma_jax.config.base import check_fields, require, require_seed
 
+ImageSize = int | tuple[int, int]
+"""Pixels along the sides of an image: one number for a square, else (height, width)."""
+
+
+class TokenGrid:
+    """What follows from `image_size` and `token_size`: tokens on a grid, row by row."""
+
+    image_size: ImageSize
+
+    @property
+    def token_size(self) -> int:
+        """Pixels along one side of a token, which is square."""
+        raise NotImplementedError
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        size = self.image_size
+        return (size, size) if isinstance(size, int) else size
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """(rows, columns) of tokens."""
+        height, width = self.image_shape
+        return height // self.token_size, width // self.token_size
+
+    @property
+    def grid(self) -> int:
+        """Tokens along one side of a square image. Raises ConfigError for images that are not square."""
+        rows, columns = self.grid_shape
+        require(
+            rows == columns,
+            f"the grid of {rows} x {columns} tokens is not square, so it has no single side; use grid_shape",
+        )
+        return rows
+
+    @property
+    def tokens(self) -> int:
+        """S: tokens per frame."""
+        rows, columns = self.grid_shape
+        return rows * columns
+
+    def _check_size(self, name: str) -> None:
+        height, width = self.image_shape
+        require(
+            min(height, width) >= 1 and height % self.token_size == 0 == width % self.token_size,
+            f"{name}.image_size {self.image_size} is not a multiple of {self.token_size}, a token's side",
+        )
+        if height == width:
+            # One way to write a square: equal settings have one identity.
+            object.__setattr__(self, "image_size", height)
+
 
 @dataclass(frozen=True)
-class TokenizerConfig:
+class TokenizerConfig(TokenGrid):
     """The small convolutional tokenizer, with lookup-free quantisation or without.
 
     An image of `image_size` x `image_size` becomes (image_size / downsample)^2 tokens. Quantised
@@ -64,19 +116,8 @@ class TokenizerConfig:
         )
 
     @property
-    def image_shape(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
-        return self.image_size, self.image_size
-
-    @property
-    def grid(self) -> int:
-        """Tokens along one side of the image."""
-        return self.image_size // self.downsample
-
-    @property
-    def tokens(self) -> int:
-        """S: tokens per frame."""
-        return self.grid**2
+    def token_size(self) -> int:
+        return self.downsample
 
     @property
     def token_channels(self) -> int:

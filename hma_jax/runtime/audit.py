@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from typing import Any, Protocol
 
 import jax
@@ -54,8 +53,8 @@ class Decision:
 
 SMALL = "small"
 
-LISTED: Mapping[str, str] = {}
-"""Large parameters that may be whole on every device, by name (or a pattern of `fnmatch`), and why: none."""
+MAX_WHOLE = 0.02
+"""Largest share of all parameters that may be whole on every device without being small."""
 
 
 def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list[Decision]:
@@ -74,10 +73,8 @@ def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list
     return decisions
 
 
-def audit_sharding(
-    decisions: list[Decision], mesh: Any, limit: float = 0.02, listed: Collection[str] = tuple(LISTED)
-) -> None:
-    """Raises ConfigError when more than `limit` of all parameters is whole and not `listed`, naming them.
+def audit_sharding(decisions: list[Decision], mesh: Any) -> None:
+    """Raises ConfigError when more than MAX_WHOLE of all parameters is whole, naming them.
 
     Only a mesh that splits parameters (fsdp or tensor above 1) is audited. Parameters that are whole because
     they are small (`MeshConfig.min_shard_size`) do not count.
@@ -85,13 +82,12 @@ def audit_sharding(
     if mesh.shape["fsdp"] * mesh.shape["tensor"] == 1:
         return
     total = sum(d.spec.size for d in decisions)
-    large = [d for d in decisions if d.whole and d.reason != SMALL]
-    whole = [d for d in large if not any(fnmatch(d.name, pattern) for pattern in listed)]
+    whole = [d for d in decisions if d.whole and d.reason != SMALL]
     share = sum(d.spec.size for d in whole) / total
-    if share > limit:
+    if share > MAX_WHOLE:
         worst = sorted(whole, key=lambda d: -d.spec.size)[:5]
         raise ConfigError(
-            f"{share:.1%} of the parameters would be replicated on every device (allowed: {limit:.0%}): "
+            f"{share:.1%} of the parameters would be replicated on every device (allowed: {MAX_WHOLE:.0%}): "
             + ", ".join(f"{d.name} {d.spec.shape}" for d in worst)
             + "; no mesh axis divides their sizes: choose sizes of fsdp and tensor that do"
         )

@@ -24,7 +24,7 @@ from hma_jax.config import ConfigError
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
-OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
+READ_OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 
 SAMPLED_BYTES = 65536
 """Bytes at each end of a file that its checksum covers. The last bytes hold the offsets of all records."""
@@ -75,7 +75,7 @@ def _opened(path: Path, stamp: tuple[int, int]):
     from array_record.python import array_record_module
 
     del stamp
-    return array_record_module.ArrayRecordReader(str(path), options=OPTIONS)
+    return array_record_module.ArrayRecordReader(str(path), options=READ_OPTIONS)
 
 
 def _index(path: Location, records: int, size: int, ends: bytes) -> ShardIndex:

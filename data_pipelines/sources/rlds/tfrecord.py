@@ -72,25 +72,14 @@ def _mask(crc: int) -> int:
     return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def index_shard(path: str | Location) -> ShardIndex:
-    """The index of a file, from a scan that skips the payloads.
-
-    Raises CorruptRecordError where a header's checksum is wrong or the file ends inside a
-    record; payload checksums are verified by `read_record`. A file of 0 bytes has 0 records.
-    A file that cannot be read raises UnreachableError, which is not damage.
-    """
-    index, damage = scan_shard(path)
-    if damage is not None:
-        raise damage
-    return index
-
-
 def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | None]:
-    """As `index_shard`, but returns the index of what could be scanned, and the error that stopped the scan.
+    """The index of a file, from a scan that skips the payloads, and the error that stopped it.
 
-    After a damaged header the offset of the next record is unknown, so records before it are indexed and the
-    rest of the file is not. The scan reads block by block: a block holds many records if they are small, little
-    more than a header if they are large.
+    It stops where a header's checksum is wrong or the file ends inside a record: the offset of the next record is then
+    unknown, so records before it are indexed and the rest of the file is not. Payload checksums are verified by
+    `read_record`. A file of 0 bytes has 0 records. A file that cannot be read raises UnreachableError, which is not
+    damage. The scan reads block by block: a block holds many records if they are small, little more than a header if
+    they are large.
     """
     path = locate(path)
     offsets: list[int] = []
@@ -255,3 +244,8 @@ def write_shard(path: str | Path, records: Iterable[bytes]) -> int:
     finally:
         temporary.unlink(missing_ok=True)
     return count
+
+
+def payload_bytes(path: Path, records: int) -> int:
+    """Bytes of the payloads of a file of so many records: what tfds counts as its size."""
+    return path.stat().st_size - (HEADER + FOOTER) * records

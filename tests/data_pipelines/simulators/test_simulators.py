@@ -131,7 +131,8 @@ def test_an_episode_does_not_depend_on_those_before_it(made, tmp_path):
     job = {"name": "dmc_reacher", "episodes": [1], "seed": 0, "size": SIZE, "directory": str(staged)}
     staged.mkdir()
     subprocess.run([*command, json.dumps(job)], check=True, capture_output=True)
-    from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
+    from data_pipelines.sources.rlds.tfrecord import read_record
+    from tests.data_pipelines.shards import index_shard
 
     shard = index_shard(next((made / "dmc_reacher").rglob("*.tfrecord-*")))
     whole = read_record(shard.path, shard.offsets[1], shard.lengths[1])

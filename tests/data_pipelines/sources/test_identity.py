@@ -9,11 +9,11 @@ from data_pipelines.errors import DataError
 from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import EpisodeRun, describe, episode_ids
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.sources.rlds.tfrecord import index_shard
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.windows.windows import train_windows
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.shards import index_shard
 
 SPEC = make_spec()
 OPTIONS = {"corrupt": "skip", "max_skipped": 100}

@@ -19,7 +19,7 @@ import simplejpeg
 from data_pipelines.registry import get_spec
 from data_pipelines.sampling.splits import held_out_episodes
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
+from data_pipelines.sources.rlds.tfrecord import read_record
 from data_pipelines.suite import generate
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
@@ -32,6 +32,7 @@ from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.windows.windows import train_windows, val_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer
+from tests.data_pipelines.shards import index_shard
 
 NAMES = ("pusher_mint", "rover_slate", "mobile_sky")
 """Short ones: a single tensor of actions; video alone; dict-valued actions."""

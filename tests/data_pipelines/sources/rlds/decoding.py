@@ -17,7 +17,8 @@ import numpy as np
 
 from data_pipelines.sources.rlds.example import parse_example
 from data_pipelines.sources.rlds.images import JPEG_MAGIC, decode_image
-from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
+from data_pipelines.sources.rlds.tfrecord import read_record
+from tests.data_pipelines.shards import index_shard
 
 
 @dataclass

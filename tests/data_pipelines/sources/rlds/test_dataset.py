@@ -11,9 +11,9 @@ import pytest
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.sources.rlds.tfrecord import index_shard
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
+from tests.data_pipelines.shards import index_shard
 
 SPEC = make_spec()
 KEYS = (SPEC.image_key, SPEC.action_keys)

@@ -6,8 +6,9 @@ import tensorflow_datasets as tfds
 
 from data_pipelines.errors import DataError
 from data_pipelines.sources.rlds.example import encode_example, parse_example
-from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
+from data_pipelines.sources.rlds.tfrecord import read_record
 from tests.data_pipelines.fakes import REAL_DATA
+from tests.data_pipelines.shards import index_shard
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +100,14 @@ def test_unpacked_numbers_are_read_as_well():
         entry = b"\x0a\x01k\x12" + bytes([len(feature)]) + feature
         features = b"\x0a" + bytes([len(entry)]) + entry
         assert parse_example(b"\x0a" + bytes([len(features)]) + features)["k"].tolist() == value
+
+
+def test_floats_that_do_not_fill_their_list_are_refused():
+    feature = b"\x12\x07" + b"\x0a\x05" + bytes(5)  # Feature{FloatList of 5 bytes}
+    entry = b"\x0a\x01k\x12" + bytes([len(feature)]) + feature
+    features = b"\x0a" + bytes([len(entry)]) + entry
+    with pytest.raises(DataError, match=r"is 5 bytes long, which is not a multiple of 4(?!, which)"):
+        parse_example(b"\x0a" + bytes([len(features)]) + features)
 
 
 def test_cut_off_or_foreign_bytes_are_refused_not_misread(records):

@@ -17,8 +17,9 @@ from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.frame_spans import FrameSpanCache
 from data_pipelines.sources.rlds.index import index_path
-from data_pipelines.sources.rlds.tfrecord import index_shard, scan_shard
+from data_pipelines.sources.rlds.tfrecord import scan_shard
 from tests.data_pipelines.fakes import make_spec, write_rlds
+from tests.data_pipelines.shards import index_shard
 
 SPEC = make_spec()
 KEYS = (SPEC.image_key, SPEC.action_keys)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError
-from data_pipelines.sources.rlds.tfrecord import HEADER, index_shard, read_record, scan_shard, write_shard
+from data_pipelines.sources.rlds.tfrecord import HEADER, read_record, scan_shard, write_shard
 from tests.data_pipelines.fakes import REAL_DATA
+from tests.data_pipelines.shards import index_shard
 from tests.full_disk import full_disk
 
 RECORDS = [b"first", b"", b"a longer third record" * 20]
