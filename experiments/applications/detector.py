@@ -31,6 +31,7 @@ import optax
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
+from experiments.applications.detector_network import Detections, DetectorParams, detect, init_detector, points_loss
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.settings_file import FILE, pin_settings
 from experiments.applications.simulators import load_simulator
@@ -40,7 +41,6 @@ from experiments.progress import say, step
 from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
-from hma_jax.evaluation.detector import Detections, DetectorParams, detect, init_detector, points_loss
 from hma_jax.kernels.random import key_of
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.robots import Robot

@@ -24,11 +24,11 @@ from experiments.applications.detector import (
     select_robots,
     train_detector,
 )  # fmt: skip
+from experiments.applications.detector_network import Detections, init_detector
 from experiments.applications.in_place import CLOSE_PX, EPISODES, VIEWS, in_place, measure_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
-from hma_jax.evaluation.detector import Detections, init_detector
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.evaluation.detector import detect, init_detector, locate_peaks, points_loss, target_heat
+from experiments.applications.detector_network import detect, init_detector, locate_peaks, points_loss, target_heat
 
 
 def logits(heat: jax.Array) -> jax.Array:
