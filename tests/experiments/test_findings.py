@@ -340,6 +340,31 @@ def test_where_things_stand_at_the_end_is_as_the_page_on_designs_says():
         assert robots == 8 and true == 1 and still < 0.01
 
 
+def test_the_stronger_recipe_is_as_good_as_the_pages_say_that_measured_it():
+    """docs/own_data.md beside the tables that its rows link to, which other tests hold."""
+    rows = table(ROOT / "docs" / "own_data.md", "| setting | what it did, on simulated robots |")
+    effects = {re.search(r"`(\w+)", setting)[1]: cells[0] for setting, cells in rows.items()}
+    header = "| | seeds | nats per token | PSNR | action-nats | ΔPSNR, dB |"
+    conditioning = table(RESULTS / "cpu-full" / "findings.md", f"{header} nats behind")
+    ladder = table(RESULTS / "ladder" / "findings.md", header)
+    nats = [conditioning[f"concat+modulate{how}"][3] for how in ("", ", released alignment")]
+    assert f"{nats[0]} nats per token instead of {nats[1]}" in effects["action_alignment"]
+    teacher = (ROOT / "docs" / "models.md").read_text()
+    forced, released = (
+        re.search(rf"\| {how} \| {steps} \| [^|]+ \| ([\d.]+) \| ([\d.]+) \|", teacher).groups()
+        for how, steps in (("teacher forcing", "4,000"), ("as released", "8,000"))
+    )
+    assert f"perplexity {forced[0]} instead of {released[0]}" in effects["teacher_forcing"]
+    assert f"action-nats {forced[1]} instead of {released[1]}" in effects["teacher_forcing"]
+    plain, both, changes = (
+        ladder[f"{name}, 4,000 steps"] for name in ("reference", "recall, Muon", "recall, Muon, changes thrice")
+    )
+    assert f"{float(plain[1]) - float(both[1]):.2f} nats less after 4,000 steps, {both[6]} robots" in effects["recall"]
+    assert both[6] == plain[6]
+    more = float(changes[1]) - float(both[1])
+    assert f"ΔPSNR {changes[4]} dB instead of {both[4]}, {more:.2f} nats more" in effects["change_weight"]
+
+
 def expectations() -> dict[tuple[str, str, str], Expected]:
     """{(axis, curve, x): what was written down before}."""
     return {(e.sweep, e.series, e.x): e for e in read_expected(RESULTS / "cpu-full" / "predictions" / FILE)}
