@@ -46,17 +46,29 @@ class Subject:
         return inference_params(self.declared, self.params, self.execution.dtype)
 
     def batch(self, rows: int, frames: int | None = None) -> dict[str, Any]:
-        """tokens [B, T, S (, C)], actions [B, T, U], embodiment [B], mixing all robots."""
-        config, rng = self.config, np.random.default_rng(self.seed)
-        frames = frames or config.frames
-        shape = (rows, frames, config.tokens)
-        if config.diffusion:
-            tokens = rng.standard_normal((*shape, config.diffusion.token_channels)).astype(np.float32)
-        else:
-            tokens = rng.integers(0, config.vocab_size, shape).astype(np.int32)
-        actions = rng.standard_normal((rows, frames, self.table.action_width)).astype(np.float32)
-        robots = (np.arange(rows) % self.table.size).astype(np.int32)
-        return jax.device_put({"tokens": tokens, "actions": actions, "embodiment": robots})
+        """As `random_batch`."""
+        return random_batch(self.config, self.table, rows, frames, self.seed)
+
+
+def random_batch(
+    config: ModelConfig, table: EmbodimentTable, rows: int, frames: int | None = None, seed: int = 0
+) -> dict[str, Any]:
+    """tokens [B, T, S (, C)], actions [B, T, U], embodiment [B], mixing all robots."""
+    rng, frames = np.random.default_rng(seed), frames or config.frames
+    shape = (rows, frames, config.tokens)
+    if config.diffusion:
+        tokens = rng.standard_normal((*shape, config.diffusion.token_channels)).astype(np.float32)
+    else:
+        tokens = rng.integers(0, config.vocab_size, shape).astype(np.int32)
+    actions = rng.standard_normal((rows, frames, table.action_width)).astype(np.float32)
+    robots = (np.arange(rows) % table.size).astype(np.int32)
+    return jax.device_put({"tokens": tokens, "actions": actions, "embodiment": robots})
+
+
+def make_table(robots: int) -> EmbodimentTable:
+    """So many robots alike."""
+    one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
+    return EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
 
 
 def make_shape(
@@ -65,10 +77,8 @@ def make_shape(
     """Configuration and robots. Raises ConfigError for a name that is not in the table."""
     require(name in MODELS, f"unknown model {name!r}; known: {', '.join(MODELS)}")
     model = MODELS[name]
-    one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
-    table = EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
     sizes = {"layers": layers or model.layers, "width": width or model.width}
-    return replace(model, **sizes), table
+    return replace(model, **sizes), make_table(robots)
 
 
 def make_subject(

@@ -12,6 +12,7 @@ from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
 from experiments.cli.check import check
 from experiments.cli.compare import compare
+from experiments.cli.coord_check import coord_check
 from experiments.cli.data import app as data
 from experiments.cli.evaluate import evaluate
 from experiments.cli.fit import fit
@@ -23,7 +24,7 @@ from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 
-BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "convert", "bench", "plan", "play", "check")
+BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "convert", "bench", "plan", "coord-check", "play", "check")
 """Commands that keep nothing of what they had begun when they are stopped."""
 
 app = SubcommandApp()
@@ -41,6 +42,7 @@ app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)
 app.command(convert.convert_app, name="convert", help=convert.HELP)
 app.command(bench.bench_app, name="bench", help=bench.HELP)
 app.command(name="plan")(plan)
+app.command(name="coord-check")(coord_check)
 app.command(name="play")(play)
 app.command(name="check")(check)
 app.command(name="generate")(generate)

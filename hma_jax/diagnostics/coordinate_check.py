@@ -196,5 +196,6 @@ def check_coordinates(rows: Sequence[Size], grow: float = 0.2, fade: float = 0.4
         if slope.size > grow:
             findings.append(f"{quantity}: grows as width^{slope.size:.2f}")
         if slope.change > grow or slope.change < -fade:
-            findings.append(f"{quantity}: its change in training grows as width^{slope.change:.2f}")
+            verb = "grows" if slope.change > 0 else "fades"
+            findings.append(f"{quantity}: its change in training {verb} as width^{slope.change:.2f}")
     return findings

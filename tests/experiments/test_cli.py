@@ -27,7 +27,8 @@ from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer",
             "tokenizer train", "tokenizer import", "tokenizer pixels", "tokenize", "train", "evaluate", "report",
             "convert", "convert from-official", "convert to-official", "convert to-safetensors",
-            "convert from-safetensors", "convert to-stablehlo", "bench", "bench generate", "fit")  # fmt: skip
+            "convert from-safetensors", "convert to-stablehlo", "bench", "bench generate", "fit",
+            "coord-check")  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -154,7 +154,7 @@ def test_findings_name_what_grows_fades_and_overflows():
     assert check_coordinates(rows) == [
         "growing: grows as width^1.00",
         "growing: its change in training grows as width^1.00",
-        "fading: its change in training grows as width^-0.50",
+        "fading: its change in training fades as width^-0.50",
         "overflowing: zero or not finite at some width",
     ]
     with pytest.raises(ConfigError, match="at least two widths"):
