@@ -233,19 +233,12 @@ def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
 def tokenizer_mismatch(trained: Run, tokenizer: Tokenizer) -> str:
     """Why a model was not trained on the tokens of this tokenizer; '' if it was. A model that was converted does not
     know its own: then the form of its tokens decides."""
+    from hma_jax.tokenizers.base import token_mismatch
+
     if not _converted(trained):
         own, here = trained.provenance.get("tokenizer"), tokenizer.identity
         return "" if own == here else f"the model was trained on tokens of tokenizer {own}, but the study uses {here}"
-    model = trained.model
-    if model.diffusion:
-        takes = (model.tokens, 0, 0, model.diffusion.token_channels)
-    else:
-        takes = (model.tokens, model.factors, model.factor_vocab, 0)
-    makes = (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels)
-    words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
-    if takes == makes:
-        return ""
-    return f"the model needs {words.format(*takes)}, but the tokenizer makes {words.format(*makes)}"
+    return token_mismatch(trained.model, tokenizer)
 
 
 def _converted(trained: Run) -> bool:

@@ -24,6 +24,7 @@ from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_
 from hma_jax.simulator.programs import Programs, ResetInputs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
+from hma_jax.tokenizers.base import token_mismatch
 from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.training.runs import Model, load_model, require_frames
 
@@ -70,9 +71,8 @@ class Simulator:
             config.frames >= 3,
             f"a simulator needs a model with model.frames of at least 3, this one has {config.frames}",
         )
-        taken = config.tokens, config.diffusion.token_channels if config.diffusion else 0
-        made = tokenizer.tokens, tokenizer.channels
-        require(taken == made, f"the model needs (tokens, channels) {taken} per frame, but the tokenizer makes {made}")
+        differs = token_mismatch(config, tokenizer)
+        require(not differs, differs)
         self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
         self.update_robots(robots)

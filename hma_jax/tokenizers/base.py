@@ -1,4 +1,4 @@
-"""The interface of all tokenizers, and how images are passed through one in batches of one size.
+"""The interface of all tokenizers, whether one fits a model, and how images pass through it in batches of one size.
 
 Code outside this package depends on `Tokenizer` alone: any model that turns frames into ids or
 latent vectors and back can stand behind it.
@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from hma_jax.config import require
+from hma_jax.config import ModelConfig, require
 from hma_jax.model.params import Params
 
 PIECE = 64
@@ -96,6 +96,19 @@ class Tokenizer(Protocol):
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         """Pure, for use inside a jit: `decode_fn` rounded as `decode` does it."""
         ...
+
+
+def token_mismatch(model: ModelConfig, tokenizer: Tokenizer) -> str:
+    """How the tokens that a model takes differ from those that a tokenizer makes; '' if they do not."""
+    if model.diffusion:
+        takes = (model.tokens, 0, 0, model.diffusion.token_channels)
+    else:
+        takes = (model.tokens, model.factors, model.factor_vocab, 0)
+    makes = (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels)
+    words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
+    if takes == makes:
+        return ""
+    return f"the model needs {words.format(*takes)}, but the tokenizer makes {words.format(*makes)}"
 
 
 def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int = PIECE) -> np.ndarray:

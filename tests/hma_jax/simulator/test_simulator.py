@@ -14,7 +14,9 @@ from hma_jax.generation import rollout
 from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
-from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, actions, parts, simulator, start
+from hma_jax.tokenizers.autoencoder import declare_tokenizer
+from hma_jax.tokenizers.lfq import LfqTokenizer
+from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, TOKENIZER, actions, parts, simulator, start
 from tests.tiny import TABLE
 
 FRAMES = 7
@@ -415,6 +417,15 @@ def test_what_predicts_actions_alone_is_no_simulator(setting):
     other = replace(model, run=replace(model.run, train=TrainConfig(masking=MaskingConfig(setting=setting))))
     with pytest.raises(ConfigError, match=f"'{setting}', which predicts no frames, so there are none to show"):
         Simulator(other, tokenizer)
+
+
+def test_a_tokenizer_of_other_ids_is_refused_though_it_makes_as_many_tokens():
+    model, tokenizer = parts()
+    coarse = replace(TOKENIZER, bits=2)
+    other = LfqTokenizer(coarse, declare_tokenizer(coarse).init(0))
+    assert (other.tokens, other.channels) == (tokenizer.tokens, tokenizer.channels)
+    with pytest.raises(ConfigError, match="of 2 factors with 4 entries .* but the tokenizer makes .* 2 entries"):
+        Simulator(model, other)
 
 
 @pytest.mark.slow
