@@ -84,13 +84,13 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
 def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[Sweep]:
     """The sweeps along `axes`, of which files are relative to `root`. Raises ConfigError for an axis that is none, or
     that does not fit the study."""
-    sweeps = [find_axis(axis, root)(study) for axis in axes]
-    for axis, sweep in zip(axes, sweeps, strict=True):
-        where = f"{axis}: plan(study)"
+    sweeps: list[Sweep] = []
+    for axis in axes:
+        where, sweep = f"{axis}: plan(study)", find_axis(axis, root)(study)
         require(isinstance(sweep, Sweep), f"{where} must return a Sweep, got {type(sweep).__name__}")
         require(bool(sweep.points), f"{where} returned a sweep without points")
         if is_file(axis):
-            _require_trials(study, sweep, where)
+            sweep = _checked_trials(study, sweep, where)
         _require_distinct(sweep, where)
         if is_file(axis):
             require(sweep.name not in AXES, f"{where}: the name {sweep.name!r} is taken; choose another")
@@ -98,18 +98,21 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
                 sweep.name.isidentifier(),
                 f"{where}: the name {sweep.name!r} is used in file names; use letters, digits and _",
             )
+        sweeps.append(sweep)
     names = [sweep.name for sweep in sweeps]
     require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
     return [limit_other_actions(study, sweep) for sweep in sweeps]
 
 
-def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
-    """Raises ConfigError for a field of a user's sweep that is not of its kind, for a point that is none, for one whose
-    trial would fail once it is trained, and for one whose number would be of other robots, or of another position, than
-    it says."""
+def _checked_trials(study: Study, sweep: Sweep, where: str) -> Sweep:
+    """A user's sweep with its trials as their processes read them: an int for a float is a float, or the same trial
+    would have two names. Raises ConfigError for a field that is not of its kind, for a point that is none, for one
+    whose trial would fail once it is trained, and for one whose number would be of other robots, or of another
+    position, than it says."""
     listed = isinstance(sweep.points, Sequence)
     require(listed, f"{where}: points must be a tuple of Point, got a {type(sweep.points).__name__}")
     _require_kinds(replace(sweep, points=()), f"{where}: the sweep")
+    points: list[Point] = []
     for number, p in enumerate(sweep.points, start=1):
         of_trial = isinstance(p, Point) and isinstance(p.trial, Trial)
         what = type(p.trial if isinstance(p, Point) else p).__name__
@@ -126,9 +129,13 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
         at = f"{where}: the trial at {p.x:g}"
         shuffled = p.role != CONTROL or p.trial.shuffle_actions
         require(shuffled, f"{at} is a control, but is not trained on shuffled actions; make it with control_of(trial)")
-        same = _require_kinds(p, at) == p
-        require(same, f"{at} has a setting of a wrong type: a list instead of a tuple, or a value that is not a number")
+        read = _require_kinds(p, at)
+        require(
+            read == p, f"{at} has a setting of a wrong type: a list instead of a tuple, or a value that is not a number"
+        )
         _require_trial(study, p.trial, p.scope or sweep.scope, at)
+        points.append(replace(p, trial=read.trial))
+    sweep = replace(sweep, points=tuple(points))
     drawn = {bool(p.series) for p in sweep.points if p.role != CONTROL}
     require(len(drawn) < 2, f"{where}: some points have a series and others have none, but a figure cannot show both")
     require(
@@ -145,6 +152,7 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
             f"{where} has the same trial at {x:g} and {p.x:g}: nothing of it changes there, or the study's reference "
             "trial does not stand at reference_x",
         )
+    return sweep
 
 
 def _require_kinds(given: Any, where: str) -> Any:

@@ -1,5 +1,6 @@
 """Axes: all that there are can be asked for, and a stranger's file is one of them."""
 
+import json
 import re
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import experiments.sweeps
 from experiments.cli.main import main
 from experiments.presets import CPU_FULL
 from experiments.report.draw import draw
+from experiments.running.trial import Trial
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.sweeps.registry import AXES, find_axis, join_axes, keep_axes, plan_sweeps
 from experiments.sweeps.sweep import titles
 from hma_jax.config import ConfigError
+from hma_jax.config.json import from_dict, stable_hash, to_dict
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
 
 FOLDER = Path(experiments.sweeps.__file__).parent
@@ -145,6 +148,20 @@ whole = plan
 def plan(study):
     return replace(whole(study), labels=("as it is",), points=whole(study).points[:1])
 """
+
+
+def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_path):
+    """Its process reads it as a float, and names the trial by that."""
+    path = tmp_path / "mine.py"
+    path.write_text(OWN.format("replace(trial, tau=x, model=replace(trial.model, mlp_ratio=4))"))
+    assert STUDY.model.mlp_ratio == 4
+    trials = [point.trial for point in plan_sweeps(STUDY, [str(path)])[0].points]
+    assert {trial.tau for trial in trials} == {1, 3}
+    for trial in trials:
+        assert stable_hash(trial) == stable_hash(from_dict(Trial, json.loads(json.dumps(to_dict(trial)))))
+    path.write_text(OWN.format("replace(trial, tau=3)"))
+    with pytest.raises(ConfigError, match="has the same trial at 1 and 3: nothing of it changes there"):
+        plan_sweeps(STUDY, [str(path)])
 
 
 @pytest.mark.parametrize(
