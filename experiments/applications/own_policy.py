@@ -133,7 +133,8 @@ def post_train(
     tokens = tokens.reshape(*demos.images.shape[:2], *tokens.shape[1:])
     params, config = with_heads(model, settings.seed)
     make = windows(tokens, demos, model, robot, settings.batch, settings.seed)
-    optimizer = OptimizerConfig(learning_rate=settings.learning_rate, warmup_steps=100, schedule="wsd")
+    warmup = min(100, settings.steps // 4)
+    optimizer = OptimizerConfig(learning_rate=settings.learning_rate, warmup_steps=warmup, schedule="wsd")
     training = TrainConfig(
         steps=settings.steps, batch=settings.batch, optimizer=optimizer, seed=settings.seed, ema_decay=0.99,
         masking=MaskingConfig(setting="policy"),

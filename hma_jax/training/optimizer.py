@@ -43,7 +43,7 @@ class AdamState(NamedTuple):
 
 
 def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
-    """Learning rate at the muP base width for each step, linear warm-up first.
+    """Learning rate at the muP base width for each step, linear warm-up first, over no more than all steps.
 
     `constant` holds, `cosine` falls towards final_fraction over the whole run, `wsd` holds and then falls towards it
     linearly during the last decay_fraction of the steps. Both would reach it one step after the last: the last of n
@@ -70,19 +70,25 @@ def decay_steps(config: OptimizerConfig, steps: int) -> int:
 
 
 def decay_fits(config: OptimizerConfig, steps: int) -> bool:
-    """Whether the decay phase, of a schedule that has one, begins after the warm-up."""
-    return config.schedule != "wsd" or config.warmup_steps + decay_steps(config, steps) <= steps
+    """Whether the decay, of a schedule that has one, begins after the warm-up and comes to its end."""
+    if config.schedule == "constant":
+        return True
+    return config.warmup_steps + (decay_steps(config, steps) if config.schedule == "wsd" else 1) <= steps
 
 
 def check_schedule(config: OptimizerConfig, steps: int) -> None:
-    """Raises ConfigError for a decay phase of wsd that would begin within the warm-up and end above final_fraction."""
-    decay, share = decay_steps(config, steps), config.decay_fraction
-    require(
-        decay_fits(config, steps),
-        f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps}) and "
-        f"the decay of schedule wsd ({decay}: train.optimizer.decay_fraction={share:g} of all steps): the learning "
-        "rate would not fall to final_fraction; change one of these three, or set train.optimizer.schedule=constant",
-    )
+    """Raises ConfigError for a decay that would begin within the warm-up and end above final_fraction, or never
+    begin."""
+    few = f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps})"
+    if config.schedule == "cosine":
+        why = f"{few}, so with schedule cosine the learning rate would not fall; change one of these two"
+    else:
+        decay, share = decay_steps(config, steps), config.decay_fraction
+        why = (
+            f"{few} and the decay of schedule wsd ({decay}: train.optimizer.decay_fraction={share:g} of all steps): the "
+            "learning rate would not fall to final_fraction; change one of these three"
+        )
+    require(decay_fits(config, steps), f"{why}, or set train.optimizer.schedule=constant")
 
 
 def steps_in_common(config: OptimizerConfig, steps: int, others: int) -> float:

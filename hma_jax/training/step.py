@@ -23,6 +23,7 @@ from hma_jax.training.average import update_average
 from hma_jax.training.optimizer import (
     Presence,
     apply_update,
+    check_schedule,
     clip_by_global_norm,
     learning_rate_multiplier,
     make_schedule,
@@ -49,6 +50,7 @@ def make_train_step(
     then the example's row.
     """
     check_micro_batches(config.batch, accumulate)
+    check_schedule(config.optimizer, config.steps)
     schedule = make_schedule(config.optimizer, config.steps)
     masking = config.masking
     check_objective(model, masking)

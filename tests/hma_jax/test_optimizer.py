@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from hma_jax.config import ConfigError, MupConfig, OptimizerConfig
+from hma_jax.config import ConfigError, MupConfig, OptimizerConfig, TrainConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec, Use, is_spec
 from hma_jax.training.optimizer import (
@@ -21,6 +21,7 @@ from hma_jax.training.optimizer import (
     make_schedule,
     muon_direction,
 )
+from hma_jax.training.step import make_train_step
 from tests.tiny import TABLE, lively_params, shallow_config
 
 USES = get_args(Use)
@@ -202,6 +203,20 @@ def test_a_decay_that_fits_after_the_warm_up_comes_to_its_end():
     with pytest.raises(ConfigError, match=r"train.steps=119 are too few .*decay of schedule wsd \(29: "):
         check_schedule(replace(config, warmup_steps=91), 119)
     check_schedule(replace(config, schedule="constant"), 1)
+
+
+def test_a_cosine_without_a_step_after_the_warm_up_is_refused():
+    config = OptimizerConfig(learning_rate=1.0, warmup_steps=90, schedule="cosine")
+    check_schedule(config, 91)
+    with pytest.raises(ConfigError, match=r"train.steps=90 are too few .*warmup_steps=90\), so with schedule cosine"):
+        check_schedule(config, 90)
+
+
+def test_training_refuses_a_decay_that_the_warm_up_leaves_no_room_for():
+    """From Python too, where no command has checked it."""
+    config = TrainConfig(steps=300, optimizer=OptimizerConfig(schedule="wsd", warmup_steps=500))
+    with pytest.raises(ConfigError, match="train.steps=300 are too few for the warm-up"):
+        make_train_step(declare_model(shallow_config(), TABLE), TABLE, shallow_config(), config)
 
 
 def test_clipping_leaves_small_gradients_alone_and_reports_the_norm_before():

@@ -33,6 +33,7 @@ from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import path_name
+from hma_jax.training.optimizer import check_schedule
 from hma_jax.training.runs import Run
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
@@ -85,6 +86,7 @@ def test_heads_are_added_and_nothing_else_changes():
 def test_what_is_post_trained_is_no_simulator_and_acts_in_one_by_the_file_of_the_page(tmp_path, monkeypatch):
 
     def trained(config, table, training, make, *, run_dir, initial, provenance, **_):
+        check_schedule(training.optimizer, training.steps)  # also of few steps
         write_run(Run(config, training, table, initial, 0, provenance), run_dir)
 
     monkeypatch.setattr(own_policy, "train_model", trained)
