@@ -43,6 +43,11 @@ class LoaderConfig:
             len(set(self.datasets)) == len(self.datasets),
             f"loader.datasets contains a dataset twice: {', '.join(self.datasets)}",
         )
+        require(
+            not self.capped or self.max_trajectories is not None,
+            f"loader.capped says that loader.max_trajectories applies to {', '.join(self.capped)}, but it is not set; "
+            "set it, or leave capped empty",
+        )
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,14 @@ class TrainingWindows:
 
 
 def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
-    """Counts windows and computes the datasets' weights. Raises DataError if no window is left."""
+    """Counts windows and computes the datasets' weights. Raises DataError if no window is left, ConfigError for a cap
+    on a dataset that is not used."""
     names = config.datasets or store.names
+    strangers = [name for name in config.capped if name not in names]
+    require(
+        not strangers,
+        f"loader.capped names {', '.join(strangers)}, not among the datasets that are trained on: {', '.join(names)}",
+    )
     sets = {name: _windows(store, name, config, config.max_trajectories) for name in names}
     require_windows(sets)
     weighed = sets

@@ -183,6 +183,10 @@ def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str)
     )
     most = trial.max_trajectories
     require(most is None or most >= 1, f"{where}: max_trajectories must be at least 1, or None for all, got {most}")
+    require(
+        most is not None or not trial.capped,
+        f"{where} caps trajectories of {few(trial.capped)} at no number; set max_trajectories, or leave `capped` empty",
+    )
 
 
 def _require_fits(study: Study, trial: Trial, where: str) -> None:

@@ -188,6 +188,10 @@ def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_pat
             OWN.format("replace(trial, max_trajectories=0) if x == 1 else trial"),
             "trial at 1: max_trajectories must be at",
         ),
+        (
+            OWN.format("replace(trial, capped=trial.datasets, max_trajectories=None) if x == 1 else trial"),
+            "trial at 1 caps trajectories of .* at no number; set max_trajectories",
+        ),
         (OWN.format("replace(trial, tau=2.0 + x)"), r"does not stand at reference_x 3, .* \(tau: 3.0 -> 5.0\)"),
         (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "trial at 1 has a setting of a wrong type .*tau"),
         (OWN.format("replace(trial, datasets=list(trial.datasets)) if x == 1 else trial"), "a list instead of a tuple"),

@@ -326,6 +326,20 @@ def test_weights_can_be_frozen_while_trajectories_are_capped(store):
     assert all(len(s.episodes) == 2 for s in sets.values()), "the cap itself still holds"
 
 
+def test_a_cap_that_concerns_nothing_is_refused(store):
+    """A name that is mistyped capped no trajectory."""
+    with pytest.raises(ConfigError, match="loader.max_trajectories applies to base, but it is not set"):
+        LoaderConfig(frames=6, capped=("base",))
+    capped = select_windows(store, LoaderConfig(frames=6, max_trajectories=2, capped=("base",))).sets
+    assert len(capped["base"].episodes) == 2 < len(capped["arm"].episodes)
+    for config in (
+        LoaderConfig(frames=6, max_trajectories=2, capped=("bsae",)),
+        LoaderConfig(frames=6, max_trajectories=2, capped=("bsae",), datasets=("base", "arm")),
+    ):
+        with pytest.raises(ConfigError, match="loader.capped names bsae, not among the datasets .*: .*base"):
+            select_windows(store, config)
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_statistics_are_of_exactly_the_trajectories_used(store_root, tmp_path, kept):
     """The first value of an action is the number of its episode, so every choice has its own mean."""
