@@ -161,6 +161,7 @@ def eval_batches(
     first: int | None = None,
     other_actions: int = 0,
     counterfactual: CounterfactualFrames | None = None,
+    prompt: int | None = None,
 ) -> Iterator[dict]:
     """Batches of the frozen windows (of each dataset the `first` ones, or all), dataset by dataset.
 
@@ -175,12 +176,14 @@ def eval_batches(
 
     `other_actions` adds action sequences of other episodes of each window's robot, that many per window (see
     `OtherWindows`): `other_actions` float32 [B, other_actions, T, U], and `other_valid` bool [B, other_actions], False
-    where there are fewer. `counterfactual`, made for these windows, adds the frames that the first of them leads to:
+    where there are fewer. `counterfactual`, made for these windows and for the `prompt` (EvalConfig.prompt_frames) that
+    they are judged after, adds the frames that the first of them leads to:
     `other_images` uint8 [B, T, H, W, 3], the recorded ones up to the prompt, and `other_seen` bool [B], False for
     robots that nobody simulates and for windows that no other episode's actions cover.
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
-    dataset is not in the manifest or in `table`.
+    dataset is not in the manifest or in `table`, and for a `counterfactual` of other windows, of another prompt, or
+    without `other_actions`.
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     frozen = {d.dataset: d for d in manifest.datasets}
@@ -201,6 +204,15 @@ def eval_batches(
     require(
         counterfactual is None or counterfactual.manifest == manifest.hash(),
         "the frames under other actions were made for other windows than the frozen ones; prepare the study again",
+    )
+    require(
+        counterfactual is None or other_actions > 0,
+        "the frames under other actions need these actions; ask for other_actions of at least 1",
+    )
+    require(
+        counterfactual is None or counterfactual.prompt == prompt,
+        f"the frames under other actions were made for prompt {counterfactual and counterfactual.prompt}, so they "
+        f"cannot be compared with what follows prompt {prompt}; prepare the study again with this eval.prompt_frames",
     )
     windows = [(name, *window) for name in wanted for window in frozen[name].windows[:first]]
     return _batches(_Rows(store, table, manifest, wanted, other_actions, counterfactual), batch, windows)

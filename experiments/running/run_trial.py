@@ -197,6 +197,7 @@ def evaluate_on(
         first=first,
         other_actions=config.other_actions,
         counterfactual=counterfactual,
+        prompt=config.prompt_frames,
     )
     windows = sum(len(d.windows[:first]) for d in manifest.datasets if d.dataset in names)
     progress("evaluating", 0, windows)

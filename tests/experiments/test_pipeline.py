@@ -37,7 +37,8 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
 
     truth, prompt = prepared.counterfactual, study.eval.prompt_frames
     assert truth.prompt == prompt and set(truth.frames) == set(prepared.manifest.names)
-    (batch,) = eval_batches(store, table, prepared.manifest, 4, other_actions=3, counterfactual=truth)
+    others = {"other_actions": 3, "prompt": prompt}
+    (batch,) = eval_batches(store, table, prepared.manifest, 4, counterfactual=truth, **others)
     rows = np.flatnonzero(batch["valid"])
     assert batch["other_seen"][rows].all()
     np.testing.assert_array_equal(batch["other_images"][:, :prompt], batch["images"][:, :prompt])
@@ -61,7 +62,7 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     monkeypatch.setattr(OtherWindows, "choose", lambda *args: [])  # as of episodes that are longer than all others
     counterfactual.make_counterfactual(study, workspace)
     alone = open_prepared_data(workspace).counterfactual
-    (batch,) = eval_batches(store, table, prepared.manifest, 4, other_actions=3, counterfactual=alone)
+    (batch,) = eval_batches(store, table, prepared.manifest, 4, counterfactual=alone, **others)
     assert not batch["other_seen"].any()
 
 

@@ -19,9 +19,8 @@ def batches(store, count: int, prompt: int | None = None, **options):
     """(frozen windows, the one batch of all of them)."""
     frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=prompt)
     table = store.embodiment_table(store.names)
-    (batch,) = eval_batches(
-        store, table, frozen, sum(len(d.windows) for d in frozen.datasets), other_actions=count, **options
-    )
+    whole = sum(len(d.windows) for d in frozen.datasets)
+    (batch,) = eval_batches(store, table, frozen, whole, other_actions=count, prompt=2, **options)
     return frozen, batch
 
 
@@ -134,11 +133,18 @@ def test_nothing_is_seen_under_actions_that_there_are_not(tmp_path):
     np.testing.assert_array_equal(batch["other_images"], batch["images"])
 
 
-def test_frames_of_other_windows_or_damaged_ones_are_refused(tmp_path):
+def test_frames_of_other_windows_or_prompts_or_damaged_ones_are_refused(tmp_path):
     store = small_store(tmp_path)
     frozen = freeze_manifest(store, store.names, 4, 5, 1)
     with pytest.raises(ConfigError, match="made for other windows than the frozen ones"):
         batches(store, 1, counterfactual=frames_for(frozen))
+    table = store.embodiment_table(store.names)
+    for options, words in (
+        ({"other_actions": 0, "prompt": 2}, "need these actions; ask for other_actions of at least 1"),
+        ({"other_actions": 1, "prompt": 3}, "made for prompt 2, .* what follows prompt 3; prepare the study again"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            eval_batches(store, table, frozen, 2, counterfactual=frames_for(frozen), **options)
     frames_for(frozen).save(tmp_path / "t.npz")
     whole = (tmp_path / "t.npz").read_bytes()
     at = 30 + sum(np.frombuffer(whole[26:30], "<u2").tolist())  # where the first array begins, packed
