@@ -49,8 +49,8 @@ def init_state(
     """The state before step 1, around a copy of `params` or freshly drawn ones.
 
     It is laid out as `shapes` says (`state_shapes`; default: on the default device, without an
-    average). No device ever holds more than its part. `params` stay the caller's: training donates
-    its state, never them. Raises ConfigError for `params` of another model.
+    average). No device ever holds more than its part. `params`, which become float32, stay the
+    caller's: training donates its state, never them. Raises ConfigError for `params` of another model.
     """
     shapes = state_shapes(declared, table) if shapes is None else shapes
     layout = _layout(shapes)
@@ -58,7 +58,7 @@ def init_state(
         params = declared.init(seed, layout and layout.params)
     else:
         require_params(declared, params, "the initial parameters do not fit the model")
-        params = jax.tree.map(lambda x, like: place(np.array(x), like.sharding), params, shapes.params)
+        params = jax.tree.map(lambda x, like: place(np.array(x, like.dtype), like.sharding), params, shapes.params)
     leaves, treedef = jax.tree.flatten(shapes)
     step, opt_state = _jitted_zeros(treedef, tuple(leaves), table.size)()
     ema = None if shapes.ema is None else jax.tree.map(copy, params)

@@ -4,12 +4,14 @@ import signal
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig, OptimizerConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.model.params import inference_params
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions
@@ -214,6 +216,15 @@ def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):
     result = train(tmp_path, initial=given)
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))
     assert equal_trees(given, before) and not equal_trees(given, result.state.params)
+
+
+def test_training_goes_on_in_float32_from_parameters_that_were_cast_for_inference():
+    """As `load_model` gives them in bfloat16: the second step was refused, for it had a state of another type."""
+    declared = declare_model(MODEL, TABLE)
+    given = inference_params(declared, declared.init(7), "bfloat16")
+    made = init_state(declared, TABLE, 0, params=given)
+    assert any(x.dtype == jnp.bfloat16 for x in jax.tree.leaves(given))
+    assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(made.params)) and equal_trees(given, made.params)
 
 
 @pytest.mark.parametrize("other", ["seeds", "statistics of actions"])
