@@ -60,8 +60,15 @@ def load_starts(path: Path) -> tuple[Start, ...]:
     """What `save_starts` wrote. Raises ConfigError for a file that is damaged or something else."""
     with reading_arrays(path, "make it again") as arrays:
         starts = []
-        for name in sorted({name.rsplit("/", 1)[0] for name in arrays}):
+        for number, robot in sorted({_parts(name) for name in arrays}):
+            name = f"{number:04d}/{robot}"
             seed = arrays[f"{name}/seed"]
             images, actions = arrays[f"{name}/images"], arrays[f"{name}/actions"]
-            starts.append(Start(name.split("/")[1], images, actions, int(seed[0]) if len(seed) else None))
+            starts.append(Start(robot, images, actions, int(seed[0]) if len(seed) else None))
         return tuple(starts)
+
+
+def _parts(name: str) -> tuple[int, str]:
+    """A start's number and robot, from the name of one of its arrays. A robot's name may contain "/" too."""
+    number, rest = name.split("/", 1)
+    return int(number), rest.rsplit("/", 1)[0]

@@ -3,6 +3,7 @@
 import logging
 from copy import copy
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.monitoring
@@ -11,8 +12,10 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.generation import rollout
+from hma_jax.runtime.arrays import write_arrays
 from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.episode import as_arrays, from_arrays
+from hma_jax.simulator.starts import load_starts, save_starts
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
@@ -398,6 +401,18 @@ def test_starts_are_looked_for_by_their_values():
     again = start(1, 2, 2)
     assert starts.index(again) == 2 and {again: "third"}[starts[2]] == "third"
     assert start(1, 3) not in starts and again != "third" and len({*starts, again}) == 3
+
+
+def test_starts_are_read_as_they_were_written(tmp_path: Path):
+    """Robots' names too, and in their order where the numbers differ in length."""
+    first = start(0, 2)
+    starts = [replace(first, robot="lab/arm", seed=3), replace(first, robot="lab/base")]
+    save_starts(starts, tmp_path / "few.npz")
+    assert load_starts(tmp_path / "few.npz") == tuple(starts)
+    given = {"images": first.images, "actions": first.actions, "seed": np.zeros(0, np.int64)}
+    arrays = {f"{i}/{robot}/{name}": x for i, robot in ((10_000, "b"), (9999, "a")) for name, x in given.items()}
+    write_arrays(tmp_path / "many.npz", arrays)
+    assert [one.robot for one in load_starts(tmp_path / "many.npz")] == ["a", "b"]
 
 
 def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
