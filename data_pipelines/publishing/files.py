@@ -6,15 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from hma_jax.runtime.files import sync
-
-
-def sync_tree(directory: Path) -> None:
-    """`sync` of everything below a directory, and of itself."""
-    for root, _, files in os.walk(directory):
-        for name in files:
-            sync(Path(root, name))
-        sync(Path(root))
+from hma_jax.runtime.files import sync, sync_tree
 
 
 def publish(made: Path, final: Path) -> None:

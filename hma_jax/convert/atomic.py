@@ -1,4 +1,4 @@
-"""Directories that appear whole or not at all."""
+"""Directories that appear whole or not at all, also after a loss of power."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import naming
+from hma_jax.runtime.files import naming, sync, sync_tree
 from hma_jax.runtime.locks import Held, exclusive
 from hma_jax.runtime.outputs import unwritable
 
@@ -48,4 +48,6 @@ def atomic_directory(directory: Path) -> Iterator[Path]:
         stack.callback(shutil.rmtree, temporary, ignore_errors=True)
         with naming(directory):
             yield temporary
+            sync_tree(temporary)
         os.replace(temporary, directory)
+        sync(directory.parent)

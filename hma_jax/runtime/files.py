@@ -18,6 +18,14 @@ def sync(path: Path) -> None:
         os.close(fd)
 
 
+def sync_tree(directory: Path) -> None:
+    """`sync` of everything below a directory, and of itself."""
+    for root, _, files in os.walk(directory):
+        for name in files:
+            sync(Path(root, name))
+        sync(Path(root))
+
+
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Adds `path` to an OSError of the block that names no file, such as that of a full disk."""

@@ -16,6 +16,7 @@ from data_pipelines.publishing.output_lock import find_held_lock, lock_output
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
 from tests.full_disk import full_disk
+from tests.written import record_writes
 
 
 def hold(place: Path, ready) -> None:
@@ -55,11 +56,9 @@ def test_a_directory_takes_the_place_of_another_and_leaves_nothing(tmp_path):
 
 
 def test_everything_is_forced_to_the_disk_before_it_is_seen(tmp_path, monkeypatch):
-    done, sync, rename = [], files.sync, files.os.rename
-    monkeypatch.setattr(files, "sync", lambda path: (done.append(Path(path).name), sync(path)))
-    monkeypatch.setattr(files.os, "rename", lambda a, b: (done.append("rename"), rename(a, b)))
     (tmp_path / "made" / "inner").mkdir(parents=True)
     (tmp_path / "made" / "inner" / "file").touch()
+    done = record_writes(tmp_path, monkeypatch)
     publish(tmp_path / "made", tmp_path / "final")
     assert done == ["made", "file", "inner", "rename", tmp_path.name]
 

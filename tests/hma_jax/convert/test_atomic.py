@@ -7,6 +7,7 @@ from hma_jax.config import ConfigError
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.tensors import write_safetensors
 from tests.full_disk import full_disk
+from tests.written import record_writes
 
 
 def test_a_directory_appears_whole_or_not_at_all(tmp_path):
@@ -20,6 +21,14 @@ def test_a_directory_appears_whole_or_not_at_all(tmp_path):
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
     with pytest.raises(ConfigError, match="out exists already"), atomic_directory(tmp_path / "out"):
         pass
+
+
+def test_all_of_it_is_on_the_disk_before_it_is_seen(tmp_path, monkeypatch):
+    """A loss of power left a directory of empty files."""
+    with atomic_directory(tmp_path / "out") as temporary:
+        (temporary / "a").touch()
+        done = record_writes(tmp_path, monkeypatch)
+    assert done == ["a", temporary.name, "rename", tmp_path.name]
 
 
 def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
