@@ -11,6 +11,7 @@ import os
 import shutil
 from pathlib import Path
 
+from hma_jax.runtime.files import sync, sync_tree
 from hma_jax.training.reading import list_steps
 from hma_jax.training.run_lock import CHECKPOINTS
 
@@ -32,7 +33,8 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
     """Puts into `run_dir` the last checkpoint of `source` up to step `latest`, and what was logged until then.
 
     Returns its step; None, and nothing is done, without one, or if `run_dir` has a checkpoint of its own. The
-    checkpoint appears whole or not at all. Whether the two runs agree is checked when it is restored. Raises OSError.
+    checkpoint appears whole or not at all, after the logs, also if the power fails. Whether the two runs agree is
+    checked when it is restored. Raises OSError.
     """
     step = last_step(source, latest)
     if not step or has_checkpoint(run_dir):
@@ -42,8 +44,12 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
     for name in LOGS:
         if (source / name).exists():
             shutil.copyfile(source / name, run_dir / name)
+            sync(run_dir / name)
+    sync(run_dir)
     aside = run_dir / f".{step}.copied"
     shutil.rmtree(aside, ignore_errors=True)  # of a copy that was cut short
     shutil.copytree(source / CHECKPOINTS / str(step), aside)
+    sync_tree(aside)
     os.replace(aside, place)
+    sync(place.parent)
     return step

@@ -17,6 +17,7 @@ from hma_jax.training.reading import list_steps
 from hma_jax.training.train import train_model
 from tests.hma_jax.test_training import equal_trees
 from tests.tiny import SMALLER, TABLE, batches, model_config, train_config
+from tests.written import record_writes
 
 WSD = OptimizerConfig(learning_rate=1e-2, warmup_steps=1, schedule="wsd", decay_fraction=0.5)
 MODEL = model_config(**SMALLER)
@@ -55,6 +56,18 @@ def test_a_branch_is_byte_equal_to_a_run_of_its_own(tmp_path: Path):
     logs = [(tmp_path / name / "metrics.jsonl").read_bytes() for name in ("alone", "branch")]
     assert logs[0] == logs[1]
     assert begin_from(tmp_path / "short", tmp_path / "branch", 5) is None, "it has checkpoints of its own"
+
+
+def test_a_branch_is_on_the_disk_before_its_checkpoint_is_seen(tmp_path: Path, monkeypatch):
+    """Its logs first: a checkpoint without them, after a loss of power, is refused."""
+    source, branch = tmp_path / "source", tmp_path / "branch"
+    (source / CHECKPOINTS / "3").mkdir(parents=True)
+    for name in (f"{CHECKPOINTS}/3/state", "metrics.jsonl"):
+        (source / name).touch()
+    branch.mkdir()
+    done = record_writes(branch, monkeypatch)
+    assert begin_from(source, branch, 5) == 3
+    assert done == ["metrics.jsonl", "branch", "state", ".3.copied", "rename", CHECKPOINTS]
 
 
 def test_a_run_does_not_go_on_from_where_another_had_begun_to_decay(tmp_path: Path):
