@@ -17,7 +17,7 @@ from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
-from hma_jax.model.given import Array, as_frames, require_keys, require_known
+from hma_jax.model.given import Array, as_frames, require_finite, require_keys, require_known
 from hma_jax.model.hma import HMA
 
 Phase = Literal["filling", "sliding"]
@@ -87,7 +87,8 @@ def advance(
     Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also
     shown the chunk that comes after it: `next_chunk_BU`, or the same again where nobody knows it
     (as the release's simulator does). `hidden_B` marks chunks the model is not shown. A caller who knows
-    which `phase` the session is in saves the program of the other. Raises ConfigError as `start`.
+    which `phase` the session is in saves the program of the other. Raises ConfigError as `start`; within `jax.jit`
+    for shapes alone, where no values are known.
     """
     capacity, t = model.config.frames - 1, session.count
     batch, _, width = session.chunks_BTU.shape
@@ -98,6 +99,8 @@ def advance(
         {"chunk": chunk_BU, "next chunk": next_chunk_BU, "hidden": hidden_B},
         {"chunk": (batch, width), "next chunk": (batch, width), "hidden": (batch,)},
     )
+    require_finite(chunk_BU)
+    require_finite(next_chunk_BU)
     require_keys(key_B, batch)
     last = jnp.minimum(t, capacity) - 1
     both = jnp.stack([chunk_BU, next_chunk_BU], axis=1)

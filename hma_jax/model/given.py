@@ -28,6 +28,11 @@ def require_known(
     for what, (array, count) in counts.items():
         if _has_values(array):
             require_below(count, array, f"got {what}")
+    require_finite(actions)
+
+
+def require_finite(actions: Array) -> None:
+    """Raises ConfigError for actions that are not finite, if their values are here, as in `require_known`."""
     require(not _has_values(actions) or bool(np.isfinite(np.asarray(actions)).all()), "the actions are not finite")
 
 

@@ -99,3 +99,17 @@ def test_a_session_of_other_shapes_is_refused(tokens, between, chunk, message):
 
     with pytest.raises(ConfigError, match=message):
         jax.eval_shape(begin_and_go_on, params)
+
+
+def test_a_session_goes_on_by_no_chunk_that_is_not_finite():
+    config = shallow_config()
+    declared, params = lively_params(config)
+
+    def go_on(params):
+        model, robots = declared.merge(params), jnp.zeros(2, jnp.int32)
+        session = start(model, jnp.zeros((2, 1, 9), jnp.int32), jnp.zeros((2, 0, TABLE.action_width)), robots)
+        given = np.full((2, TABLE.action_width), np.nan)
+        return advance(model, session, given, jax.random.split(jax.random.key(0), 2), DecodeConfig())
+
+    with pytest.raises(ConfigError, match="the actions are not finite"):
+        jax.eval_shape(go_on, params)
