@@ -161,10 +161,14 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
         return
     real = np.where(batch["valid"], np.sum(batch["real"], axis=1), config.first_predicted + 1)
     row = int(np.argmin(real))
+    if config.context == "generated":
+        what = f"eval.prompt_frames {config.prompt_frames}"
+        advice = "freeze windows for this prompt, or use a shorter one"
+    else:
+        what, advice = "eval.context recorded", "freeze windows of at least 2 frames"
     require(
         real[row] > config.first_predicted,
-        f"a window of {batch['dataset'][row]} has {real[row]} frames, so with eval.prompt_frames "
-        f"{config.prompt_frames} there is none to predict; freeze windows for this prompt, or use a shorter one",
+        f"a window of {batch['dataset'][row]} has {real[row]} frames, so with {what} there is none to predict; {advice}",
     )
 
 
