@@ -112,13 +112,14 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
             flops += steps * denoiser_flops(model, frames, own_steps=False, channels=table.action_width)
     if not predicts_frames(setting):
         return flops
-    window_pass = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, true or masked
-    likelihood = 2 * window_pass
+    window_pass = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, masked
+    true_pass = pass_flops(model, table, frames - 1, frames / 2, predicted=0)  # what these come after
+    likelihood = true_pass + window_pass
     if model.diffusion:
         likelihood += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
     flops += (1 + config.other_actions) * likelihood
     if config.context == "recorded":
-        flops += 2 * window_pass * (config.other_actions > 0)  # the likelihood once more, for decoding
+        flops += (true_pass + window_pass) * (config.other_actions > 0)  # the likelihood once more, for decoding
         flops += (decode.unmask_steps - 1) * window_pass + (frames - 1) * sampler_flops(model, decode)
         flops += draws * rollout_flops(model, table, decode, frames, frames - 1)
     else:

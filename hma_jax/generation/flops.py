@@ -29,15 +29,16 @@ def frame_flops(
     whole, steps = config.frames, decode.unmask_steps
     earlier = whole - 1 if earlier is None else earlier
 
-    def one(seen: int) -> float:
-        return pass_flops(config, table, 1, seen)
+    def one(seen: int, predicted: int = 1) -> float:
+        return pass_flops(config, table, 1, seen, predicted)
 
-    if way == "fill":  # the frame before enters the cache beside the first step
-        trunk = one(earlier) + steps * one(earlier + 1)
+    # A finished frame that enters the cache beside the first step is not read out.
+    if way == "fill":
+        trunk = one(earlier, predicted=0) + steps * one(earlier + 1)
     elif way == "stream":
-        trunk = (1 + steps) * one(whole)
+        trunk = one(whole, predicted=0) + steps * one(whole)
     elif way == "slide":
-        trunk = pass_flops(config, table, whole, whole / 2) + (steps - 1) * one(whole)
+        trunk = pass_flops(config, table, whole, whole / 2, predicted=1) + (steps - 1) * one(whole)
     else:
         trunk = steps * pass_flops(config, table, earlier + 1, (earlier + 1) / 2)
     return trunk + sampler_flops(config, decode)
@@ -75,7 +76,7 @@ def rollout_flops(
     window = min(frames, config.frames)
     if naive:
         return sequences * (frames - prompt) * frame_flops(config, table, decode, "recompute", window - 1)
-    past = pass_flops(config, table, prompt - 1, (prompt - 1) / 2)
+    past = pass_flops(config, table, prompt - 1, (prompt - 1) / 2, predicted=0)
     filled = sum(frame_flops(config, table, decode, "fill", t) for t in range(prompt, window))
     slide: Way = "slide" if decode.slide == "exact" else "stream"
     slid = (frames - window) * frame_flops(config, table, decode, slide)

@@ -19,6 +19,10 @@ def forward_flops_per_window(
 
     With teacher forcing it is a pass over T - 1 frames and, beside them, over the T - 1 that follow them. What
     `masking` does not predict is not computed. An action head without a denoiser is too small to count.
+
+    Counted as published trials have it, so that budgets of training stay comparable: without teacher forcing all T
+    frames are read out, where training leaves out the first, and attention over time is causal, where that of the
+    setting `inverse` is not.
     """
     t, diffusion = config.frames, config.diffusion
     frames, predicted = (2 * (t - 1), t - 1) if masking.teacher_forcing else (t, t)

@@ -129,6 +129,22 @@ def test_a_frame_counts_every_look_and_every_sampler_step(kind, looks):
         assert formula == pytest.approx(count, rel=0.03), way
 
 
+def test_of_the_frames_before_a_new_one_none_is_read_out():
+    """With a vocabulary so large that reading out is most of a pass."""
+    case = Case(factor_vocab=2048, layers=1)
+    decode = DecodeConfig(2)
+    for way, make in ways(case, decode).items():
+        count, formula = counted(make, case.params), frame_flops(case.config, TABLE, decode, way)
+        assert formula == pytest.approx(count, rel=0.03), way
+    tokens, size = jnp.asarray(case.batch["tokens"])[:, :-1], case.config.frames
+    chunks = jnp.asarray(case.batch["actions"])[:, None]
+    count = counted(
+        lambda p: rollout(case.declared.merge(p), tokens, chunks, case.batch["embodiment"], case.keys, decode),
+        case.params,
+    )
+    assert rollout_flops(case.config, TABLE, decode, size, size - 1) == pytest.approx(count, rel=0.03)
+
+
 @pytest.mark.parametrize("resample", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("sampler", [SamplerConfig("ddpm", 5), SamplerConfig("ddim", 12), SamplerConfig("dpm++", 8)])
 def test_the_denoiser_counts_the_tokens_that_it_sees_at_every_step(resample, sampler):
