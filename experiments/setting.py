@@ -104,7 +104,7 @@ class Setting:
 
     arguments: StudyArguments
     study: Study
-    data: tuple[str, ...]  # RLDS directories, in the study's order; () for the suite
+    data: tuple[str, ...]  # directories of datasets; () for the suite
     workspace: Workspace
 
     @property
@@ -195,9 +195,13 @@ def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
 
 
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:
-    """`<root>/<name>` for every name, in the first root that has it. ConfigError for those missing."""
+    """`<root>/<name>` for every name, or those that its entry joins, in the first root that has it. ConfigError for
+    those missing."""
+    from data_pipelines.registry import find_spec
     from data_pipelines.sources.rlds.location import locate
 
+    entries = {name: find_spec(name) for name in names}
+    names = [one for name, entry in entries.items() for one in (entry and entry.joins) or (name,)]
     found = {n: locate(r) / n for r in reversed(roots) for n in names if (locate(r) / n).is_dir()}
     missing = [n for n in names if n not in found]
     if missing:

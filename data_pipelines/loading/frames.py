@@ -22,6 +22,7 @@ from data_pipelines.sampling.mixture import make_mixture
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
 from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, held_out_episodes
 from data_pipelines.sources.identity import describe
+from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
@@ -36,7 +37,7 @@ PREFETCH_BATCHES = 8
 
 
 def make_frame_loader(
-    datasets: Sequence[tuple[DatasetSpec, str | Path]],
+    datasets: Sequence[tuple[DatasetSpec, str | Path | Parts]],
     image_size: int,
     batch: int,
     seed: int,
@@ -74,7 +75,8 @@ def make_frame_loader(
             if split == "val":
                 bound = f"val_fraction={val_fraction:g}, min_val={min_val} and max_val={max_val} set how many are"
                 skipped = f"all {all_held_out.sum():,} held-out episodes of its {len(all_held_out):,} were skipped"
-                none = f"of {len(mask)} none is held out: this needs at least two"
+                where = " in one of its parts" if spec.joins else ""
+                none = f"of {len(mask)} none is held out: this needs at least two{where}"
                 reasons[spec.name] += f": {skipped if all_held_out.any() else none}; {bound}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)

@@ -9,9 +9,9 @@ dataset.
 
 from data_pipelines.registry.mixtures import MIXTURES, get_mixture
 from data_pipelines.registry.spec import FRAME_RATE, DatasetSpec
-from data_pipelines.registry.table import all_specs, find_spec, get_spec, known_groups, register
+from data_pipelines.registry.table import all_specs, find_reader, find_spec, get_spec, known_groups, register
 
 __all__ = [
-    "FRAME_RATE", "MIXTURES", "DatasetSpec", "all_specs", "find_spec", "get_mixture", "get_spec", "known_groups",
-    "register",
+    "FRAME_RATE", "MIXTURES", "DatasetSpec", "all_specs", "find_reader", "find_spec", "get_mixture", "get_spec",
+    "known_groups", "register",
 ]  # fmt: skip

@@ -24,7 +24,7 @@ FRAME_RATE = 2.0
 
 NOT_OF_ACTIONS = (
     "name", "image_key", "hz", "rate", "camera", "split", "note", "video_targets", "version", "unverified",
-    "episodes", "median_steps", "mean_steps", "val_split", "image_corrections",
+    "episodes", "median_steps", "mean_steps", "val_split", "image_corrections", "joins",
 )  # fmt: skip
 """Fields of an entry that do not affect the meaning of action values."""
 
@@ -85,6 +85,8 @@ class DatasetSpec:
     val_split: str = ""  # the part of `split` ("train+val") that is held out; "": episodes chosen by hash
     # What is done to every frame that is read: for a camera that hangs upside down, or colours written as BGR.
     image_corrections: tuple[ImageCorrection, ...] = ()
+    # Datasets, by the names in their own files, that together are this one, in this order; (): it is one by itself.
+    joins: tuple[str, ...] = ()
 
     def __post_init__(self):
         name = self.name
@@ -131,6 +133,13 @@ class DatasetSpec:
             f"dataset {name!r}: image_corrections may list {', '.join(known)}, in this order and each once, got "
             f"{self.image_corrections}",
         )
+        for joined in self.joins:
+            require(
+                is_dataset_name(joined),
+                f"dataset {name!r}: joins has {quote(joined)}, which cannot be the name of a dataset. Write the names that "
+                "`hma data inspect` prints, not directories",
+            )
+        require(len(set(self.joins)) == len(self.joins), f"dataset {name!r}: joins names a dataset twice: {self.joins}")
 
     @property
     def stride(self) -> int:

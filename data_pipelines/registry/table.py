@@ -12,7 +12,7 @@ from data_pipelines.registry.openx_more import OPENX_MORE
 from data_pipelines.registry.openx_rest import OPENX_REST
 from data_pipelines.registry.own import OWN
 from data_pipelines.registry.spec import DatasetSpec
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 MAX_LISTED = 12
 """Names in a message; `hma data list` shows all."""
@@ -48,7 +48,8 @@ def get_spec(name: str) -> DatasetSpec:
     table = _table()
     if name in table:
         return table[name]
-    close = difflib.get_close_matches(name, table, n=3, cutoff=0.4)
+    names = [*table, *(part for spec in table.values() for part in spec.joins)]
+    close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
     if close:
         hint = f"did you mean {', '.join(close)}?"
     else:
@@ -62,6 +63,25 @@ def get_spec(name: str) -> DatasetSpec:
 def find_spec(name: str) -> DatasetSpec | None:
     """The entry called `name`, if there is one."""
     return _table().get(name)
+
+
+def find_reader(own_name: str) -> DatasetSpec | None:
+    """The entry by which files are read that name their dataset so: one that joins it with others, or else the one
+    called so; None without either. Raises ConfigError if several join it, and for a dataset that is called as one that
+    others are joined to and it is not."""
+    joining = [spec for spec in _table().values() if own_name in spec.joins]
+    require(
+        len(joining) <= 1,
+        f"{own_name} is in `joins` of {' and '.join(spec.name for spec in joining)}; a dataset can be part of one other: "
+        "keep one of these entries in the file for --registry",
+    )
+    known = joining[0] if joining else find_spec(own_name)
+    if known is not None and known.joins and not joining:
+        raise ConfigError(
+            f"{own_name} is the name of a dataset by its own files, and of the registry's entry that joins "
+            f"{', '.join(known.joins)}. Add {own_name} to `joins` of that entry, or call the entry something else"
+        )
+    return known
 
 
 def _table() -> dict[str, DatasetSpec]:

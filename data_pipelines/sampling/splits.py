@@ -14,7 +14,7 @@ import numpy as np
 
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.order import hash64, stream_seed
-from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from data_pipelines.sources.identity import EpisodeRun, episode_ids, runs_of_parts
 from hma_jax.config import require
 
 VAL_FRACTION, MIN_VAL, MAX_VAL, MAX_VAL_FRACTION = 0.05, 2, 200, 0.25
@@ -25,9 +25,16 @@ def held_out_episodes(
     spec: DatasetSpec, runs: Sequence[EpisodeRun], fraction: float, min_val: int, max_val: int, max_fraction: float
 ) -> np.ndarray:
     """bool [episodes that `runs` name], True for validation: the split that the dataset's entry names for that,
-    whatever its size, or else as `held_out` chooses. Raises ConfigError if there is no such split."""
+    whatever its size, or else as `held_out` chooses. Raises ConfigError if there is no such split.
+
+    Of a joined dataset, `held_out` chooses in each part as if that were a dataset by itself: what is held out of a part
+    is new to a model that was trained on the part alone, or joined with others.
+    """
     if not spec.val_split:
-        return held_out(spec.name, episode_ids(runs), fraction, min_val, max_val, max_fraction)
+        bounds = (fraction, min_val, max_val, max_fraction)
+        parts = runs_of_parts(runs).items()
+        masks = [held_out(part or spec.name, episode_ids(own), *bounds) for part, own in parts]
+        return np.concatenate([np.zeros(0, bool), *masks])
     own = [run.split == spec.val_split for run in runs]
     require(
         any(own),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,10 +19,20 @@ from data_pipelines.errors import DataError
 class EpisodeRun:
     """The episodes at positions `first`, ..., `first + count - 1` of one file, readable or not."""
 
-    file: str  # its name, without a directory
+    file: str  # its name, without a directory; in a joined dataset that of the part and a slash before it
     first: int
     count: int
     split: str = ""  # of the files', where several are read together ("train+val")
+
+
+def runs_of_parts(runs: Sequence[EpisodeRun]) -> dict[str, list[EpisodeRun]]:
+    """The runs of each part of a joined dataset, in order, as they are named in the part alone. Those of a dataset that
+    is not joined belong to ''."""
+    parts: dict[str, list[EpisodeRun]] = {}
+    for run in runs:
+        part, _, file = run.file.rpartition("/")
+        parts.setdefault(part, []).append(replace(run, file=file) if part else run)
+    return parts
 
 
 def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:

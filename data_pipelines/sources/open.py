@@ -5,8 +5,10 @@ Owns the choice of the format. A new format is one more source and one line here
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
+from data_pipelines.sources.joined import JoinedSource, Parts
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
@@ -31,18 +33,23 @@ def find_format(location: str | Location) -> str:
 
 
 def open_source(
-    location: str | Location,
+    location: str | Location | Parts,
     split: str = "train",
     *,
     corrupt: Corrupt = "raise",
     max_skipped: float = MAX_SKIPPED,
     files: OpenFiles | None = None,
 ) -> EpisodeSource:
-    """The episodes of one split of the dataset at `location`; `files` may be shared by several.
+    """The episodes of one split of the dataset at `location`, or of all `Parts`; `files` may be shared by several.
 
     Raises DataError for a location that is no dataset, and for damage that `corrupt` does not allow;
     ConfigError for an unknown split and for a library that is missing.
     """
+    if isinstance(location, Parts):
+        files = OpenFiles() if files is None else files
+        own = sys.maxsize  # the limit is of all parts together
+        parts = [open_source(p, split, corrupt=corrupt, max_skipped=own, files=files) for p in location.places]
+        return JoinedSource(location.name, parts, corrupt, max_skipped)
     options = {"corrupt": corrupt, "max_skipped": max_skipped}
     kind = find_format(location)
     if kind == "lerobot":

@@ -224,6 +224,12 @@ class EpisodeSource(ABC):
                     "Correct action_dims, or read the version of the dataset it was written for."
                 )
 
+    def without_location(self, reason: str) -> str:
+        """The message without the dataset's location, so that what is made of it does not depend on where it lies."""
+        place, name = str(self.location), self.location.name
+        inside = reason.replace(f"{place}/", "")
+        return inside.replace(place, name) if name else inside  # "." has none
+
     def skip(self, i: int, error: EpisodeError) -> None:
         """Counts the unusable episode `i`, only once however often it is read; raises `error` under the policy
         corrupt='raise'."""

@@ -204,9 +204,9 @@ def _published(final: Path, plan: Manifest) -> Manifest | None:
 
 def _changes(existing: Manifest, plan: Manifest) -> list[str]:
     inputs = ("spec", "tokenizer", "settings", "source", "recipe")
-    n, asked = len(existing.train.episodes) + len(existing.val.episodes) + existing.skipped_count, plan.settings
+    counts, asked = existing.episodes_of_parts, plan.settings
     own = replace(asked, max_val_fraction=existing.settings.max_val_fraction)
-    if own.count_held_out(n) == asked.count_held_out(n):  # the limit differs, and changes nothing here
+    if all(own.count_held_out(n) == asked.count_held_out(n) for n in counts):  # another limit changes nothing here
         plan = replace(plan, settings=own)
     return [line for name in inputs for line in diff(getattr(existing, name), getattr(plan, name), name)]
 

@@ -20,7 +20,7 @@ from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sampling.splits import MAX_VAL, MIN_VAL, VAL_FRACTION, check_bounds, count_held_out
-from data_pipelines.sources.identity import EpisodeRun
+from data_pipelines.sources.identity import EpisodeRun, runs_of_parts
 from data_pipelines.tokens.moments import Moments
 from data_pipelines.tokens.row_sample import ActionRange, quantiles_vary
 from hma_jax.config import require
@@ -44,6 +44,7 @@ ADDED_FIELDS = (
     ("spec", "mean_steps", 0.0),
     ("spec", "val_split", ""),
     ("spec", "image_corrections", []),
+    ("spec", "joins", []),
     ("settings", "max_val_fraction", 0.5),
 )
 """Fields that were added to the format, with the value that holds for older stores. A field that has this value is left
@@ -169,6 +170,13 @@ class Manifest:
     def skipped_count(self) -> int:
         """Episodes left out."""
         return sum(entry.episodes for entry in self.skipped)
+
+    @property
+    def episodes_of_parts(self) -> list[int]:
+        """How many episodes the source has, left out ones counted; of a joined dataset, each part of it."""
+        if self.spec.joins:
+            return [sum(run.count for run in own) for own in runs_of_parts(self.runs).values()]
+        return [len(self.train.episodes) + len(self.val.episodes) + self.skipped_count]
 
     def split(self, name: str) -> SplitFacts:
         require(name in SPLITS, f"split must be 'train' or 'val', got {name!r}")

@@ -44,13 +44,14 @@ from hma_jax.config import require
 from hma_jax.runtime.cores import usable_cores
 
 if TYPE_CHECKING:
+    from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.rlds.location import Location
     from hma_jax.tokenizers.base import Tokenizer
 
 
 def tokenize_dataset(
     spec: DatasetSpec,
-    directory: str | Location,
+    directory: str | Location | Parts,
     tokenizer: Tokenizer,
     store_root: str | Path,
     *,
@@ -96,7 +97,7 @@ def tokenize_dataset(
     watch = TurnWatch(spec, warn or (lambda _: None))
     work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8), watch)
     skipped = [
-        SkippedEpisodes(_without_location(reason, source), episodes=count)
+        SkippedEpisodes(source.without_location(reason), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
@@ -170,13 +171,6 @@ def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
         factor_vocab=tokenizer.factor_vocab,
         channels=tokenizer.channels,
     )
-
-
-def _without_location(reason: str, source: EpisodeSource) -> str:
-    """The message without the source's location, so that manifests do not depend on it."""
-    place, name = str(source.location), source.location.name
-    inside = reason.replace(f"{place}/", "")
-    return inside.replace(place, name) if name else inside  # "." has none
 
 
 @dataclass
@@ -272,4 +266,4 @@ class _Work:
         if self._source.corrupt == "raise":
             raise error
         file, offset = (error.path.name, error.offset) if error.path is not None else ("", -1)
-        return SkippedEpisodes(_without_location(str(error), self._source), file, offset)
+        return SkippedEpisodes(self._source.without_location(str(error)), file, offset)

@@ -98,19 +98,22 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
     elif token_manifest.spec.val_split:
         why = f"Its split {token_manifest.spec.val_split} has {held_out}: remove val_split from its entry"
     else:
-        episodes = held_out + len(token_manifest.train.steps)
+        counts = token_manifest.episodes_of_parts
+        episodes = sum(counts)
         why = (
             f"{held_out} of {episodes} are held out, by store.min_val={settings.min_val}, "
             f"store.val_fraction={settings.val_fraction:g} and at most "
-            f"store.max_val_fraction={settings.max_val_fraction:g}. {_hold_out_more(settings, episodes)}"
+            f"store.max_val_fraction={settings.max_val_fraction:g}. {_hold_out_more(settings, counts)}"
         )
     return f"{robot} has {judged} held-out episodes with windows, but the check needs at least {MIN_EPISODES}. {why}"
 
 
-def _hold_out_more(settings: JobSettings, episodes: int) -> str:
-    """How to have MIN_EPISODES of so many held out."""
+def _hold_out_more(settings: JobSettings, counts: Sequence[int]) -> str:
+    """How to have MIN_EPISODES held out, of a dataset with so many in each of its parts."""
+    episodes = sum(counts)
     for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
-        count = count_held_out(episodes, settings.val_fraction, AT_LEAST, max(AT_LEAST, settings.max_val), share)
+        most = max(AT_LEAST, settings.max_val)
+        count = sum(count_held_out(n, settings.val_fraction, AT_LEAST, most, share) for n in counts)
         if count >= MIN_EPISODES:
             return (
                 "To hold out more, tokenise and train again in another --out, with --set "

@@ -37,9 +37,9 @@ def prepare(
 ) -> Provenance:
     """Makes what is missing and returns what trials depend on.
 
-    `data` are RLDS directories of the user, in the study's order; () simulates the suite. Instead
-    of training one, a trained `tokenizer` is taken from its directory. What follows from `replace` on may be made
-    again in its place. `batch` and `threads` as in `make_store`. Raises ConfigError or DataError.
+    `data` are directories of the user's datasets; () simulates the suite. Instead of training one, a trained
+    `tokenizer` is taken from its directory. What follows from `replace` on may be made again in its place. `batch` and
+    `threads` as in `make_store`. Raises ConfigError or DataError.
     """
     require_plain(workspace.root)
     if study.eval.lpips:

@@ -2,48 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from experiments.progress import say
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
+from experiments.words import few
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
+    from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.rlds.location import Location
     from data_pipelines.sources.source import EpisodeSource
 
-Source = tuple["DatasetSpec", "Location"]
+Source = tuple["DatasetSpec", "Location | Parts"]
 """A dataset: how it is read, and where it lies."""
 
 
-def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
-    """The names of the datasets at these locations. Raises DataError for one that is none, ConfigError for two of one
-    name."""
+def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
+    """The datasets at these locations, by name: of each the locations of its parts, which are several where an entry
+    joins them, by the names in their own files. Raises DataError for a location that is none, ConfigError for two of
+    one name."""
+    from data_pipelines.registry import find_reader
     from data_pipelines.sources.open import source_name
 
     places: dict[str, str] = {}
+    datasets: dict[str, dict[str, str]] = {}
     for place in data:
         name = source_name(place)
         require(
             name not in places,
             f"--data: {places.get(name)} and {place} are both the dataset {name!r}, by the name in their files; a "
-            "study reads one directory per dataset: leave one out",
+            "study reads one directory per name: leave one out or, if it is a LeRobot folder, which has no other name "
+            "than its folder's, rename it; an entry with `joins` makes one dataset of both",
         )
         places[name] = place
-    return tuple(places)
+        entry = find_reader(name)
+        datasets.setdefault(name if entry is None else entry.name, {})[name] = place
+    return datasets
+
+
+def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
+    """The names of the datasets at these locations. Raises what `group_by_dataset` raises."""
+    return tuple(group_by_dataset(data))
 
 
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     """User directories with their registry entries. Raises ConfigError for unknown names."""
+    datasets = group_by_dataset(data)
+    missing = [n for n in study.all_names() if n not in datasets]
+    require(not missing, f"no --data directory for {', '.join(missing)}; given: {', '.join(datasets)}")
+    return [source_of(name, datasets[name]) for name in study.all_names()]
+
+
+def source_of(name: str, places: Mapping[str, str]) -> Source:
+    """A dataset with its registry entry, which joins those of its parts that are given; says which are not. Raises
+    ConfigError for an unknown name."""
     from data_pipelines.registry import get_spec
+    from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.rlds.location import locate
 
-    named = dict(zip(name_datasets(data), map(locate, data), strict=True))
-    missing = [n for n in study.all_names() if n not in named]
-    require(not missing, f"no --data directory for {', '.join(missing)}; given: {', '.join(named)}")
-    return [(get_spec(name), named[name]) for name in study.all_names()]
+    spec = get_spec(name)
+    if not spec.joins:
+        return spec, locate(places[name])
+    given = tuple(part for part in spec.joins if part in places)
+    absent = [part for part in spec.joins if part not in places]
+    if absent:
+        say(
+            f"note: {name} is made of {few(given)} alone: no --data directory for {few(absent)}, which its entry joins too"
+        )
+    return replace(spec, joins=given), Parts(name, tuple(locate(places[part]) for part in given))
 
 
 def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:

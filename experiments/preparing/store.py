@@ -61,10 +61,13 @@ def make_store(
 
 def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
     """Of datasets whose files say another native rate than their entry, which counts."""
+    from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.open import find_format
 
     for spec, path in sources:
-        own = None if find_format(path) == "rlds" else open_source((spec, path), study.store).hz  # RLDS says none
+        places = path.places if isinstance(path, Parts) else (path,)
+        silent = all(find_format(place) == "rlds" for place in places)  # RLDS says none
+        own = None if silent else open_source((spec, path), study.store).hz
         if own not in (None, spec.hz):
             say(
                 f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from data_pipelines.registry import DatasetSpec, get_spec
+from data_pipelines.registry import DatasetSpec, find_reader, get_spec
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.sources.open import open_source, source_name
 from data_pipelines.sources.rlds.images import fit_images
@@ -52,6 +52,7 @@ class Trajectories(ABC):
     """The recorded trajectories of one split, made when they are asked for."""
 
     name: str  # of the dataset
+    drawn_as: str  # the name by which `ids` are hashed: the dataset's own, also where an entry joins it with others
     split: str
     fingerprint: str  # of its contents
     spec: DatasetSpec  # which camera and actions of it, at which rate
@@ -87,6 +88,7 @@ class RldsTrajectories(Trajectories):
         """Raises ConfigError for a dataset whose actions are not this robot's."""
         self._source, self.spec, self._robot, self._size = open_source(directory, split), spec, robot, size
         self.name, self.split, self.fingerprint = spec.name, split, self._source.fingerprint()
+        self.drawn_as = self._source.name if spec.joins else spec.name
         _require_fit(spec, robot)
         self._source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 
@@ -138,6 +140,7 @@ class StoredTrajectories(Trajectories):
         self._store, self._tokenizer, self._robot = store, tokenizer, robot
         self._every = robot.stride // manifest.frame_step
         self.name, self.split, self.fingerprint, self.spec = name, split, manifest.hash(), manifest.spec
+        self.drawn_as = name
         self._count = len(manifest.split(split).episodes)
         self.reconstructed = self._count > 0 and not self._keeps(store.episode(name, split, 0))
 
@@ -172,7 +175,8 @@ class StoredTrajectories(Trajectories):
 def open_trajectories(
     place: str, split: str, robot: Robot | None, robots: dict[str, Robot], tokenizer: BaseTokenizer, stores: Path
 ) -> tuple[Trajectories, Robot]:
-    """The trajectories at `place`, and who replays them: `robot`, or the one that the dataset is called after.
+    """The trajectories at `place`, and who replays them: `robot`, or the one that the dataset, or the one that it is
+    joined to, is called after.
 
     `place` is a dataset's directory, one of a token store (`STORE/NAME`), or the name of a dataset in the token store
     `stores`. Raises ConfigError for what is none of them, or of no known robot; DataError for damage.
@@ -187,6 +191,8 @@ def open_trajectories(
         path = stores / place
     stored = (path / MANIFEST).is_file()
     name = path.name if stored else source_name(place)
+    entry = None if stored else find_reader(name)
+    name = name if entry is None else entry.name
     chosen = robot or robots.get(name)
     if chosen is None:
         known = ", ".join(robots)

@@ -83,7 +83,7 @@ class RecordedTruth:
             known = np.ones(len(outlines), bool)
             self._success = np.array([held(x[None, 1:], task.hold).any() for x in self._reached], bool)
         # A recording that is held out of a model's training comes first here, too: by the same hash.
-        order = np.argsort(hash64(recorded.ids(), stream_seed("held-out", recorded.spec.name)), kind="stable")
+        order = np.argsort(hash64(recorded.ids(), stream_seed("held-out", recorded.drawn_as)), kind="stable")
         enough = length > task.hold
         usable = [int(i) for i in order if known[i] and enough[i]][: config.head_episodes]
         kinds = [[i for i in usable if self._success[i] == kind] for kind in (True, False)]

@@ -179,10 +179,9 @@ def load(
         with step(f"draw windows of {len(opened.names)} datasets"):
             timings = [time_windows(opened, windows, batch, frames, n) for n in threads]
     if data:
-        from data_pipelines.registry import get_spec
-        from experiments.preparing.sources import name_datasets
+        from experiments.preparing.sources import group_by_dataset, source_of
 
-        sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
+        sources = [source_of(name, places) for name, places in group_by_dataset(data).items()]
         with step(f"draw frames of {len(sources)} RLDS directories"):
             timings += [time_shards(sources, windows * frames // 10, 4 * batch, size, n) for n in threads]
     settings = {"frames": frames, "threads": threads, "datasets": len(opened.names), "size": size}

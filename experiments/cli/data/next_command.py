@@ -87,10 +87,12 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
 def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | None:
     """What to run first where a known dataset was looked at with another native rate than its entry's, which is the
     one that a study takes; None where they agree."""
-    from data_pipelines.registry import find_spec
+    from data_pipelines.registry import find_reader
 
-    known = find_spec(facts.name)
+    known = find_reader(facts.name)
     if known is None or hz is None or known.hz == hz:
         return None
+    if known.joins:
+        return f"correct hz in the entry of {known.name}, by which a study reads this at {known.hz:g} Hz, not {hz:g}"
     words = command("data inspect", facts.directory, "--hz", f"{hz:g}", "--entry", registry or ENTRIES)
     return f"{words}  (its entry says {known.hz:g} Hz, which a study uses, not {hz:g}; this writes another entry)"

@@ -17,6 +17,7 @@ from data_pipelines.errors import MAX_LISTED
 from experiments.cli.data.next_command import no_window, other_rate, say_next
 from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, say_unmatched, use_entries
+from experiments.words import few
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, to_strict_json
@@ -83,9 +84,13 @@ def _table_of(title: str, specs: Sequence[DatasetSpec]):
             f"{spec.episodes:,}" if spec.episodes else "?",
             f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
             spec.image_key.removeprefix("observation/"),
-            escape(spec.note) + unsure,
+            escape(", ".join(filter(None, (spec.note, _joined(spec))))) + unsure,
         )
     return table
+
+
+def _joined(spec: DatasetSpec) -> str:
+    return f"joins {few(spec.joins)}" if spec.joins else ""
 
 
 def data_inspect(
@@ -115,7 +120,7 @@ def data_inspect(
     """
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry
-    from data_pipelines.registry.table import find_spec
+    from data_pipelines.registry.table import find_reader
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
@@ -129,7 +134,7 @@ def data_inspect(
     with step(f"read {directory}"):
         sample = inspect_dataset(directory, split, episodes=episodes)
     facts = sample.facts
-    known = find_spec(facts.name)
+    known = find_reader(facts.name)
     say_unmatched(registry, (facts.name,))
     suggested = hz or facts.hz or (known.hz if known else None)
     suggestion = suggest_entry(facts, suggested)
@@ -266,7 +271,8 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
 
 def _in_words(spec: DatasetSpec) -> str:
     action = " + ".join(spec.action_keys) or "no action"
-    return f"{spec.image_key}, {action} ({spec.action_dim}), {spec.hz:g} Hz"
+    part = f"as a part of {spec.name}, " if spec.joins else ""
+    return f"{part}{spec.image_key}, {action} ({spec.action_dim}), {spec.hz:g} Hz"
 
 
 def _write_entry(path: Path, suggestion: Suggestion) -> None:

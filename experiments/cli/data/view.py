@@ -87,11 +87,11 @@ def _view_one(
     from data_pipelines.inspection.issues import find_issues
     from data_pipelines.inspection.suggest import suggest_entry, window_facts
     from data_pipelines.registry.spec import stride_of
-    from data_pipelines.registry.table import find_spec
+    from data_pipelines.registry.table import find_reader
     from data_pipelines.sources.open import source_name
     from experiments.report.data_page import CLIP_FRAMES, DatasetView
 
-    known = find_spec(source_name(directory))
+    known = find_reader(source_name(directory))
     split = split or (known.split if known else "train")
     keys = known.action_keys if known else ()
     sample = inspect_dataset(

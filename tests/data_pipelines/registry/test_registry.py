@@ -12,6 +12,7 @@ from data_pipelines.registry import (
     MIXTURES,
     DatasetSpec,
     all_specs,
+    find_reader,
     get_mixture,
     get_spec,
     known_groups,
@@ -220,12 +221,28 @@ def test_part_of_a_field_is_read_as_the_action(tmp_path):
         ({"action_dims": (7, 1)}, "same length"),
         ({"action_keys": ("action[:6]",)}, r"'action\[:6\]' uses 6 values, but action_dims says 7"),
         ({"action_dims": (0,)}, "at least 1"),
+        ({"joins": ("y", "/data/z")}, "joins has '/data/z', .* Write the names that `hma data inspect` prints"),
+        ({"joins": ("y", "y")}, "joins names a dataset twice"),
     ],
 )
 def test_entry_that_cannot_be_right_is_refused(change, message):
     good = DatasetSpec("x", "observation/image", ("action[:7]",), (7,), 10)
     with pytest.raises(ConfigError, match=f"dataset 'x': .*{message}"):
         replace(good, **change)
+
+
+def test_a_dataset_is_read_by_the_entry_that_joins_it(registered):
+    one = DatasetSpec("one", "observation/image", ("action",), (7,), 10)
+    arm = replace(one, name="arm", joins=("one", "two"))
+    assert arm.action_layout() == one.action_layout() and arm.facts().joins == arm.joins
+    register([one])
+    assert find_reader("one") == one and find_reader("two") is None
+    register([arm, replace(one, name="two", joins=("two", "three"))])
+    assert find_reader("one") == arm and find_reader("three").name == "two"
+    with pytest.raises(ConfigError, match="two is in `joins` of arm and two; a dataset can be part of one other"):
+        find_reader("two")
+    with pytest.raises(ConfigError, match="arm is the name of a dataset by its own files, .* joins one, two. Add arm"):
+        find_reader("arm")
 
 
 def test_unknown_name_suggests_the_closest():
@@ -261,7 +278,8 @@ def test_corrections_that_there_are_not_are_refused(wrong):
 def test_entry_survives_its_toml_file(tmp_path):
     rare = DatasetSpec("rare", "observation/\U0001f916", ("action\u00e9",), (7,), 10)
     upside_down = replace(rare, image_corrections=("rotate_180",))
-    for spec in (*all_specs(), rare, upside_down):
+    joined = replace(rare, joins=("rare", "unique"))
+    for spec in (*all_specs(), rare, upside_down, joined):
         (tmp_path / "one.toml").write_text(to_toml(spec), encoding="utf-8")
         assert load_entries(tmp_path / "one.toml") == (spec,)
 
@@ -283,6 +301,7 @@ def test_registered_entry_is_found_and_takes_the_place_of_a_known_one(registered
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\n', "robot: missing field.* hz"),
         ('[robot]\nimage = "i"\n', "unknown field.* image; known"),
         ('[robot]\nname = "arm"\nimage_key = "i"\n', "robot: remove name = 'arm'"),
+        ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\nhz = 1\njoins = "a"\n', "robot.joins"),
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\nhz = -1\n', "hz, the native rate"),
         (
             '[robot]\nimage_key = "i"\naction_keys = ["action"]\naction_dims = [2]\nhz = 1\nangles = [1]\n',
