@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.report.plot_style import STYLE, axis_of_points, plain_log, save, show_legend
+from experiments.report.plot_style import MUTED, STYLE, axis_of_points, plain_log, save, show_legend
 from hma_jax.diagnostics.coordinate_check import Size
 
 ROWS = {"size": "size (RMS)", "change": "change since step 0 (RMS)"}
@@ -42,7 +42,11 @@ def plot_coords(rows: Sequence[Size], path: Path) -> None:
             panel.set_ylabel(label)
         for panel in panels.ravel():
             axis_of_points(panel, widths, [str(width) for width in widths])
-            plain_log(panel, panel.yaxis)
+            drawn = np.array([line.get_ydata() for line in panel.lines])
+            if (np.isfinite(drawn) & (drawn > 0)).any():
+                plain_log(panel, panel.yaxis)
+            else:  # an axis of logarithms needs a number
+                panel.text(0.5, 0.5, "zero or not finite", transform=panel.transAxes, ha="center", color=MUTED)
         for panel in panels[-1]:
             panel.set_xlabel("width")
         show_legend(figure, panels[0])

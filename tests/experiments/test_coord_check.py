@@ -1,6 +1,7 @@
 """`hma coord-check`: what is measured, printed and written."""
 
 import csv
+import math
 
 import pytest
 
@@ -74,8 +75,8 @@ def test_the_learning_rate_is_the_study_s_unless_one_is_given(tmp_path, monkeypa
     assert {train.optimizer.learning_rate for train in rates} == {1e-3, 0.5}
 
 
-def test_sizes_that_are_zero_or_not_finite_are_drawn_as_gaps(tmp_path):
-    sizes = (0.0, 1.0, float("inf"), float("nan"))
+@pytest.mark.parametrize("sizes", [(0.0, 1.0, math.inf, math.nan), (math.nan, math.nan), (0.0, math.inf)], ids=str)
+def test_a_model_that_diverged_is_drawn_as_far_as_it_can_be(sizes, tmp_path):
     plot_coords([Size("x", 8 * 2**i, 0, 1, size, size) for i, size in enumerate(sizes)], tmp_path / "x.png")
     assert (tmp_path / "x.png").exists()
 
