@@ -3,7 +3,7 @@
 One row per robot and metric: the mean with its interval over episodes and, where several seeds were judged, over
 these (`bootstrap`), how many standard errors it is from the value of a deaf model (one whose predictions do not depend
 on actions), and what share of the change of this robot's pixels its actions explain in truth
-(`experiments.suite.explained`).
+(`experiments.suite.explained`), where the model has the rate at which that was measured.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr
 
+from data_pipelines.registry import FRAME_RATE
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.paired import require_same_windows
 from experiments.suite.explained import read_table
@@ -51,14 +52,17 @@ class Controllability:
     role: str = POINT  # or CONTROL: a model trained on the actions of other episodes, which has nothing to follow
 
 
-def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Controllability]:
-    """Of one model of that `role` under several seeds, {seed: table}: every robot that has the metric, in the
-    order of the tables.
+def controllability(
+    seeds: dict[int, WindowTable], role: str = POINT, rate: float | None = FRAME_RATE
+) -> list[Controllability]:
+    """Of one model of that `role` and frame rate under several seeds, {seed: table}: every robot that has the metric,
+    in the order of the tables.
 
     Raises NotComparable unless all seeds saw the same windows.
     """
     require(len(seeds) > 0, "there is no trial to compute controllability from")
-    first, truth, rows = next(iter(seeds.values())), read_table(), []
+    first, rows = next(iter(seeds.values())), []
+    truth = read_table() if rate == FRAME_RATE else {}  # over a step of another length it is another share
     matched = {}
     for seed, table in seeds.items():
         require_same_windows(first, table)

@@ -49,14 +49,15 @@ def robots_of(
 ) -> list[Robot]:
     """Of the scope of a sweep, by the trials at its default, the most controllable first. Where each seed judges robots
     of its own, of those seeds that judge all of the scope."""
-    tables = {}
+    tables, rate = {}, None
     for p in sweep.points:
         id = trial_id(p.trial, provenance)
         whole = set(sweep.scope) <= set(p.trial.evaluated)
         if p.role == POINT and p.x == sweep.reference_x and whole and id in windows:
             tables[p.trial.train.seed] = windows[id]
+            rate = p.trial.rate
     follows: dict[str, dict[str, Controllability]] = {name: {} for name in sweep.scope}
-    for line in controllability(tables) if tables else ():
+    for line in controllability(tables, rate=rate) if tables else ():
         follows.setdefault(line.robot, {})[line.metric] = line
     robots = []
     for name in sweep.scope:

@@ -71,6 +71,12 @@ def test_a_row_says_what_there_is_to_follow():
     assert {row.robot for row in rows} >= {"mine", sorted(truth)[0]}
 
 
+@pytest.mark.parametrize("rate", [4.0, None])
+def test_what_there_is_to_follow_is_of_the_rate_at_which_it_was_measured(rate):
+    """The share over one step at 2 Hz stood beside models of 4 to 6 Hz."""
+    assert all(np.isnan(row.explained) for row in controllability({0: model(1.0)}, rate=rate))
+
+
 def test_seeds_that_differ_make_the_error_larger():
     one = controllability({0: model(1.0)})
     three = controllability({s: model(1.0, shift=s) for s in range(3)})
