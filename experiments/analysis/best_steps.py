@@ -17,8 +17,9 @@ from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
 from experiments.analysis.changes import METRICS
 from experiments.analysis.paired import NotComparable, agree, require_same_windows
 from experiments.running.provenance import Provenance
-from experiments.running.trial import trial_id
+from experiments.running.trial import training_of, trial_id
 from experiments.sweeps.sweep import POINT, Sweep
+from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import WindowTable
 
 LOSS = "cross_entropy"
@@ -47,20 +48,24 @@ class BestSteps:
 def judge_at_best(
     sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[BestSteps]:
-    """For sweeps whose curves differ in the number of steps alone: every point and seed with at least two numbers of
-    steps, where its episodes can be halved. Raises NotComparable."""
+    """Every point and seed whose trials differ in the number of steps alone, of which there are at least two, where its
+    episodes can be halved. Raises NotComparable."""
     rows = []
     for sweep in sweeps:
         if not (sweep.fittable and sweep.has_series) or sweep.interior_minimum:
             continue
         tables_by_steps: dict[float, dict[int, dict[int, WindowTable]]] = defaultdict(lambda: defaultdict(dict))
-        for point in sweep.points:
+        trained = defaultdict(set)
+        for point in (p for p in sweep.points if p.role == POINT and not p.scope):
+            trained[point.x, point.trial.train.seed].add(stable_hash(training_of(point.trial)))
             table = windows.get(trial_id(point.trial, provenance))
-            if point.role == POINT and not point.scope and table is not None and LOSS in table.metrics:
+            if table is not None and LOSS in table.metrics:
                 tables_by_steps[point.x][point.trial.train.seed][point.trial.train.steps] = table
         for x, seeds in sorted(tables_by_steps.items()):
             several = {
-                s: tables for s, tables in sorted(seeds.items()) if len(tables) > 1 and _halved(tables, sweep.scope)
+                s: tables
+                for s, tables in sorted(seeds.items())
+                if len(tables) > 1 and len(trained[x, s]) == 1 and _halved(tables, sweep.scope)
             }
             if several:
                 rows += _judge(sweep, x, several)

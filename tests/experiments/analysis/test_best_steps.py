@@ -10,6 +10,7 @@ from experiments.analysis.paired import NotComparable
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.running.trial import trial_id
 from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import POINT
 from tests.experiments.analysis.worlds import judged, with_loss
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, windows_of
@@ -74,6 +75,23 @@ def test_a_point_that_one_episode_judges_is_left_out():
         id = trial_id(point.trial, PROVENANCE)
         tables[id] = tables[id].among(["pusher_sand"]).rows(np.arange(2))
     assert fewest not in {row.x for row in judge_at_best([sweep], PROVENANCE, tables)}
+
+
+def test_trials_that_differ_in_more_than_steps_are_not_taken_for_one_another():
+    """Of series of two widths, the windows of one stood in the other's place."""
+    named = replace(WIDE, datasets=("pusher_sand", "arm_sand", "rover_road"))
+    study = replace(named, designs=replace(WIDE.designs, caps=(2,)), train=replace(WIDE.train, steps=8))
+    (sweep,) = plan_sweeps(study, ("episodes",))
+    most = max(p.x for p in sweep.points)
+    wider = [
+        replace(p, trial=replace(p.trial, model=replace(p.trial.model, width=64)), series=f"wide {p.series}")
+        for p in sweep.points
+        if p.role == POINT and p.x == most and p.trial.train.seed == 0
+    ]
+    sweep = replace(sweep, points=(*sweep.points, *wider))
+    tables = {trial_id(p.trial, PROVENANCE): windows_of(p.trial) for p in sweep.points}
+    rows = {row.x: row for row in judge_at_best([sweep], PROVENANCE, tables) if row.metric == "cross_entropy"}
+    assert rows[most].seeds == 2 and all(row.seeds == 3 for x, row in rows.items() if x != most)
 
 
 def test_the_axis_of_trajectories_is_judged_at_its_best_steps():
