@@ -263,7 +263,7 @@ def _trial_table(
         status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
         lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
     done = sum(states[id].event == FINISHED for id in names)
-    head = ["id", "trial", "status", "parameters", "train FLOPs", "time", "training loss"]
+    head = ["id", "trial", "status", "parameters", "train FLOPs", "time, last attempt", "training loss"]
     return f"<p>{done} of {len(lines)} finished.</p>" + table(head, lines, text=3)
 
 
@@ -277,7 +277,7 @@ def _origin(
     suite = record.study.suite
     machines = [results[id]["run"]["machine"] for id in finished]
     ran = group_by_sources(workspace.trials, finished)
-    counted = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
+    several = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
     facts = {
         "command": _repeatable(record.command),
         "data": ", ".join(record.data)
@@ -286,7 +286,7 @@ def _origin(
         "evaluation manifest": provenance.manifest,
         "tokenizer": provenance.tokenizer,
         "version of the results": str(provenance.results),
-        "sources": counted + "; ".join(describe_sources(ran)) if ran else "unknown",
+        "sources": several + "; ".join(describe_sources(ran)) if ran else "unknown",
         "commit": _each([m.get("commit") or "unknown" for m in machines]),
         "processor": _each([_processor(m) for m in machines]),
         "devices": _each([", ".join(m.get("devices", [])) or "unknown" for m in machines]),

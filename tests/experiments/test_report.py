@@ -56,6 +56,11 @@ def test_rows_carry_hashes_and_average_over_the_scope(drawn):
     assert (first.store, first.results, first.code) == (PROVENANCE.store, PROVENANCE.results, "c0de")
 
 
+def test_the_time_of_a_trial_is_said_to_be_that_of_its_last_attempt(drawn):
+    """After it was stopped at 95 % the page says minutes."""
+    assert "<th>time, last attempt</th>" in drawn.report.read_text()
+
+
 def test_tables_read_back_what_was_written(drawn, tmp_path):
     rows, a, b = rows_of(drawn, [plan_width(STUDY)]), Workspace(tmp_path / "a"), Workspace(tmp_path / "b")
     a.root.mkdir(), b.root.mkdir()
