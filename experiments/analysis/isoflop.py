@@ -155,8 +155,9 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     lowest = np.where(opens_up, np.clip(lowest, x[0], x[-1]), falling)
     common = dict(parabola=parabolas[:, 0], centre=float(x.mean()))
     if at_end[0] or not opens_up[0] or lowest[0] in (x[0], x[-1]):
-        end = "smallest" if (least == 0 if at_end[0] else lowest[0] == x[0]) else "largest"
-        refused = f"the {end} size is best: the minimum may lie beyond"
+        refused = "the parabola has no minimum between the sizes"
+        if at_end[0]:
+            refused = f"the {'largest' if least else 'smallest'} size is best: the minimum may lie beyond"
         return Budget(flops, sizes, loss, **common, refused=refused), lowest
     part = float((at_end[1:] | np.isin(lowest[1:], (x[0], x[-1]))).mean())
     doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OPEN_SHARE else ""

@@ -69,7 +69,7 @@ def _show(root: Path) -> None:
         a = numbers.isoflop.exponent
         exponent = f"N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" if a else ""
         doubts = [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
-        table.add_row("isoflop", "training FLOPs", exponent, "", numbers.isoflop.refused or "; ".join(doubts))
+        table.add_row("isoflop", "training FLOPs", "", exponent, numbers.isoflop.refused or "; ".join(doubts))
     console.print(table)
 
 

@@ -129,11 +129,19 @@ def test_a_smallest_size_that_is_best_is_refused():
 
 
 def test_a_parabola_that_is_lowest_beyond_the_sizes_is_refused():
-    """Of the losses themselves the last but one is the least."""
+    """Of the losses themselves the last but one is the least: the largest size was said to be best."""
     losses = dict(zip(GRID, [1.7, 1.3, 0.9, 0.64, 0.40, 0.16, 0.17], strict=True))
     value = np.exp([losses[n] for n in EXACT[:, 0]])
     fit = fit_exactly(value, value)
-    assert all("the largest size is best" in budget.refused for budget in fit.budgets)
+    assert {budget.refused for budget in fit.budgets} == {"the parabola has no minimum between the sizes"}
+
+
+def test_a_parabola_that_opens_downwards_is_refused_without_naming_a_best_size():
+    losses = dict(zip(GRID, [1.3, 1.0, 1.2, 0.9, 1.2, 1.0, 1.3], strict=True))
+    value = np.exp([losses[n] for n in EXACT[:, 0]])
+    fit = fit_exactly(value, value)
+    assert all(budget.parabola[0] < 0 for budget in fit.budgets)
+    assert {budget.refused for budget in fit.budgets} == {"the parabola has no minimum between the sizes"}
 
 
 def test_two_minima_make_no_exponent():

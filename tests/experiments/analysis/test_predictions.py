@@ -6,14 +6,17 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from experiments.analysis.fits import MIN_POSITIONS
+from experiments.analysis.fits import MIN_POSITIONS, Coefficient
+from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome, Prediction, load_predictions, save_prediction
 from experiments.cli.main import main
 from experiments.override import override
 from experiments.presets import CPU
+from experiments.report import numbers
 from experiments.report.draw import draw
 from experiments.report.fits import describe_fits
 from experiments.report.numbers import read_numbers
@@ -58,6 +61,15 @@ def predicted(with_prediction, tmp_path):
 
 def command(root, *words):
     return main(["fit", str(root), *words])
+
+
+def test_the_law_of_best_sizes_stands_under_exponents(monkeypatch, tmp_path, capsys):
+    """It stood under the loss."""
+    law = IsoFlop(exponent=Coefficient("a", 0.5, 0.45, 0.55))
+    monkeypatch.setattr(numbers, "read_numbers", lambda _: SimpleNamespace(fits=[], isoflop=law))
+    assert command(tmp_path) == 0
+    head, row = capsys.readouterr().out.splitlines()
+    assert row.index("N_opt ~ C^0.500") == head.index("exponents")
 
 
 def predict(root, *words):
