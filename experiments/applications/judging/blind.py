@@ -117,7 +117,7 @@ def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
         key: dict[str, Any] = json.loads((out / "blind.json").read_text())
         labels = {int(number): bool(value) for number, value in saved["labels"].items()}
         clips: Sequence[Any] = key["clips"]
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} cannot be read as labels of {out / 'blind.html'} ({error})") from error
     require(
         saved.get("page") == key["page"], f"{path} has labels of another page ({saved.get('page')}, not {key['page']})"

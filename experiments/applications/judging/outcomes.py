@@ -83,5 +83,5 @@ def read_outcomes(path: Path) -> list[Outcome]:
                 )
                 for r in csv.DictReader(file)
             ]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:  # TypeError: a row that was cut short
         raise ConfigError(f"{path} cannot be read as outcomes ({error}); run `hma judge` again") from error

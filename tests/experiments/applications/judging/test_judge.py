@@ -15,7 +15,7 @@ from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.head import PIECE, HeadConfig, HeadJudge, load_head
 from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
-from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, read_outcomes, write_outcomes
+from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, Outcome, read_outcomes, write_outcomes
 from experiments.applications.judging.page import describe_clipping, draw_scatter, place, write_page
 from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
@@ -240,6 +240,23 @@ def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path, capsy
     path.write_text(json.dumps({"page": "another", "labels": labels}))
     with pytest.raises(ConfigError, match="labels of another page"):
         read_labels(path, root / "out")
+
+
+@pytest.mark.parametrize("content", ["[]", "null", "{", '{"labels": []}'])
+def test_what_is_no_file_of_labels_is_said(content, tmp_path):
+    """A list ended in a traceback."""
+    (tmp_path / "labels.json").write_text(content)
+    (tmp_path / "blind.json").write_text('{"page": "mine", "clips": []}')
+    with pytest.raises(ConfigError, match=r"labels\.json cannot be read as labels of .*blind\.html"):
+        read_labels(tmp_path / "labels.json", tmp_path)
+
+
+def test_outcomes_that_were_cut_short_are_said(tmp_path):
+    path = tmp_path / "outcomes.csv"
+    write_outcomes([Outcome("mine", 0, 1, 2, TRUE, HEAD, True)], path)
+    path.write_text(path.read_text() + "mine,1")
+    with pytest.raises(ConfigError, match=r"outcomes\.csv cannot be read as outcomes .*; run `hma judge` again"):
+        read_outcomes(path)
 
 
 def test_the_head_judges_environments_and_forgets_with_them(judged):
