@@ -118,6 +118,8 @@ def play(
             console.print("stopping, as soon as the running compilation is finished")
         raise
     except OSError as error:
-        raise ConfigError(f"cannot listen on {host}:{port}: {error.strerror}; choose another --port") from error
+        raise ConfigError(
+            f"cannot listen on {host}:{port}: {error.strerror}; choose another --host or --port"
+        ) from error
     finally:
         ended.set()

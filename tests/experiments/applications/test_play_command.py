@@ -87,6 +87,20 @@ def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(
         assert deaf == known[0]["deaf"] == (setting == "passive")
 
 
+def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monkeypatch, tmp_path, capsys):
+    """An unknown host was told to choose another port."""
+    from experiments.applications import simulators
+
+    async def serve(*_):
+        raise OSError(-2, "Name or service not known")
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    assert main(["play", str(tmp_path), "--visitors", "1", "--host", "nosuchhost"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "nosuchhost:" in said and "Name or service not known; choose another --host or --port" in said
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
 def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, monkeypatch, tmp_path, capsys):
     from experiments.applications import simulators
