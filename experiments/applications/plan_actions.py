@@ -98,6 +98,11 @@ class Settings:
     def __post_init__(self):
         most = self.search.frames
         require(1 <= self.execute <= most, f"--execute must lie in 1..{most}, the frames of a plan, got {self.execute}")
+        require(
+            self.frames > self.hold,
+            f"--frames must be more than the {self.hold} in a row at the goal that make success, or an episode is decided "
+            f"before the first plan; got {self.frames}",
+        )
         require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
         require(self.skip >= 0, f"--skip must not be negative, got {self.skip}")
 

@@ -261,6 +261,9 @@ def test_a_plan_is_not_carried_out_for_longer_than_it_is_nor_searched_among_too_
     assert plan_actions.Settings(execute=6).search.frames == 6
     with pytest.raises(ConfigError, match="--execute must lie in 1..6, the frames of a plan, got 7"):
         plan_actions.Settings(execute=7)
+    with pytest.raises(ConfigError, match="--frames must be more than the 6 in a row at the goal .*; got 6"):
+        plan_actions.Settings(frames=6)  # nothing was planned, and the seconds of a plan were no number
+    assert not decided([False], plan_actions.Settings(frames=7).make_task())
     monkeypatch.setattr(sys, "argv", ["plan_actions", "nowhere", "--candidates", "2"])
     with pytest.raises(ConfigError, match="--candidates must be at least 4, got 2"):
         plan_actions.main()
