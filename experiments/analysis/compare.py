@@ -17,7 +17,7 @@ from experiments.analysis.paired import OF_TOKENS, TRUTH, NotComparable, require
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
-NOT_OF_MODELS = (TRUTH, "counterfactual_copy", "retrieval_chance")
+NOT_OF_MODELS = (TRUTH, "lpips_copy", "counterfactual_copy", "retrieval_chance")
 """Metrics that depend on the windows alone, not on the model."""
 
 

@@ -37,6 +37,16 @@ def test_one_seed_is_the_paired_interval_clustered_by_episode():
     assert next(iter(rows)) == (OVERALL, "cross_entropy") and not any(m == "psnr_copy" for _, m in rows)
 
 
+def test_what_windows_alone_decide_is_not_compared():
+    """LPIPS of copying the last frame was a row of zeros."""
+    a, b = sides()
+    for side in (a, b):
+        table = side.seeds[0]
+        table.metrics.update(lpips=np.full(len(table), 0.1), lpips_copy=np.full(len(table), 0.2))
+    metrics = {row.metric for row in compare(a, b)}
+    assert "lpips" in metrics and "lpips_copy" not in metrics
+
+
 def test_what_some_robots_have_not_is_over_the_others():
     rows = {(r.scope, r.metric): r for r in compare(*sides())}
     assert ("r0", "action_nats") not in rows and rows[OVERALL, "action_nats"].n == 2 * 48
