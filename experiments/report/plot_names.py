@@ -41,7 +41,7 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
         _draw(panel, rows, sweep, metric)
     panels[0, 0].set_yticks(range(len(sweep.labels)), sweep.labels)
     panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
-    panels[0, 0].get_yticklabels()[sweep.reference_x].set(color=DEFAULT, fontweight="bold")
+    panels[0, 0].get_yticklabels()[int(sweep.reference_x)].set(color=DEFAULT, fontweight="bold")
     figure.supxlabel(
         CAPTION.format(judged=JUDGED[sweep.robots_vary], whose=WHOSE[sweep.robots_vary]), fontsize=8.5, color=MUTED
     )

@@ -143,6 +143,11 @@ def _checked_trials(study: Study, sweep: Sweep, where: str) -> Sweep:
         f"{where} has labels and several series, but an axis with labels has one point per label and seed; put the "
         "series into the labels",
     )
+    require(
+        not sweep.labels or sweep.reference_x in range(len(sweep.labels)),
+        f"{where}: reference_x is {sweep.reference_x}, but on an axis with labels it must be the position of the default, "
+        f"from 0 to {len(sweep.labels) - 1}: the others are compared with it",
+    )
     places: dict[tuple[str, str, str], float] = {}
     for p in sweep.points if not sweep.labels else ():
         trained = replace(p.trial, measure_untrained=False)  # of the reference alone

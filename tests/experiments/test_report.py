@@ -319,6 +319,12 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
         assert ("one seed and its robots: do not compare it with the means" in caption) == own
 
 
+def test_the_default_may_be_written_as_a_float():
+    sweep = replace(plan_conditioning(CPU_FULL), reference_x=1.0)
+    names = plot_names([], sweep).axes[0].get_yticklabels()
+    assert [name.get_fontweight() == "bold" for name in names] == [i == 1 for i in range(len(names))]
+
+
 def test_robots_that_are_others_for_every_seed_are_shown_of_the_seed_that_judges_them():
     """Of `newcomers` alone no page could be drawn: two seeds' windows do not fit together."""
     sweep = plan_newcomers(replace(CPU_FULL, seeds=(0, 1)))

@@ -226,6 +226,7 @@ def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_pat
         ),
         (EDITED.format("series='long'"), "some points have a series and others have none"),
         (EDITED.format("x=0, series='long'") + LABELLED, "has labels and several series"),
+        (EDITED.format("x=0") + LABELLED, "reference_x is 16, but .* with labels .* the default, from 0 to 0"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
         (NAMED.replace('"own"', "3"), "the sweep has a setting of a wrong type .Sweep.name: expected str, got 3"),
         (EDITED.format("scope=3"), "trial at 8 has a setting of a wrong type .Point.scope: expected a list, got 3"),
