@@ -136,6 +136,35 @@ def test_slurm_gets_one_array_of_all_trials_and_those_that_are_lost_later(places
     assert place._executor.arrays == [3, 1]
 
 
+def test_where_slurm_takes_some_jobs_but_not_all_none_stays_in_its_queue(submitted, tmp_path, monkeypatch):
+    from submitit.core.utils import FailedJobError
+
+    place, fake, _ = submitted
+    monkeypatch.setattr(slurm, "LARGEST_ARRAY", 2)
+
+    def submit_array(attempts):
+        if fake.arrays:
+            raise FailedJobError("QOSMaxSubmitJobPerUserLimit")
+        fake.arrays.append(len(attempts))
+        return [fake.submit(None, f"8_{i}") for i in range(len(attempts))]
+
+    fake.submit_array = submit_array
+    with pytest.raises(ConfigError, match="does not take the jobs: QOSMaxSubmitJobPerUserLimit"):
+        place.launch([tmp_path / str(i) for i in range(3)])
+    assert fake.cancelled == [["scancel", "8_0", "8_1"]]
+
+
+def test_where_one_process_cannot_start_the_others_end(tmp_path):
+    place = fake_trial.launcher(tmp_path, 2)
+    started, start = [], place._start
+    place._start = lambda directory: started.append(start(directory)) or started[-1]
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/job.json").write_text('{"steps": 2000, "seconds": 0.02, "end": "result"}')
+    with pytest.raises(FileNotFoundError):
+        place.launch([tmp_path / "a", tmp_path / "missing"])
+    assert len(started) == 1 and started[0].process.poll() is not None
+
+
 @pytest.fixture
 def submitted(tmp_path, monkeypatch):
     """A Slurm launcher, its fake, and a job that only stands in the queue."""

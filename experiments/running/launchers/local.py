@@ -55,7 +55,14 @@ class LocalLauncher(Launcher):
         return sum(len(slot.accelerators.names) / slot.sharers for slot in slots) / workers
 
     def launch(self, directories: Sequence[Path]) -> list[Child]:
-        return [self._start(directory) for directory in directories]
+        children: list[Child] = []
+        try:
+            for directory in directories:
+                children.append(self._start(directory))
+        finally:
+            if len(children) < len(directories):  # the caller has no handles of those that started
+                self.stop(children)
+        return children
 
     def _start(self, directory: Path) -> Child:
         slot = self._free.pop(0)

@@ -119,6 +119,9 @@ class SlurmLauncher(Launcher):
                 jobs += self._executor.submit_array(attempts[first : first + LARGEST_ARRAY])
         except FailedJobError as error:
             raise ConfigError(f"Slurm does not take the jobs: {error}; change --launcher-set") from error
+        finally:
+            if len(jobs) < len(attempts):  # the caller has no handles of those that Slurm took
+                self.ask_to_stop(jobs)
         self._polled, self._states = -math.inf, None
         return jobs
 
