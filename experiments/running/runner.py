@@ -189,7 +189,7 @@ class _Run:
     def _end(self, attempt: _Attempt, state: State, again: bool) -> None:
         self._note_start(attempt)
         seconds = time.monotonic() - attempt.launched
-        if attempt.start or state.event not in (LOST, PREEMPTED):  # otherwise it was only queued
+        if attempt.start or state.event != PREEMPTED:  # otherwise it was only queued
             self.record(attempt.job.id, state, seconds=round(seconds, 1))
         self.monitor.ended(attempt.job, state, seconds, again)
 

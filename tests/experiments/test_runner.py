@@ -16,6 +16,7 @@ import pytest
 from experiments.running import runner, trial_main
 from experiments.running.attempts import attempt, read_states
 from experiments.running.children import child_environment
+from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import TRIES, Job, Monitor, run_missing
 from hma_jax.runtime import locks
@@ -89,6 +90,15 @@ def test_what_kills_a_trial_every_time_is_not_tried_for_ever(tmp_path):
     assert len(starts(tmp_path, "big")) == TRIES and starts(tmp_path, "good") == [0]
     run(tmp_path, [job("big", "SIGKILL", times=99)])  # the next command tries as often
     assert len(starts(tmp_path, "big")) == 2 * TRIES
+
+
+def test_the_reason_is_kept_of_a_trial_that_is_lost_before_it_has_begun(tmp_path):
+    """Such as one that the kernel ends while it imports: it leaves no started.json."""
+    place = LocalLauncher(tmp_path, 1, command=lambda directory: ["/bin/sh", "-c", "kill -KILL $$"])
+    ledger = Ledger(tmp_path / "ledger.jsonl")
+    state = run_missing([job("a")], tmp_path / "trials", ledger, place)["a"]
+    assert state.event == "lost" and "out of memory?" in state.message
+    assert events(tmp_path, "a") == ["lost"] * TRIES
 
 
 def test_failed_trials_run_again_only_on_request_and_keep_their_checkpoint(tmp_path):
