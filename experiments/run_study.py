@@ -6,19 +6,20 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from experiments.done import newest_step
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console, say
 from experiments.report.draw import draw
 from experiments.running.apart import call_apart
-from experiments.running.attempts import RESULT, State, read_states
+from experiments.running.attempts import RESULT, RUN, State, read_states
 from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
 from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
-from experiments.running.shared_runs import share_runs
+from experiments.running.shared_runs import latest_common, share_runs
 from experiments.running.slots import find_accelerators
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
@@ -138,11 +139,15 @@ def make_jobs(
 
 
 def say_trained(jobs: Sequence[Job], former: Collection[str], workspace: Workspace) -> None:
-    """Says of how many trials that are to be run all training or some is there, in `former` ones."""
+    """Says how many trials that are to be run begin from a checkpoint of `former` ones."""
     missing = [job for job in jobs if not (workspace.trials / job.id / RESULT).exists()]
-    count = sum(bool(job.after & set(former)) for job in missing)
+    count = 0
+    for job in missing:
+        before = [(id, step) for id, step in job.record["shared"]["before"] if id in former]
+        begun = newest_step(workspace.trials / job.id / RUN)
+        count += not begun and latest_common(workspace.trials, before)[1] > 0
     if count:
-        what = "go on from what was trained here for trials that are not of this study"
+        what = "go on from what was trained here for other trials"
         console.print(f"{count} of {len(missing)} trials to be run {what}")
 
 

@@ -29,7 +29,7 @@ class SharedTraining:
 
 
 def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) -> dict[str, SharedTraining]:
-    """The shared training of every trial of a study, by id. `former`: finished trials that are not of this study
+    """The shared training of every one of `trials`, by id. `former`: other finished trials in the study's directory
     (`trained.find_trained`)."""
     trained: dict[str, dict[str, int]] = defaultdict(dict)
     for id, trial in former.items():

@@ -1,6 +1,7 @@
-"""Finished trials in a study's directory that are not of the study, whose training its trials can share.
+"""Finished trials in a study's directory besides those that are to be run, which can share their training.
 
-A study whose evaluation was changed (`eval`, `--replace study`) has trials of other names with the same training.
+They may be of the study's other axes, or of an earlier evaluation: a study whose `eval` was changed (`--replace study`)
+has trials of other names with the same training.
 """
 
 from __future__ import annotations

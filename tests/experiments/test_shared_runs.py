@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from experiments.presets import CPU_FULL, SMOKE
-from experiments.run_study import make_jobs
+from experiments.progress import console
+from experiments.run_study import make_jobs, say_trained
 from experiments.running import trial as trial_module
 from experiments.running.attempts import RUN
 from experiments.running.provenance import FILE, Start, TrialRecord, read_record
@@ -17,6 +18,7 @@ from experiments.running.runner import Job
 from experiments.running.shared_runs import begin_shared, share_runs
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
+from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
 from hma_jax.config import DiffusionConfig
@@ -87,6 +89,26 @@ def test_a_trial_that_is_judged_otherwise_goes_on_from_what_is_trained(tmp_path)
     assert shared["judged"].keep == (160,)
     source = replace(trial(100), train=replace(trial(100).train, steps=99))
     assert share_runs({"a": replace(adapted, source=source)}, former)["a"].before == ()
+
+
+def test_trials_are_said_to_go_on_only_from_checkpoints_that_they_can_begin_from(tmp_path):
+    trials = {"begun": trial(400, tau=1.0), "400": trial(400), "alone": replace(trial(400), weighed="all")}
+    former = {"200": trial(200), "other": trial(200, tau=1.0)}
+    jobs = make_jobs(trials, dict.fromkeys(trials, ""), PROVENANCE, {}, former)
+    assert {job.id: len(job.after) for job in jobs} == {"begun": 1, "400": 1, "alone": 0}
+    workspace = Workspace(tmp_path)
+    checkpoint(workspace.trials, "200", 200)  # of the decay, in which their learning rates differ
+    checkpoint(workspace.trials, "other", 160)
+    checkpoint(workspace.trials, "begun", 20)
+
+    def said() -> str:
+        with console.capture() as capture:
+            say_trained(jobs, former, workspace)
+        return " ".join(capture.get().split())
+
+    assert said() == ""
+    checkpoint(workspace.trials, "200", 160)
+    assert said() == "1 of 3 trials to be run go on from what was trained here for other trials"
 
 
 def test_it_says_then_what_both_ran(tmp_path):
