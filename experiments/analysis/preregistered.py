@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from experiments.rows import Row, curve, difference
+from experiments.rows import OVERALL, Row, curve, difference
 from experiments.sweeps.registry import AXES
 from experiments.sweeps.sweep import POINT
 from hma_jax.config import ConfigError, require
@@ -123,7 +123,7 @@ def _compare_one(e: Expected, rows: Sequence[Row]) -> ExpectationOutcome:
         names = dict.fromkeys(label or f"{at:g}" for at, label, _ in sorted(positions))
         known = any(_names(x, at, label) for at, label, _ in positions)
         require(known, f"{where} has no point {x!r}, but {', '.join(names) or 'none, nor such a curve'}")
-    metrics = {r.metric for r in rows} - {""}
+    metrics = {r.metric for r in rows if r.scope == OVERALL}
     require(not metrics or e.metric in metrics, f"{where} has no metric {e.metric!r}, but {', '.join(sorted(metrics))}")
     planned = {seed for at, label, seed in positions if _names(e.x, at, label)}
     points = curve(rows, e.sweep, e.metric, series=e.series)

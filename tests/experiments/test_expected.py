@@ -77,6 +77,7 @@ def test_a_point_that_is_not_there_is_refused(rows):
         (replace(WIDTH, against="wide"), "has no point 'wide'"),
         (replace(WIDTH, series="8,000 steps"), "nor such a curve"),
         (replace(WIDTH, metric="cross-entropy"), "has no metric 'cross-entropy', but .*cross_entropy"),
+        (replace(WIDTH, metric="loss"), "has no metric 'loss', but .*cross_entropy"),  # not over judged robots
         (replace(WIDTH, sweep="widht"), "no axis 'widht'"),
         (replace(WIDTH, seeds=(1, 7)), "width has no seed 7"),
     ):
