@@ -63,7 +63,8 @@ def read_side(path: Path) -> Side:
 
     Raises ConfigError for what is none of them, or whose trials have no result.
     """
-    workspace = Workspace(path.absolute())
+    path = path.resolve()  # a trial's directory bears its id; '.' and links do not
+    workspace = Workspace(path)
     if workspace.record.exists():
         record = load_record(workspace)
         if record.provenance is None:

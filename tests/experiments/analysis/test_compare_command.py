@@ -49,6 +49,15 @@ def test_two_trials_are_compared_per_robot_and_overall(table, tmp_path, capsys):
     assert f"{a.name} - {b.name}" in said and "-0.1000 ± 0.0000" in said and "x 0.9048" in said
 
 
+def test_a_trial_may_be_named_from_within_it_or_by_a_link(table, tmp_path, monkeypatch, capsys):
+    a = write_trial(tmp_path, reference_trial(STUDY, 0), better(table))
+    b = write_trial(tmp_path, reference_trial(STUDY, 1), table)
+    (tmp_path / "best").symlink_to(b)
+    monkeypatch.chdir(a)
+    assert main(["compare", ".", "../best", "--to", str(tmp_path / "c.csv")]) == 0
+    assert f"{a.name} - {b.name}" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("loss", "nats"), [("cross_entropy", "nats"), ("diffusion_loss", "loss")])
 def test_every_column_has_its_own_unit_if_it_has_one(loss, nats, table, tmp_path, capsys):
     """Of latents action-nats are differences of the diffusion loss."""
