@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.analysis.compare import Difference, Side, overall_difference
-from experiments.analysis.intervals import critical
+from experiments.analysis.intervals import critical, standard_errors
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
@@ -103,6 +103,6 @@ def _over_seeds(a: Side, b: Side, metric: str, scopes: Mapping[int, Sequence[str
     at_a, at_b = (float(np.mean([getattr(d, side) for d in known])) for side in "ab")
     return Difference(
         known[0].scope, metric, at_a, at_b, mean, sem, mean - half, mean + half,
-        mean / sem if sem else math.copysign(math.inf, mean), len(known),
+        standard_errors(mean, sem), len(known),
         sum(d.n for d in known), sum(d.episodes for d in known),
     )  # fmt: skip

@@ -16,6 +16,7 @@ from scipy.special import stdtr
 
 from data_pipelines.registry import FRAME_RATE
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.intervals import standard_errors
 from experiments.analysis.paired import require_same_windows
 from experiments.suite.explained import read_table
 from experiments.sweeps.sweep import POINT
@@ -102,9 +103,7 @@ def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, 
     panel = Panel(first.dataset[known], first.episode[known], (values[:, known],), (tuple(tables),))
     (interval,) = bootstrap_intervals(panel)
     excess = interval.mean - deaf
-    errors = (
-        0.0 if abs(excess) < ROUNDING else excess / interval.sem if interval.sem else float(np.copysign(np.inf, excess))
-    )
+    errors = standard_errors(0.0 if abs(excess) < ROUNDING else excess, interval.sem)
     return (
         Controllability(
             robot, metric, interval.mean, interval.sem, interval.low, interval.high, deaf, errors, len(tables), interval.n,

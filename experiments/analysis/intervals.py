@@ -42,16 +42,21 @@ class Interval:
 
     @property
     def errors(self) -> float:
-        """How many standard errors the mean is from zero; 0 where it is zero exactly, nan for an unknown error."""
-        if self.mean == 0:
-            return 0.0
-        return self.mean / self.sem if self.sem else math.copysign(math.inf, self.mean)
+        """`standard_errors` of the mean."""
+        return standard_errors(self.mean, self.sem)
 
     def exp(self) -> Interval:
         """Of exp(x), the interval transformed: perplexity beside nats, a ratio of perplexities beside a difference of
         nats. The standard error is by the delta method, sem exp(mean)."""
         mean = _exp(self.mean)
         return Interval(mean, self.sem * mean, _exp(self.low), _exp(self.high), self.n, self.episodes)
+
+
+def standard_errors(mean: float, sem: float) -> float:
+    """How many standard errors a mean is from zero; 0 where it is zero exactly, nan for an unknown error."""
+    if mean == 0:
+        return 0.0
+    return mean / sem if sem else math.copysign(math.inf, mean)
 
 
 def interval_of(stat: Stat) -> Interval:

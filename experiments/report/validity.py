@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from experiments.analysis.controllability import ROUNDING
+from experiments.analysis.intervals import standard_errors
 from experiments.analysis.predictions import Outcome
 from experiments.optima import Optimum
 from experiments.report.pieces import section
@@ -203,7 +204,7 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
     controls = {id: replace(r, mean=0.0, sem=0.0) if abs(r.mean) < ROUNDING else r for id, r in controls.items()}
     unknown = [r.trial for r in controls.values() if math.isfinite(r.mean) and math.isnan(r.sem)]
     known = [r for id, r in controls.items() if id not in unknown]
-    far = max((abs(_errors(r.mean, r.sem)) for r in known), default=0.0)
+    far = max((abs(standard_errors(r.mean, r.sem)) for r in known), default=0.0)
     if unknown and far <= EACH:
         text = (
             f"The errors of {len(unknown)} of {len(controls)} controls are unknown: one episode per robot gives none."
@@ -211,17 +212,13 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
         return Check(name, "open", text)
     mean = sum(r.mean for r in known) / len(known)
     sem = math.sqrt(sum(r.sem**2 for r in known)) / len(known)
-    fine = far <= EACH and abs(_errors(mean, sem)) <= MEAN  # nan: not fine
-    off = f"{_errors(mean, sem):+.1f}"
+    fine = far <= EACH and abs(standard_errors(mean, sem)) <= MEAN  # nan: not fine
+    off = f"{standard_errors(mean, sem):+.1f}"
     text = f"{len(known)} controls: at most {far:.1f} standard errors from zero, their mean {off}"
     if len(known) == 1:
         text = f"One control: {off} standard errors from zero"
     text = f"{text} (allowed: {EACH:g} each, {MEAN:g} for the mean).".replace("-", "\u2212")
     return Check(name, "good" if fine else "bad", text)
-
-
-def _errors(mean: float, sem: float) -> float:
-    return 0.0 if mean == 0 else mean / sem if sem else math.copysign(math.inf, mean)
 
 
 def _copying(robots: Sequence[Robot], whose: str) -> Check:

@@ -66,3 +66,6 @@ def test_seeds_that_judge_robots_of_their_own_are_each_compared_on_these():
         means.append((a.metrics["cross_entropy"] - b.metrics["cross_entropy"])[own].mean())
     assert change.mean == pytest.approx(np.mean(means)) and change.seeds == 3
     assert change.sem == pytest.approx(np.std(means, ddof=1) / math.sqrt(3))
+    same = {of(x, seed): TABLES[of(8, seed)] for x in (8, 48) for seed in range(3)}
+    change = changed(replace(SWEEP, points=points), same)
+    assert change.mean == change.sem == change.errors == 0
