@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def table(head: Sequence[str], lines: Iterable[Sequence[str]], text: int = 1) ->
 
 def pm(mean: float, error: float) -> str:
     """Mean ± standard error, with the digits that the error leaves meaningful."""
-    if not error > 0:  # also nan
+    if not 0 < error < math.inf:  # also nan
         return f"{mean:.4g}".replace("-", "\u2212")
     return f"{number(mean, error)} <span class=sem>± {number(error, error)}</span>"
 

@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from experiments.report.pieces import pm
 from experiments.words import counted, plus_minus
 
 
@@ -19,11 +20,17 @@ from experiments.words import counted, plus_minus
         (0.5, 0.0, "0.5 ± 0"),
         (10.3456, math.nan, "10.35"),
         (math.inf, math.nan, "inf"),
+        (10.3456, math.inf, "10.35"),
     ],
 )
 def test_a_mean_has_the_digits_that_its_error_leaves(mean, error, said):
     assert plus_minus(mean, error) == said
     assert plus_minus(mean, error, "+") == f"+{said}"
+
+
+@pytest.mark.parametrize("error", [math.nan, math.inf])
+def test_a_mean_of_unknown_error_stands_alone_on_the_page(error):
+    assert pm(-10.3456, error) == "\u221210.35"
 
 
 def test_one_thing_is_not_called_several():
