@@ -69,9 +69,9 @@ def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
     return found
 
 
-def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tuple[Trial, Curve]]:
-    """{trial id: (trial, the curve over TRUNK and WINDOWS that all of them share)}; the largest such group of a study,
-    or {} where none has two widths and two numbers of steps."""
+def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> Curve | None:
+    """The largest group of a study's trials that differ in width and steps alone, over TRUNK and WINDOWS; None where no
+    group has two of both."""
     groups: dict[str, dict[str, Trial]] = defaultdict(dict)
     for sweep in sweeps:
         for point in sweep.points:
@@ -83,14 +83,13 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tup
 
     both = [g for g in groups.values() if varies(g, lambda t: t.model.width) and varies(g, _seen)]
     if not both:
-        return {}
+        return None
     group = max(both, key=len)
     positions = tuple(
         Position(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
         for id, t in group.items()
     )
-    curve = Curve("joint", (TRUNK, WINDOWS), positions)
-    return {id: (trial, curve) for id, trial in group.items()}
+    return Curve("joint", (TRUNK, WINDOWS), positions)
 
 
 def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRAWS, episodes: bool = True) -> CurveFit:
@@ -114,8 +113,8 @@ def fit_study(
     """The fit of each curve, and the joint one where there is a surface."""
     curves = curves_of(sweeps, provenance)
     surface = surface_of(sweeps, provenance)
-    if surface:
-        curves.append(next(iter(surface.values()))[1])
+    if surface is not None:
+        curves.append(surface)
     return [fit_curve(curve, windows, draws) for curve in curves]
 
 
@@ -125,17 +124,13 @@ def fit_budgets(
     windows: Mapping[str, WindowTable],
     flops: Mapping[str, float],
     draws: int = DRAWS,
-) -> tuple[Measurements | None, IsoFlop | None]:
-    """The best size for a budget, from the surface's trials and the training `flops` of each; (None, None) without."""
+) -> IsoFlop | None:
+    """The best size for a budget, from the surface's trials and the training `flops` of each; None without."""
     surface = surface_of(sweeps, provenance)
-    if not surface:
-        return None, None
-    curve = next(iter(surface.values()))[1]
-    positions = [replace(p, x=(p.x[0], flops[p.trial])) for p in curve.finished(windows)]
+    positions = [replace(p, x=(p.x[0], flops[p.trial])) for p in surface.finished(windows)] if surface else []
     if not positions:
-        return None, None
-    measured = measure((TRUNK, FLOPS), positions, windows, LOSS)
-    return measured, fit_isoflop(measured, draws=draws)
+        return None
+    return fit_isoflop(measure((TRUNK, FLOPS), positions, windows, LOSS), draws=draws)
 
 
 def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Provenance) -> Curve:

@@ -10,8 +10,9 @@ from experiments.analysis.fits import DRAWS
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome, compare, load_predictions
 from experiments.analysis.scaling import CurveFit, curves_of, fit_budgets, fit_study
+from experiments.running.attempts import RESULT
 from experiments.running.provenance import Provenance
-from experiments.running.sealed import RESULT, read_result
+from experiments.running.sealed import read_result
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
@@ -50,7 +51,7 @@ def compute_numbers(
     """Raises ConfigError for a trial or a prediction that was changed."""
     results, windows = read_results(workspace, unique_trials(sweeps, provenance))
     flops = {id: float(result["train_flops"]) for id, result in results.items()}
-    _, isoflop = fit_budgets(sweeps, provenance, windows, flops, draws)
+    isoflop = fit_budgets(sweeps, provenance, windows, flops, draws)
     hashes, curves = result_hashes(results), curves_of(sweeps, provenance)
     predictions = load_predictions(workspace.predictions).values()
     outcomes = [compare(p, curves, windows, hashes) for p in predictions]

@@ -10,7 +10,7 @@ import pytest
 
 from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
 from data_pipelines.suite.generate import episode_count
-from experiments.analysis.scaling import surface_of
+from experiments.analysis.scaling import surface_of, trunk_parameters
 from experiments.cost import plan_trials
 from experiments.override import override
 from experiments.preparing_cost import estimate_preparing
@@ -134,7 +134,9 @@ def test_every_width_spends_the_same_compute():
 
 def test_the_surface_over_size_and_data_has_every_width():
     """The reference, which is judged under more actions, too."""
-    assert {t.model.width for t, _ in surface_of(list(SWEEPS.values()), PROVENANCE).values()} == set(CPU_FULL.widths)
+    surface = surface_of(list(SWEEPS.values()), PROVENANCE)
+    sizes = {float(trunk_parameters(replace(CPU_FULL.model, width=width))) for width in CPU_FULL.widths}
+    assert {p.x[0] for p in surface.positions} == sizes
 
 
 def test_trajectories_are_counted_as_they_are():

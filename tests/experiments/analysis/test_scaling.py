@@ -7,7 +7,6 @@ import pytest
 
 from experiments.analysis.intervals import critical
 from experiments.analysis.scaling import (
-    FLOPS,
     TRUNK,
     WINDOWS,
     curves_of,
@@ -129,24 +128,22 @@ def test_seeds_that_judge_other_robots_are_fitted_together(seeds):
 def test_branches_of_widths_make_a_surface(branches, fitted):
     sweeps, windows, _ = branches
     surface = surface_of(sweeps, PROVENANCE)
-    assert len(surface) == len(windows) == 90
-    curve = next(iter(surface.values()))[1]
-    assert curve.axes == (TRUNK, WINDOWS) and len({p.run for p in curve.positions}) == 6
-    (first, *_, joint), (measured, isoflop) = fitted
+    assert len(surface.positions) == len(windows) == 90
+    assert surface.axes == (TRUNK, WINDOWS) and len({p.run for p in surface.positions}) == 6
+    (first, *_, joint), isoflop = fitted
     assert first.curve.axes == ("steps",) and first.fit["alpha"].value == pytest.approx(0.4, abs=0.05)
     assert len(set(first.measured.run)) == 1  # one run, of which every step is a branch
     assert (joint.fit["alpha"].value, joint.fit["beta"].value) == (pytest.approx(0.4, abs=0.05),) * 2
-    assert measured.axes == (TRUNK, FLOPS)
     assert isoflop.exponent.value == pytest.approx(0.5, abs=0.15)
 
 
 def test_a_study_without_branches_has_no_surface():
-    assert surface_of(plan_sweeps(WIDE, ("width", "trajectories")), PROVENANCE) == {}
+    assert surface_of(plan_sweeps(WIDE, ("width", "trajectories")), PROVENANCE) is None
 
 
 def test_the_page_shows_fits_and_what_was_refused(branches, fitted, tmp_path):
     sweeps, windows, flops = branches
-    fits, (_, isoflop) = fitted
+    fits, isoflop = fitted
     words = describe_fits(fits, isoflop, [], "")
     assert "N<sup>\u22120." in words and "D<sup>\u22120." in words and "The best size grows as C<sup>0." in words
     plot_fits(fits, [], tmp_path / "fits.png")
