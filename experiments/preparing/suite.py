@@ -14,6 +14,9 @@ from experiments.words import few
 from hma_jax.config import require
 from hma_jax.runtime.cores import usable_cores
 
+MOST_LINES = 8
+"""Of what differs, in a message."""
+
 
 def require_simulated(names: Sequence[str], advice: str = "Give RLDS directories with --data") -> None:
     """Raises ConfigError unless every dataset is one of the suite, which needs no --data."""
@@ -93,6 +96,6 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
     return lines if lines or is_complete(directory, made_as) else None
 
 
-def _shortened(lines: Sequence[str], most: int = 8) -> list[str]:
-    more = len(lines) - most
-    return [*lines[:most], f"... and {more} more"] if more > 0 else list(lines)
+def _shortened(lines: Sequence[str]) -> list[str]:
+    more = len(lines) - MOST_LINES
+    return [*lines[:MOST_LINES], f"... and {more} more"] if more > 0 else list(lines)

@@ -64,10 +64,10 @@ class Launcher(ABC):
     def kill(self, handles: Sequence[Any]) -> None:
         """Ends attempts at once, those that have ended already too."""
 
-    def stop(self, handles: Sequence[Any], grace: float | None = None) -> list[AttemptEnd]:
+    def stop(self, handles: Sequence[Any]) -> list[AttemptEnd]:
         """Asks, waits until all have ended, kills the rest after the grace period. Returns how each ended."""
         self.ask_to_stop(handles)
-        deadline = time.monotonic() + (GRACE_SECONDS if grace is None else grace)
+        deadline = time.monotonic() + GRACE_SECONDS
         while time.monotonic() < deadline and any(self.ended(h) is None for h in handles):
             time.sleep(self.pause)
         self.kill([h for h in handles if self.ended(h) is None])
