@@ -29,6 +29,9 @@ from hma_jax.config import (
 )
 from hma_jax.config.base import require_seed
 
+SCALING = ("datasets", "trajectories", "width")
+"""The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
+
 
 @dataclass(frozen=True)
 class SuiteConfig:
@@ -173,7 +176,7 @@ class Study:
     ablation_seeds: tuple[int, ...] = (0, 1, 2)  # random seeds of the ablations, whose error bars are over seeds
     transfer: TransferConfig = field(default_factory=TransferConfig)
     designs: DesignConfig = field(default_factory=DesignConfig)
-    axes: tuple[str, ...] = ("datasets", "trajectories", "width")  # sweeps that `hma study` runs
+    axes: tuple[str, ...] = SCALING  # sweeps that `hma study` runs
     # Axis datasets: evaluate on the first datasets, or on random ones for every seed.
     judged: Literal["first", "drawn"] = "first"
     unseen: tuple[str, ...] = ()  # axis fewshot: robots that no model is trained on before it is adapted to them

@@ -16,16 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running.trial import Trial
-from experiments.study import Study
+from experiments.study import SCALING, Study
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, limit_other_actions
 from experiments.user_file import find_function, naming_line
 from experiments.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file
-
-SCALING = ("datasets", "trajectories", "width")
-"""The demonstration: what `hma study` runs, unless its preset says otherwise."""
 
 DESIGNS = ("dilution", "transfer", "newcomers", "fewshot", "episodes", "compute", "horizon", "lr_horizon")
 """Those of a study that is to be believed (`DesignConfig`)."""

@@ -19,8 +19,8 @@ from experiments.running.run_trial import last_loss, write_samples
 from experiments.running.sealed import write_result
 from experiments.running.trial import Trial
 from experiments.running.workspace import Record, Workspace
-from experiments.study import Study, TransferConfig
-from experiments.sweeps.registry import SCALING, plan_sweeps
+from experiments.study import SCALING, Study, TransferConfig
+from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Sweep, titles, unique_trials
 from hma_jax.config.json import to_dict
 

@@ -11,8 +11,8 @@ from experiments.running.attempts import RESULT
 from experiments.running.ledger import DIVERGED, FAILED, Ledger
 from experiments.running.workspace import save_record
 from experiments.setting import Setting, StudyArguments
-from experiments.study import TokenizerTrainConfig
-from experiments.sweeps.registry import SCALING, plan_sweeps
+from experiments.study import SCALING, TokenizerTrainConfig
+from experiments.sweeps.registry import plan_sweeps
 from tests.experiments import fakes
 
 STUDY = replace(fakes.STUDY, datasets=("pusher_sand", "rover_road", "arm_chalk"))  # robots whose sizes are known

@@ -28,7 +28,8 @@ from experiments.running.sealed import read_result, write_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, find_record, save_record
 from experiments.setting import StudyArguments, make_setting
-from experiments.sweeps.registry import SCALING, plan_sweeps
+from experiments.study import SCALING
+from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit
