@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from experiments.preparing.tokenizer import QUALITY_FRAMES
 from experiments.study import Study
 from hma_jax.config import AnyTokenizerConfig, TokenizerConfig
 
@@ -21,7 +22,6 @@ DECODED = 1500.0
 LARGE_PRODUCTS = 3.0
 """How many times the FLOPs of a small world model a tokenizer computes in a second: its products are larger, and it
 has all cores."""
-QUALITY_FRAMES = 1024
 START = 30.0
 """Seconds of importing and compiling, of the whole preparation."""
 

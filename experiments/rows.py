@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.analysis.intervals import OVERALL
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
@@ -30,9 +31,6 @@ from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from hma_jax.evaluation.statistics import Stat
-
-OVERALL = "overall"
-"""The scope that averages over all datasets of a sweep, each counting equally."""
 
 UNTRAINED = "untrained"
 """The role of the reference trial before its first step."""

@@ -169,7 +169,6 @@ def require_agreement(
     """Raises ConfigError if a finished trial among `shown`, all trials of the study, was changed, or if they and those
     still to be run of `requested` ran different sources and `accept_code` is not given. Both are ids."""
     from experiments.running.agreement import check_finished, require_one_closure
-    from experiments.running.sealed import RESULT
 
     check_finished(workspace.trials, shown)
     complete = all((workspace.trials / id / RESULT).exists() for id in requested)

@@ -18,7 +18,7 @@ from hma_jax.evaluation.statistics import Stat, stratified
 from hma_jax.evaluation.sums import add_up
 
 OVERALL = "overall"
-"""The scope that averages over all robots, each counting equally."""
+"""The scope that averages over all robots that are judged, each counting equally."""
 
 LEVEL = 0.95
 

@@ -10,9 +10,10 @@ from pathlib import Path
 from experiments.analysis.compare import Side
 from experiments.evaluated import STAMP
 from experiments.preparing.made_from import read_stamp
+from experiments.running.attempts import JOB, RESULT
 from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of
-from experiments.running.sealed import RESULT, read_result
+from experiments.running.sealed import read_result
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.sweep import reference_trial
@@ -42,7 +43,7 @@ def read_trial(directory: Path) -> FinishedTrial:
     read_result(directory)  # that its files are those it was sealed with
     windows = WindowTable.load(directory / FILE)
     try:
-        job = json.loads((directory / "job.json").read_text())
+        job = json.loads((directory / JOB).read_text())
         trial, provenance = read_job(job)[0], inputs_of(job["provenance"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(

@@ -19,6 +19,7 @@ from typing import Any
 from experiments.analysis.preregistered import FILE as PREREGISTERED
 from experiments.analysis.preregistered import ExpectationOutcome, compare_expected, read_expected
 from experiments.optima import Optimum
+from experiments.preparing.tokenizer import QUALITY
 from experiments.report.clips import describe_clips
 from experiments.report.findings import Findings, describe_expected, read_findings
 from experiments.report.fits import describe_fits
@@ -35,6 +36,7 @@ from experiments.running.agreement import group_by_sources
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED, name_within
 from experiments.running.provenance import Provenance
+from experiments.running.sealed import SAMPLES
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study
@@ -82,7 +84,7 @@ def write_report(
         *_curves(workspace, sweeps, rows, optima, along, outcomes, findings),
         _fits(workspace, numbers),
         findings.rest,
-        _clips(workspace.trials / first / "samples.npz", record, robots, aside) if has_reference else "",
+        _clips(workspace.trials / first / SAMPLES, record, robots, aside) if has_reference else "",
         section(f"Robots{', the most controllable first' * are_sorted(robots)}{aside}", describe_robots(
             rows, shown.sweep, robots, workspace.data_summary
         )) if has_reference else "",
@@ -213,7 +215,7 @@ def _curves(
 
 
 def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
-    path = workspace.tokenizer / "quality.json"
+    path = workspace.tokenizer / QUALITY
     try:
         quality = json.loads(path.read_text())
         return CurvePoint(0, float(quality["mean"]), float(quality["sem"]), math.nan, {}, ())

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.running.attempts import RUN
+from experiments.running.attempts import JOB, RESULT, RUN
 from experiments.running.closure import Closure, changed, closure_hash
 from experiments.running.job import read_job
 from experiments.running.provenance import CodeChanged, inputs_of, read_record
-from experiments.running.sealed import RESULT, read_result
+from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.words import few
 from hma_jax.config import ConfigError, require
@@ -38,7 +38,7 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
         if (directory / RESULT).exists():
             read_result(directory)
             try:
-                job = json.loads((directory / "job.json").read_text())
+                job = json.loads((directory / JOB).read_text())
                 actual_id = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise ConfigError(
@@ -47,7 +47,7 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
                 ) from error
             require(
                 actual_id == id,
-                f"{directory}: its job.json describes trial {actual_id}: it was renamed or edited. Remove the directory "
+                f"{directory}: its {JOB} describes trial {actual_id}: it was renamed or edited. Remove the directory "
                 "to run the trial again",
             )
 

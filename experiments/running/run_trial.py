@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.running.attempts import RUN
 from experiments.running.machine import describe_machine
 from experiments.running.provenance import record_end
 from experiments.running.run_options import UNWATCHED, RunOptions
@@ -247,7 +248,7 @@ def run_trial(
     table = beginning["table"]
     declared = declare_model(trial.model, table)
     trained = train_trial(
-        trial, prepared, directory / "run", execution=execution, keep=keep, progress=progress, **beginning
+        trial, prepared, directory / RUN, execution=execution, keep=keep, progress=progress, **beginning
     )
 
     subject = (trial.model, table, prepared, trial.eval, trial.train.masking.setting)

@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running import provenance
+from experiments.running.attempts import RESULT, RUN
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import FILE as WINDOWS
 from hma_jax.runtime.files import write_file
 
-RESULT, SAMPLES = "result.json", "samples.npz"
+SAMPLES = "samples.npz"
 
-SEALED = (WINDOWS, SAMPLES, "run/metrics.jsonl", provenance.FILE)
+SEALED = (WINDOWS, SAMPLES, f"{RUN}/metrics.jsonl", provenance.FILE)
 """Files beside a result that it vouches for, where they are. Checkpoints are not among them: no number is read from
 them again, and a copy may leave them out."""
 

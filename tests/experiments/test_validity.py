@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from experiments.report.draw import draw
-from experiments.running.sealed import RESULT, write_result
+from experiments.running.attempts import RESULT
+from experiments.running.sealed import write_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps

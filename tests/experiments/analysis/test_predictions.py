@@ -21,8 +21,9 @@ from experiments.report.draw import draw
 from experiments.report.fits import describe_fits
 from experiments.report.numbers import read_numbers
 from experiments.report.validity import _prediction
+from experiments.running.attempts import RESULT
 from experiments.running.ledger import FINISHED, Ledger
-from experiments.running.sealed import RESULT, write_result
+from experiments.running.sealed import write_result
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import POINT, unique_trials
