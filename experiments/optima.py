@@ -14,12 +14,13 @@ from dataclasses import dataclass
 
 from scipy.special import stdtrit  # not scipy.stats, which takes most of a second to import
 
-from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference, of_sweep
+from experiments.analysis.intervals import HELD_OUT_LOSS
+from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, CurvePoint, Row, all_series, curve, difference, of_sweep
 from experiments.running.ledger import DIVERGED, FINISHED
 from experiments.sweeps.sweep import Sweep
 from hma_jax.evaluation.sums import add_up
 
-LOSSES = {"cross_entropy": OVERALL, LOSS: TRAINING}
+LOSSES = {HELD_OUT_LOSS: OVERALL, TRAINING_LOSS: TRAINING}
 """What optima are taken of, with scopes: nats per held-out token, and the training objective."""
 
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 UNTRAINED = "untrained"
 """The role of the reference trial before its first step."""
 
-TRAINING, LOSS = "training", "loss"
+TRAINING, TRAINING_LOSS = "training", "loss"
 """Scope and metric of the objective on the trial's own mixture, averaged over its last steps."""
 
 
@@ -117,7 +117,7 @@ def _rows(
     parts = [(point.role, Summary.from_dict(result["evaluation"]))]
     if result["untrained"]:
         parts.append((UNTRAINED, Summary.from_dict(result["untrained"])))
-    rows = [row(point.role, TRAINING, LOSS, training_loss(result))]
+    rows = [row(point.role, TRAINING, TRAINING_LOSS, training_loss(result))]
     for role, summary in parts:
         judged = [name for name in point.scope or sweep.scope if name in summary.datasets]  # those with windows
         scopes = {OVERALL: summary.over(judged)}

@@ -15,14 +15,13 @@ import numpy as np
 
 from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
 from experiments.analysis.changes import METRICS
+from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.analysis.paired import NotComparable, agree, require_same_windows
 from experiments.running.provenance import Provenance
 from experiments.running.trial import training_of, trial_id
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import WindowTable
-
-LOSS = "cross_entropy"
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def judge_at_best(
         for point in (p for p in sweep.points if p.role == POINT and not p.scope):
             trained[point.x, point.trial.train.seed].add(stable_hash(training_of(point.trial)))
             table = windows.get(trial_id(point.trial, provenance))
-            if table is not None and LOSS in table.metrics:
+            if table is not None and HELD_OUT_LOSS in table.metrics:
                 tables_by_steps[point.x][point.trial.train.seed][point.trial.train.steps] = table
         for x, seeds in sorted(tables_by_steps.items()):
             several = {
@@ -142,6 +141,6 @@ def _halved(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> bool:
 
 def _mean_of_robots(table: WindowTable, chosen: np.ndarray) -> float:
     """The mean loss of the windows `chosen`, bool [n], by robot, then over robots."""
-    loss = table.metrics[LOSS]
+    loss = table.metrics[HELD_OUT_LOSS]
     own = [chosen & (table.dataset == robot) for robot in table.datasets]
     return float(np.mean([loss[rows].mean() for rows in own if rows.any()]))

@@ -21,7 +21,7 @@ from scipy.special import fdtrc  # not scipy.stats, which takes most of a second
 from experiments.analysis.measured import Measurements
 from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, fit_values, predict_log
 
-DRAWS, LEVEL = 1000, 0.90
+DRAWS, FIT_LEVEL = 1000, 0.90
 MIN_POSITIONS = 4
 """Distinct positions on an axis that a power law with a constant needs: one more than its three parameters."""
 
@@ -71,7 +71,7 @@ class PowerFit:
         return np.exp(predict_log(self.thetas, np.log(x) - self.centre))
 
     def band(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """LEVEL interval [m], [m] of the curve at `x` [m, K]."""
+        """FIT_LEVEL interval [m], [m] of the curve at `x` [m, K]."""
         return interval(self.all_at(x))
 
     def formula(self) -> str:
@@ -83,8 +83,8 @@ class PowerFit:
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """LEVEL interval of `values` [R, ...] over the first axis."""
-    return tuple(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
+    """FIT_LEVEL interval of `values` [R, ...] over the first axis."""
+    return tuple(np.quantile(values, [(1 - FIT_LEVEL) / 2, (1 + FIT_LEVEL) / 2], axis=0))
 
 
 def fit_power(measured: Measurements, draws: int = DRAWS, episodes: bool = True) -> PowerFit:

@@ -21,8 +21,13 @@ OVERALL = "overall"
 """The scope that averages over all robots that are judged, each counting equally."""
 
 LEVEL = 0.95
+"""Of intervals of means and differences; those of fits have `fits.FIT_LEVEL`."""
 
-NATS = ("cross_entropy", "diffusion_loss", "action_nats")
+HELD_OUT_LOSS = "cross_entropy"
+"""Nats per held-out token, which models of latents have not: what is fitted. Its exponential, the perplexity, is no sum
+of powers."""
+
+NATS = (HELD_OUT_LOSS, "diffusion_loss", "action_nats")
 """Metrics in nats per token (the diffusion loss in its own unit), which come first in every table."""
 
 

@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis.fits import LEVEL, interval
+from experiments.analysis.fits import FIT_LEVEL, interval
+from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.analysis.measured import Position, measure
-from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_near
+from experiments.analysis.scaling import Curve, fit_curve, noise_near
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.evaluation.windows import WindowTable
@@ -96,7 +97,7 @@ def predict(
     spread = np.exp(noise * luck)
     low, high = interval(fit.all_at(x)[:, 0] * spread)
     return Prediction(
-        curve.name, curve.axes, tuple(map(float, x[0])), ids, float(fit.at(x)[0]), float(low), float(high), LEVEL,
+        curve.name, curve.axes, tuple(map(float, x[0])), ids, float(fit.at(x)[0]), float(low), float(high), FIT_LEVEL,
         fit.formula(), {c.name: (c.value, c.low, c.high) for c in fit.coefficients},
         {id: hashes[id] for id in fit.trials}, tuple(sorted(windows)),
     )  # fmt: skip
@@ -117,7 +118,7 @@ def compare(
         marks.append("the study does not plan its trials")
     if finished and len(finished) < len(prediction.trials):
         marks.append(f"{len(finished)} of its {len(prediction.trials)} trials finished")
-    observed = float(measure(curve.axes, finished, windows, LOSS).value.mean()) if finished else None
+    observed = float(measure(curve.axes, finished, windows, HELD_OUT_LOSS).value.mean()) if finished else None
     return Outcome(prediction, observed, len(finished), tuple(marks))
 
 

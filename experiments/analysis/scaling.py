@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from experiments.analysis.fits import DRAWS, PowerFit, fit_power
+from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.analysis.isoflop import IsoFlop, fit_isoflop
 from experiments.analysis.measured import PRIOR, Measurements, NoLevel, Position, measure
 from experiments.running.provenance import Provenance
@@ -25,9 +26,6 @@ from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ModelConfig
 from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.evaluation.windows import WindowTable
-
-LOSS = "cross_entropy"
-"""Nats per token: what is fitted. Its exponential, the perplexity, is no sum of powers."""
 
 TRUNK, WINDOWS, FLOPS = "trunk parameters", "windows seen", "training FLOPs"
 
@@ -43,7 +41,7 @@ class Curve:
     positions: tuple[Position, ...]
 
     def finished(self, windows: Mapping[str, WindowTable]) -> tuple[Position, ...]:
-        return tuple(p for p in self.positions if p.trial in windows and LOSS in windows[p.trial].metrics)
+        return tuple(p for p in self.positions if p.trial in windows and HELD_OUT_LOSS in windows[p.trial].metrics)
 
 
 @dataclass(frozen=True)
@@ -96,9 +94,11 @@ def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRA
     """The power law of the finished trials of a curve. Raises ConfigError if they saw different windows."""
     positions = curve.finished(windows)
     if not positions:
-        return CurveFit(curve, None, PowerFit(curve.axes, (), f"no finished trial has a {LOSS} of its windows"))
+        return CurveFit(
+            curve, None, PowerFit(curve.axes, (), f"no finished trial has a {HELD_OUT_LOSS} of its windows")
+        )
     try:
-        measured = measure(curve.axes, positions, windows, LOSS)
+        measured = measure(curve.axes, positions, windows, HELD_OUT_LOSS)
     except NoLevel as error:  # until more trials have finished
         return CurveFit(curve, None, PowerFit(curve.axes, tuple(p.trial for p in positions), str(error)))
     fit = fit_power(measured, draws, episodes=episodes)
@@ -130,7 +130,7 @@ def fit_budgets(
     positions = [replace(p, x=(p.x[0], flops[p.trial])) for p in surface.finished(windows)] if surface else []
     if not positions:
         return None
-    return fit_isoflop(measure((TRUNK, FLOPS), positions, windows, LOSS), draws=draws)
+    return fit_isoflop(measure((TRUNK, FLOPS), positions, windows, HELD_OUT_LOSS), draws=draws)
 
 
 def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Provenance) -> Curve:

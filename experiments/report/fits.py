@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from experiments.analysis.fits import DRAWS, LEVEL, Coefficient
+from experiments.analysis.fits import DRAWS, FIT_LEVEL, Coefficient
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import CurveFit
@@ -76,7 +76,7 @@ def describe_fits(fits: Sequence[CurveFit], isoflop: IsoFlop | None, outcomes: S
     return (
         "<p>The law is L = E + A x<sup>\u2212\u03b1</sup>: L is the loss in nats per held-out token, x the position on "
         "the axis. It is fitted by the Huber loss in the logarithm, points weighted by the measured scatter of seeds. "
-        f"Brackets are {LEVEL:.0%} intervals of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, "
+        f"Brackets are {FIT_LEVEL:.0%} intervals of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, "
         "this tokenizer and this range; beyond its last point it is an extrapolation, which only predictions can test.</p>"
         f"{drawn}{table(head, lines, text=6)}{_outcomes(outcomes)}{_isoflop(isoflop)}"
     )

@@ -22,12 +22,12 @@ from experiments.report.plot_style import (
     show_nothing,
     show_tally,
 )
-from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
+from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, Row, all_series, curve
 from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 
 ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}
 DRAWN = {
-    LOSS: (TRAINING, "training loss, last tenth of steps"),
+    TRAINING_LOSS: (TRAINING, "training loss, last tenth of steps"),
     **{metric: (OVERALL, f"{LABELS[metric]}, held out") for metric in ON_LOG},
 }
 """Metrics with their scope and label, where curves are compared by where they are lowest."""
@@ -44,7 +44,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     metrics = drawn_metrics(rows, [sweep.name])
     if sweep.base:
         measured = {r.metric for r in rows if r.sweep == sweep.name}
-        metrics = [m for m in DRAWN if m in measured] or [LOSS, "perplexity"]
+        metrics = [m for m in DRAWN if m in measured] or [TRAINING_LOSS, "perplexity"]
     figure, panels = plt.subplots(
         len(series), len(metrics), figsize=(4.3 * len(metrics), 0.7 + 2.9 * len(series)),
         layout="constrained", sharex=True, sharey="col", squeeze=False,

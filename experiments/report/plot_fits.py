@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
-from experiments.analysis.fits import LEVEL
+from experiments.analysis.fits import FIT_LEVEL
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import FLOPS, TRUNK, CurveFit
@@ -64,7 +64,7 @@ def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outco
     above.plot(x, loss, color=LINE, label="seeds", zorder=3, **POINTS)
     ends = [x.min(), *(o.prediction.x[0] for o in outcomes), x.max()]
     line = np.geomspace(min(ends) / 1.15, max(ends) * 1.15, 120)[:, None]
-    band = f"{LEVEL:.0%} of bootstraps"
+    band = f"{FIT_LEVEL:.0%} of bootstraps"
     above.fill_between(line[:, 0], *fit.band(line), color=LINE, alpha=BAND, linewidth=0, label=band)
     above.plot(line[:, 0], fit.at(line), color=LINE, linewidth=1.6, label="fit")
     below.plot(x, 100 * fit.residuals, color=LINE, **POINTS)

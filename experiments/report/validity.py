@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from experiments.analysis.controllability import ROUNDING
-from experiments.analysis.intervals import standard_errors
+from experiments.analysis.intervals import HELD_OUT_LOSS, standard_errors
 from experiments.analysis.predictions import Outcome
 from experiments.optima import Optimum
 from experiments.report.pieces import section
 from experiments.report.robots import Robot
-from experiments.rows import LOSS, OVERALL, UNTRAINED, Row
+from experiments.rows import OVERALL, TRAINING_LOSS, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
@@ -36,9 +36,6 @@ EACH, MEAN = 3.0, 2.0
 
 CONTROLLED = {"delta_psnr": "ΔPSNR", "action_nats": "action-nats"}
 """What has to vanish for a model trained on shuffled actions."""
-
-HELD_OUT = "cross_entropy"
-"""Nats per held-out token; models of latents have none."""
 
 EXACT = 1e-6
 """Relative difference that recomputing a mean or its error may make: windows are kept in float32."""
@@ -182,7 +179,7 @@ def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
     if vocabulary is None:
         return []
     name, expected = "An untrained model is at chance.", math.log(vocabulary)
-    losses = [r.mean for r in rows if (r.role, r.scope, r.metric) == (UNTRAINED, OVERALL, HELD_OUT)]
+    losses = [r.mean for r in rows if (r.role, r.scope, r.metric) == (UNTRAINED, OVERALL, HELD_OUT_LOSS)]
     if not losses:
         return [Check(name, "open", "No trial was judged before its first step.")]
     off = max(losses, key=lambda v: abs(v - expected))
@@ -235,13 +232,13 @@ def _copying(robots: Sequence[Robot], whose: str) -> Check:
 
 
 def _held_out(optima: Sequence[Optimum]) -> bool:
-    return any(o.metric == HELD_OUT for o in optima)
+    return any(o.metric == HELD_OUT_LOSS for o in optima)
 
 
 def _optima(optima: Sequence[Optimum]) -> list[Check]:
     """Of muP's curves, on held-out data where there is a likelihood. Where the standard parametrisation is best is a
     finding, not a condition."""
-    mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT if _held_out(optima) else LOSS)]
+    mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT_LOSS if _held_out(optima) else TRAINING_LOSS)]
     if not mup:
         return []
     edge = [o.series for o in mup if o.edge]

@@ -12,7 +12,7 @@ from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
 from experiments.report.plots import plot_sweep
 from experiments.report.sweeps import _transfer
-from experiments.rows import LOSS, TRAINING, CurvePoint, curve, read_csv
+from experiments.rows import TRAINING, TRAINING_LOSS, CurvePoint, curve, read_csv
 from experiments.study import TransferConfig
 from experiments.sweeps import lr
 from experiments.sweeps.registry import plan_sweeps
@@ -113,7 +113,7 @@ def test_optima_line_up_with_mup_and_cost_nothing(tmp_path):
     wide = optima[STANDARD, "width 32"]
     assert wide.x == RATE / 2 and wide.transferred_x == RATE and wide.penalty > 0.05
     assert optima[STANDARD, "width 16"].penalty == 0.0  # its own optimum
-    training = optima_of(rows, LOSS)
+    training = optima_of(rows, TRAINING_LOSS)
     assert training[STANDARD, "width 8"].penalty == pytest.approx(0.1)
 
 
@@ -195,6 +195,6 @@ def test_no_base_width_no_penalty(tmp_path):
 
 def test_final_loss_is_the_mean_of_the_last_tenth(tmp_path):
     rows = rows_with(tmp_path)
-    points = curve(rows, "lr", LOSS, POINT, TRAINING, "width 8")
+    points = curve(rows, "lr", TRAINING_LOSS, POINT, TRAINING, "width 8")
     assert [p.x for p in points] == pytest.approx([RATE / 4, RATE / 2, RATE, 2 * RATE, 4 * RATE])
     assert points[2].mean == pytest.approx(3.5)  # of 20 steps the last two, 4 and 3
