@@ -88,6 +88,8 @@ def run_study(
         kept = keep_axes(every, workspace.root)
         if setting.arguments.registry:  # some axes are planned with it
             write_file(workspace.registry, setting.arguments.registry.read_bytes())
+        else:  # there may be that of a study that this one replaces
+            workspace.registry.unlink(missing_ok=True)
         record = Record(study, setting.data, kept, whole_command(setting, kept), provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}

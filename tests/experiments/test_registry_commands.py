@@ -305,12 +305,18 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
     use_entries(entries)
     workspace = Workspace(tmp_path / "study")
     workspace.root.mkdir()
-    run_study.run_study(
-        Setting(arguments, study, ("somewhere",), workspace), ("episodes",), again="", launcher_options=LauncherOptions(),
-        retry_failed=False, accept_code=False, replace=None,
-    )  # fmt: skip
+
+    def run(arguments, study, axis, step=None):
+        run_study.run_study(
+            Setting(arguments, study, ("somewhere",), workspace), (axis,), again="", launcher_options=LauncherOptions(),
+            retry_failed=False, accept_code=False, replace=step,
+        )  # fmt: skip
+
+    run(arguments, study, "episodes")
     entries.unlink()
     registry_table._registered.clear()
     record = load_record(workspace)
     (sweep,) = plan_sweeps(record.study, record.axes, workspace.root)
     assert {p.x for p in sweep.points} == {8, 25, 39}
+    run(replace(arguments, registry=None), replace(study, datasets=("pusher_sand", "rover_road")), "width", "study")
+    assert load_record(workspace).axes == ("width",) and not workspace.registry.exists(), "of the study before"
