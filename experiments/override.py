@@ -9,7 +9,7 @@ import difflib
 import json
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import is_dataclass
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ def override(study: Study, settings: Sequence[str], model: ModelConfig | None = 
     the ones before change them, and end the program as --help does.
     """
     values = to_dict(study) | ({} if model is None else {"model": to_dict(model)})
+    before = _leaves(values)
     for setting in settings:
         path, separator, text = setting.partition("=")
         if not separator and path.split(".")[-1] == "help":
@@ -35,7 +36,7 @@ def override(study: Study, settings: Sequence[str], model: ModelConfig | None = 
             raise SystemExit(0)
         advice = "write it as path=value, such as model.frames=4; --set help lists all settings"
         require(bool(separator), f"--set {setting}: {advice}")
-        _assign(values, path.strip(), text.strip())
+        _assign(values, before, path.strip(), text.strip())
     return from_dict(Study, values)
 
 
@@ -51,8 +52,9 @@ def _show(values: dict[str, Any], group: str) -> None:
     show_settings(found, f"Settings of preset {values['name']}; --set PATH=VALUE changes one")
 
 
-def _assign(values: dict[str, Any], path: str, text: str) -> None:
-    """Puts the parsed `text` at `path`, in place."""
+def _assign(values: dict[str, Any], before: Mapping[str, Any], path: str, text: str) -> None:
+    """Puts the parsed `text` at `path`, in place, of the kind that stood there `before` any override: an earlier one of
+    the same path may have left a whole number in the place of a fraction."""
     known = _leaves(values)
     if path not in known:
         raise ConfigError(f"--set {path}: {_instead(values, path, known)}")
@@ -60,10 +62,10 @@ def _assign(values: dict[str, Any], path: str, text: str) -> None:
     *parents, last = path.split(".")
     for parent in parents:
         node = node[parent]
-    node[last] = _parse(path, text, node[last])
+    node[last] = _parse(path, text, before.get(path, node[last]))
 
 
-def _instead(values: dict[str, Any], path: str, known: Sequence[str]) -> str:
+def _instead(values: dict[str, Any], path: str, known: Collection[str]) -> str:
     """The message for an unknown setting: a name that was probably meant, or the names of its group."""
     node, at, rest = values, [], path.split(".")
     while rest and isinstance(node, dict) and rest[0] in node:
@@ -82,7 +84,7 @@ def _instead(values: dict[str, Any], path: str, known: Sequence[str]) -> str:
     return f"no such setting; did you mean {' or '.join(meant[:4])}?" if meant else f"no such setting; {inside}"
 
 
-def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequence[str]) -> list[str]:
+def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Collection[str]) -> list[str]:
     """Settings probably meant by the rest of a path below `group`, by the first rule that finds any."""
     last, leaves = rest[-1], {k.split(".")[-1] for k in known}
 
@@ -142,9 +144,9 @@ def _json(path: str, text: str) -> Any:
         raise ConfigError(f"--set {path}={text}: not a number, true, false, null or list") from None
 
 
-def _leaves(values: dict[str, Any], prefix: str = "") -> list[str]:
-    """Dotted paths of everything that is not a nested config."""
-    paths = []
+def _leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Everything that is not a nested config, by its dotted path."""
+    found = {}
     for key, value in values.items():
-        paths += _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
-    return paths
+        found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found

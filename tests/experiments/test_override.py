@@ -1,5 +1,7 @@
 """Settings changed from the command line: which there are, what is said of others and of values that do not fit."""
 
+from dataclasses import replace
+
 import pytest
 
 from experiments.override import override
@@ -15,6 +17,15 @@ def test_override_sets_nested_fields_and_lists():
     assert study.train.optimizer.learning_rate == 1.0 and study.store.frame_step == 1
     assert (study.store.max_skipped, study.train.action_scale) == (0.01, "quantiles")
     assert study.execution.dtype == "bfloat16" and study.model.mup.enabled is False
+
+
+def test_of_several_values_the_last_is_taken_whichever_kinds_of_number_they_are():
+    assert override(SMOKE, ["tau=1000", "tau=2.5"]).tau == 2.5
+    assert override(replace(SMOKE, rate=None), ["rate=4", "rate=2.5"]).rate == 2.5
+    with pytest.raises(ConfigError, match="train.steps=2.5: expected a value like"):
+        override(SMOKE, ["train.steps=7", "train.steps=2.5"])
+    latents = ["tokenizer.quantise=false", 'model.diffusion={"channels": 2, "patch": 1}', "model.diffusion.patch=2"]
+    assert override(SMOKE, latents).model.diffusion.patch == 2
 
 
 def test_lists_of_names_are_written_without_quotes_wherever_they_are():
