@@ -22,6 +22,7 @@ from experiments.preparing.made_from import Step
 from experiments.progress import console, say, step
 from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
+from experiments.running.workspace import Workspace
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, short
 from experiments.sweeps.sweep import reference_trial
 from experiments.words import counted, few
@@ -192,12 +193,27 @@ def _check(
 
     options.check()
     require_plain(run)
+    _require_free(setting, run)
     _require_no_trial(setting, run)
     check_schedule(setting.study.train.optimizer, setting.study.train.steps)
     require_only(setting.study.train, setting.study.dataset_names(), setting.study.rate)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
     return _origin_of(run, initial)
+
+
+def _require_free(setting: Setting, run: Path) -> None:
+    """Raises ConfigError for a run that would lie among what a study made: as its own directory, of which no
+    application would find tokenizer and tokens beside the run, or in the place of a part of it."""
+    study = setting.workspace
+    parts = (study.suite, study.tokenizer, study.store, study.trials, study.predictions, study.figures)
+    there = run.resolve()
+    whole = there == study.root.resolve() or Workspace(run).manifest.exists() or Workspace(run).record.exists()
+    require(
+        not whole and there not in [part.resolve() for part in parts],
+        f"--run {short(run)} is {'the directory of a study' if whole else 'a place of the study for what it makes'}; give "
+        f"the run a directory of its own, such as {short((run if whole else study.root) / 'model')}",
+    )
 
 
 def _require_no_trial(setting: Setting, run: Path) -> None:

@@ -398,9 +398,10 @@ def test_training_is_not_resumed_on_other_data(study, tmp_path, refused):
     assert "provenance.store: " in message and str(other / "model") in message
 
 
-def test_run_of_another_kind(study, refused):
+def test_run_of_another_kind(study, tmp_path, refused):
     out, data = study
-    message = refused(2, "train", *SMOKE, "--out", out, *data, "--run", out / "tokenizer")
+    copied = shutil.copytree(out / "tokenizer", tmp_path / "copied")
+    message = refused(2, "train", *SMOKE, "--out", out, *data, "--run", copied)
     assert "another kind of run" in message and "use a new output directory" in message
     message = refused(2, "evaluate", out / "tokenizer", *SMOKE, "--out", out, *data)
     assert f"{out / 'tokenizer'}: not a run of this project (no model, table)" in message

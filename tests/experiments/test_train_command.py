@@ -384,6 +384,24 @@ def test_a_new_run_does_not_lie_where_the_model_lies_that_it_begins_with(tmp_pat
         assert "give the new run a directory of its own with --run NEW" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["train", "adapt"])
+def test_a_new_run_does_not_lie_among_what_a_study_made(command, where, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
+    tokenizer, out, other = tmp_path / "lfq", tmp_path / "out", tmp_path / "other"
+    config = get_preset("smoke").tokenizer
+    save_tokenizer(LfqTokenizer(config, declare_tokenizer(config).init(0)), tokenizer)
+    source = make_released(tmp_path, as_registered(ARM)) if command == "adapt" else None
+    words = [command, *[str(source)] * (source is not None), *SMOKE, "--out", str(out), "--tokenizer", str(tokenizer)]
+    words += where[where.index("--data") :]
+    other.mkdir()
+    (other / "eval_manifest.json").write_text("{}")
+    for run, its_own in ((out, out / "model"), (out / "tokenizer", out / "model"), (other, other / "model")):
+        assert main([*words, "--run", str(run)]) == 2
+        said = capsys.readouterr().err
+        assert f"--run {run} is " in said and f"directory of its own, such as {its_own}" in said
+    assert not out.exists() and [path.name for path in other.iterdir()] == ["eval_manifest.json"]
+
+
 def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where, tmp_path, monkeypatch, capsys):
     """What does not fit is said before a tokenizer is trained on the data."""
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
