@@ -17,6 +17,7 @@ from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.sources.source import INSTRUCTION_KEY, REWARD_KEY
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import FILE as MANIFEST
+from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
@@ -179,7 +180,8 @@ def open_trajectories(
     joined to, is called after.
 
     `place` is a dataset's directory, one of a token store (`STORE/NAME`), or the name of a dataset in the token store
-    `stores`. Raises ConfigError for what is none of them, or of no known robot; DataError for damage.
+    `stores`. Raises ConfigError for what is none of them, or of no known robot, and for an entry that corrects images
+    otherwise than that store was made; DataError for damage.
     """
     path = Path(place)
     if not path.exists() and stores.is_dir() and "/" not in place:
@@ -201,6 +203,8 @@ def open_trajectories(
         )
     if stored:
         return StoredTrajectories(TokenStore(path.parent), name, split, tokenizer, chosen), chosen
+    if name == chosen.name:
+        _require_corrections(get_spec(name), stores / name)
     return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size), chosen
 
 
@@ -225,6 +229,21 @@ def _require_fit(spec: DatasetSpec, robot: Robot) -> None:
     require(
         not robot.hz or robot.hz == spec.hz,
         f"{spec.name} was recorded at {spec.hz:g} Hz, but the model was trained with {robot.name} at {robot.hz:g} Hz",
+    )
+
+
+def _require_corrections(spec: DatasetSpec, tokens: Path) -> None:
+    """Raises ConfigError where the tokens that a model was trained on were made of frames that were corrected in
+    another way: it would be shown, say, rotated ones."""
+    if not (tokens / MANIFEST).is_file():  # the run was moved, or converted
+        return
+    learnt = load_manifest(tokens / MANIFEST).spec.image_corrections
+    there, asked = (" and ".join(corrections) or "none" for corrections in (learnt, spec.image_corrections))
+    require(
+        learnt == spec.image_corrections,
+        f"{spec.name}: image_corrections of the registry's entry are not those of the tokens in {tokens} (there -> asked "
+        f"for): {there} -> {asked}. The model has not seen such frames; restore those of the tokens in the entry "
+        "(--registry)",
     )
 
 

@@ -137,6 +137,27 @@ def test_actions_that_stand_in_another_order_than_the_model_learnt_are_not_repla
         opened()
 
 
+def test_frames_that_are_corrected_otherwise_than_those_a_model_learnt_from_are_refused(tmp_path, monkeypatch):
+    spec = get_spec("berkeley_gnm_cory_hall")
+    entry = Embodiment(spec.name, 2, 2, (0.0,) * 2, (1.0,) * 2, layout=spec.action_layout())
+    simulator = load_simulator(make_run(tmp_path / "study", table=EmbodimentTable((*TABLE.entries, entry))))
+    robot, rlds, tokens = simulator.robot(spec.name), str(write_rlds(tmp_path, spec, [9, 9])), tmp_path / "tokens"
+    tokenize_dataset(spec, rlds, simulator.tokenizer, tokens, min_val=1)
+    rotated = replace(spec, image_corrections=("rotate_180",))
+
+    def opened(entry):
+        monkeypatch.setattr(trajectories_module, "get_spec", lambda _: entry)
+        return open_trajectories(rlds, "train", robot, {}, simulator.tokenizer, tokens)
+
+    assert len(opened(spec)[0]) == 2
+    with pytest.raises(ConfigError, match=r"image_corrections .* \(there -> asked for\): none -> rotate_180\. "):
+        opened(rotated)
+    tokenize_dataset(rotated, rlds, simulator.tokenizer, tokens, min_val=1, overwrite=True)
+    assert len(opened(rotated)[0]) == 2
+    with pytest.raises(ConfigError, match=r"\(there -> asked for\): rotate_180 -> none\. "):
+        opened(spec)
+
+
 def episode_seed(i: int) -> int:
     return source_module.episode_seed(0, f"pusher_sand/val/{i}")
 
