@@ -113,6 +113,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
+    _note_other_data(setting, prepared)
     note_possible_leakage(trained, names, prepared.store)
     made_from = describe_evaluation(trained, names, prepared, setting.study.eval)
     if not replace:
@@ -151,6 +152,18 @@ def table_of(summary: Summary, title: str) -> TidyTable:
     if alone := [name for name, stats in judged.items() if all(s.clusters == 1 for s in stats.values())]:
         table.caption = f"No standard error for {few(alone)}: there is only one held-out episode."
     return table
+
+
+def _note_other_data(setting: Setting, prepared: PreparedData) -> None:
+    """Prints a note where the windows were frozen on other recordings than those that --data and --registry give."""
+    from experiments.preparing.store import data_differences
+
+    if lines := data_differences(setting.study, setting.workspace, setting.data, prepared.tokenizer):
+        console.print(
+            f"note: the windows that are frozen in {short(setting.workspace.root)} are evaluated, whose tokens were made "
+            f"from other data than --data and the registry give (there -> given): {'; '.join(lines)}",
+            soft_wrap=True,
+        )
 
 
 def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, may_replace, require_same
-from experiments.preparing.sources import Source, open_source
+from experiments.preparing.sources import Source, group_by_dataset, open_source, source_of
 from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.words import few
+from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:
@@ -57,6 +58,19 @@ def make_store(
     with step(f"tokenise {len(sources)} dataset(s)") as update:
         for i in [i for i in range(len(sources)) if not make(i, wait=False)]:
             make(i, wait=True)
+
+
+def data_differences(study: Study, workspace: Workspace, data: Sequence[str], tokenizer: Tokenizer) -> list[str]:
+    """How the recordings at `data`, and the registry's entries of them, differ from those that the tokens here were
+    made from; settings of the store are not compared, nor what cannot be opened."""
+    from data_pipelines.errors import DataError
+
+    try:
+        sources = [source_of(name, places) for name, places in group_by_dataset(data).items()]
+        lines = _differences(study, workspace, sources, tokenizer)
+    except (DataError, ConfigError):  # evaluation reads nothing of it
+        return []
+    return [line for line in lines if line.startswith(("spec.", "source:"))]
 
 
 def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:

@@ -27,6 +27,7 @@ from data_pipelines.tokens import tokenize_job
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
 from experiments.preparing import tokenizer, windows
+from hma_jax.config import require
 from hma_jax.convert import read_official, write_run
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
@@ -477,6 +478,25 @@ def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tm
     said = capsys.readouterr().out
     assert f"not evaluated, because the study has no windows of them: {BASE.name}" in said
     assert f"also those of {ARM.name}, which --data does not name" in said
+
+
+def test_evaluation_says_where_its_windows_are_of_other_recordings_than_data_names(
+    study, tmp_path, monkeypatch, capsys
+):
+    out, (option, arm, base) = study
+    longer, to = write_rlds(tmp_path, ARM, [20] * 6), ("--to", str(tmp_path / "to"))
+    monkeypatch.setattr("experiments.cli.evaluate.step", lambda _: require(False, "it would evaluate"))
+
+    def said(*data: object) -> str:
+        assert main(["evaluate", str(out / "model"), *SMOKE, "--out", str(out), option, *map(str, data), *to]) == 2
+        return capsys.readouterr().out
+
+    note = (
+        f"note: the windows that are frozen in {out} are evaluated, whose tokens were made from other data than --data"
+    )
+    assert note not in said(arm, base)
+    found = said(longer, base)
+    assert note in found and "source: " in found and f"({ARM.name})" in found
 
 
 def test_evaluation_with_a_prompt_that_fills_the_window(study, refused):
