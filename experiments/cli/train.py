@@ -344,21 +344,16 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
 
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
+    from experiments.done import newest_step
     from experiments.running.run_trial import open_prepared_data, train_trial
     from hma_jax.runtime.processes import is_writer
-    from hma_jax.training.step_trace import PROFILE, SETTLED
 
     prepared = open_prepared_data(setting.workspace)
     say_data(trial, prepared)
-    profile = run / PROFILE
-    if options.trace and is_writer():
-        say(
-            f"note: {counted(options.trace, 'step')} will be profiled, after {SETTLED} others, in {short(profile)}. To see "
-            f"that: pip install xprof, then xprof --logdir {short(profile)}; or open its perfetto_trace.json.gz at "
-            "https://ui.perfetto.dev"
-        )
+    steps, made = trial.train.steps, newest_step(run)
+    there = f", of which it has {made:,}" if made else ""
     each = counted(trial.train.batch, "window")
-    with step(f"train width {trial.model.width} for {counted(trial.train.steps, 'step')} of {each}") as update:
+    with step(f"train width {trial.model.width} for {counted(steps, 'step')} of {each}{there}") as update:
         result = train_trial(
             trial,
             prepared,
@@ -371,7 +366,27 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
     if not is_writer():
         return
     console.print(f"loss {result.losses[-1]:.4f} after {counted(len(result.losses), 'step')}")
-    wrote(run, *[profile] * bool(options.trace), then=setting.command("evaluate", run.absolute()))
+    profiles = _say_profiled(run, options.trace or 0, result.resumed_from, steps)
+    wrote(run, *profiles, then=setting.command("evaluate", run.absolute()))
+
+
+def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:
+    """The directory of the profile that a run from step `start` to `steps` recorded, if it did: says of which steps it
+    is, and how it is seen."""
+    from hma_jax.training.step_trace import PROFILE, traced_steps
+
+    first, last = traced_steps(asked, start, steps)
+    if not first:
+        if asked:
+            say("note: no step was profiled: the run had all of its steps")
+        return []
+    profile, fewer = run / PROFILE, f" ({asked:,} were asked for)" if last - first + 1 < asked else ""
+    which = f"step {first:,} was" if first == last else f"steps {first:,} to {last:,} were"
+    say(
+        f"note: {which} profiled{fewer}. To see that: pip install xprof, then xprof --logdir {short(profile)}; or open its "
+        "perfetto_trace.json.gz at https://ui.perfetto.dev"
+    )
+    return [profile]
 
 
 def say_data(trial: Trial, prepared: PreparedData) -> None:

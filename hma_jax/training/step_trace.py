@@ -16,18 +16,24 @@ SETTLED = 10
 """Steps after a start that are not recorded, if there are others: buffers fill in them, libraries choose programs."""
 
 
+def traced_steps(count: int, start: int, steps: int) -> tuple[int, int]:
+    """The first and the last of `count` steps that are recorded, or as many as there are, of a run that goes from step
+    `start` to `steps`; (0, 0) for none."""
+    if not count or start >= steps:
+        return 0, 0
+    first = 1 + max(min(start + SETTLED, steps - count), start)
+    return first, min(first + count - 1, steps)
+
+
 class StepTrace:
-    """Records `count` steps of a run that goes from step `start` to `steps`: from `first` to `last`, both 0 for none.
+    """Records steps of a run: from `first` to `last`, see `traced_steps`.
 
     Use it as a context manager: a recording that is not finished ends with the block.
     """
 
     def __init__(self, directory: Path, count: int, start: int, steps: int):
         self.directory = directory
-        self.first = self.last = 0
-        if count:
-            self.first = 1 + max(min(start + SETTLED, steps - count), start)
-            self.last = min(self.first + count - 1, steps)
+        self.first, self.last = traced_steps(count, start, steps)
         self._recording = False
 
     def start(self) -> None:

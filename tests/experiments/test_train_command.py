@@ -169,11 +169,16 @@ def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, s
     assert train.phases[-1] == (f"training, held-out loss {lines[0]['loss']:.4f}" if steps else "training")
 
 
-def test_steps_are_profiled_as_asked_for_and_the_place_is_said(train, tmp_path):
+def test_steps_are_profiled_as_asked_for_and_which_and_where_is_said(train, tmp_path):
     said, _, _ = train("--set", "train.steps=3", "--trace", "2")
     profile = tmp_path / "run" / "profile"
-    assert f"note: 2 steps will be profiled, after 10 others, in {profile}. To see that: pip install xprof" in said
+    assert f"note: steps 2 to 3 were profiled. To see that: pip install xprof, then xprof --logdir {profile}" in said
     assert f"wrote {profile}" in said and list(profile.glob("plugins/profile/*/*.xplane.pb"))
+    said, _, _ = train("--set", "train.steps=3", "--trace", "2")
+    assert "note: no step was profiled: the run had all of its steps" in said and f"wrote {profile}" not in said
+    said, _, _ = train("--set", "train.steps=4", "--trace", "1000000")
+    assert "train width 16 for 4 steps of 4 windows, of which it has 3 ..." in said, "that it is extended is said"
+    assert "note: step 4 was profiled (1,000,000 were asked for)" in said and f"wrote {profile}" in said
 
 
 def test_windows_are_read_by_as_many_threads_as_asked_for(train, monkeypatch):
