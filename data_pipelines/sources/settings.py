@@ -28,11 +28,11 @@ class RobomimicSettings:
     """What is taken from the file."""
 
     camera: Cameras = ()
-    """Cameras to keep, such as agentview. Default: all."""
+    """Cameras to keep, such as agentview. (default: all)"""
     filter_key: str | None = None
     """Take only the demonstrations of this mask (filter key)."""
     hz: Annotated[float | None, UNSET] = None
-    """Control rate in Hz. Default: the file's own, or 20."""
+    """Control rate in Hz. (default: the file's own, or 20)"""
     short_side: int | None = None
     """Shrink images to this shorter side."""
 
@@ -47,7 +47,7 @@ class LeRobotSettings:
     """What is taken from the dataset."""
 
     camera: Cameras = ()
-    """Cameras to keep, such as top. Default: all."""
+    """Cameras to keep, such as top. (default: all)"""
     short_side: int | None = None
     """Shrink images to this shorter side."""
 

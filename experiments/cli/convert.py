@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
-from tyro.extras import SubcommandApp
 
+from experiments.cli.command_line import Commands
 from experiments.presets import get_preset
 from experiments.progress import console, say
 from experiments.wrote import wrote
@@ -19,7 +19,7 @@ from hma_jax.config.evaluation import SamplerKind
 if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
-convert_app = SubcommandApp()
+convert_app = Commands()
 
 HELP = (
     "Convert checkpoints to and from other formats. A RUN is the directory of a training run of this project. "
@@ -27,6 +27,8 @@ HELP = (
 )
 
 Platform = Literal["cpu", "cuda", "rocm", "tpu"]
+RunDirectory = Annotated[Positional[Path], arg(metavar="RUN")]
+Directory = Annotated[Path, arg(metavar="DIR")]
 
 RATES = "rates.toml"
 
@@ -40,7 +42,7 @@ def _unless(usual: float | str) -> object:
 
 
 @convert_app.command(name="from-official")
-def from_official(checkpoint: Positional[Path], out: Path) -> None:
+def from_official(checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")], out: Directory) -> None:
     """Make a run from a checkpoint of the official PyTorch release, discrete or continuous.
 
     Every tensor must be present, with the shape that config.json requires. PyTorch is not needed, and
@@ -75,7 +77,7 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
 
 
 @convert_app.command(name="to-official")
-def to_official(run: Positional[Path], out: Path, weights: Weights = "auto") -> None:
+def to_official(run: RunDirectory, out: Directory, weights: Weights = "auto") -> None:
     """Write a run as a checkpoint that the official PyTorch release loads.
 
     A run that came from the release and was not trained further is written back byte for byte. Any other run is
@@ -105,7 +107,7 @@ def to_official(run: Positional[Path], out: Path, weights: Weights = "auto") -> 
 
 
 @convert_app.command(name="to-safetensors")
-def to_safetensors(run: Positional[Path], out: Path, weights: Weights = "auto") -> None:
+def to_safetensors(run: RunDirectory, out: Directory, weights: Weights = "auto") -> None:
     """Write a run's weights for any framework, with a JSON description of every array.
 
     Args:
@@ -125,7 +127,7 @@ def to_safetensors(run: Positional[Path], out: Path, weights: Weights = "auto") 
 
 
 @convert_app.command(name="from-safetensors")
-def from_safetensors(directory: Positional[Path], out: Path) -> None:
+def from_safetensors(directory: Annotated[Positional[Path], arg(metavar="DIR")], out: Directory) -> None:
     """Make a run from what to-safetensors wrote; the weights may have been changed since.
 
     Args:
@@ -143,8 +145,8 @@ def from_safetensors(directory: Positional[Path], out: Path) -> None:
 
 @convert_app.command(name="to-stablehlo")
 def to_stablehlo(
-    run: Positional[Path],
-    out: Path,
+    run: RunDirectory,
+    out: Directory,
     batch: int = 1,
     prompt: Annotated[int | None, arg(help_behavior_hint="(default: 4, or all but the last)")] = None,
     frames: Annotated[int | None, arg(help_behavior_hint="(default: the model's window)")] = None,

@@ -12,7 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.progress import console, say
 from experiments.running.workspace import Workspace, load_record
-from experiments.setting import short
+from experiments.setting import UNSET, short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def fit(
     study: Annotated[Positional[Path], arg(metavar="STUDY")],
-    predict: Annotated[str | None, arg(metavar="AXIS=X")] = None,
+    predict: Annotated[str | None, arg(metavar="AXIS=X"), UNSET] = None,
     out: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: STUDY/predictions/AXIS-X.json)")
     ] = None,

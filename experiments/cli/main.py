@@ -5,12 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from tyro.extras import SubcommandApp
-
 from experiments.boundary import guarded
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
 from experiments.cli.check import check
+from experiments.cli.command_line import Commands
 from experiments.cli.compare import compare
 from experiments.cli.coord_check import coord_check
 from experiments.cli.data import app as data
@@ -27,7 +26,7 @@ from experiments.program import PROGRAM
 BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "convert", "bench", "plan", "coord-check", "play", "check")
 """Commands that keep nothing of what they had begun when they are stopped."""
 
-app = SubcommandApp()
+app = Commands()
 app.command(name="study")(study.study)
 app.command(name="sweep")(study.sweep)
 app.command(name="tokenize")(tokenize)
@@ -61,10 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments.remove("--debug")
 
     def work() -> None:
-        app.cli(
-            prog=PROGRAM,
-            description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
-            args=arguments or ["--help"],
+        app.run(
+            PROGRAM,
+            arguments or ["--help"],
+            "HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
         )
 
     resumes = not set(arguments[:1]) & set(BEGIN_ANEW)

@@ -11,7 +11,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from experiments.cli.bench.arguments import Model
 from experiments.progress import console, say, step, tidy_table
-from experiments.setting import Preset, StudyArguments, make_setting
+from experiments.setting import UNSET, Preset, StudyArguments, make_setting
 from experiments.words import counted
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
@@ -58,8 +58,8 @@ def plan(
     arguments: Annotated[OmitArgPrefixes[PlanArguments], arg(name="study")],
     shape: OmitArgPrefixes[Shape],
     topology: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("local",),
-    memory: Annotated[str | None, arg(metavar="SIZE")] = None,
-    brief: FlagCreatePairsOff[bool] = False,
+    memory: Annotated[str | None, arg(metavar="SIZE"), UNSET] = None,
+    brief: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
     """Compile the real training step and print its memory, the sharding of every parameter, and its communication.
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def play(
     run: Annotated[Positional[Path], arg(metavar="RUN")] = DRIVEN,
-    host: str = "127.0.0.1",
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
     port: int = 8765,
     visitors: int = 4,
     window: Annotated[Literal["exact", "streaming"] | None, arg(metavar="{exact,streaming}"), UNSET] = None,

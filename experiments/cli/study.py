@@ -31,7 +31,7 @@ def study(
 
 
 def sweep(
-    axis: Annotated[Positional[str], arg(metavar="|".join((*AXES, "FILE.py")))],
+    axis: Annotated[Positional[str], arg(metavar="AXIS", help=f"What varies: {', '.join(AXES)} or FILE.py.")],
     arguments: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
     replacement: ReplaceOptions,

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
-from tyro.extras import SubcommandApp
 
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
+from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step
 from experiments.setting import Setting, command, make_setting, short
@@ -17,7 +17,7 @@ from experiments.wrote import wrote
 if TYPE_CHECKING:
     from hma_jax.tokenizers.shared import BaseTokenizer
 
-tokenizer_app = SubcommandApp()
+tokenizer_app = Commands()
 
 HELP = "Train an image tokenizer, import published weights, or make one of pixel patches."
 
@@ -30,8 +30,8 @@ def tokenizer_train(arguments: StudyOptions, replacement: ReplaceOptions) -> Non
 
 @tokenizer_app.command(name="import")
 def import_(
-    source: Positional[Path],
-    out: Path,
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    out: Annotated[Path, arg(metavar="DIR")],
     image_size: Annotated[int, arg(name="image-size")] = 256,
     patch: int = 2,
     dtype: Literal["float32", "bfloat16"] = "float32",
@@ -61,7 +61,9 @@ def import_(
 
 
 @tokenizer_app.command(name="pixels")
-def pixels(out: Path, image_size: Annotated[int, arg(name="image-size")] = 64, patch: int = 8) -> None:
+def pixels(
+    out: Annotated[Path, arg(metavar="DIR")], image_size: Annotated[int, arg(name="image-size")] = 64, patch: int = 8
+) -> None:
     """Make a tokenizer without a network: a token is a patch of pixels. For -continuous presets.
 
     Args:
@@ -89,7 +91,7 @@ def train_tokenizer(setting: Setting, replace: Step | None) -> None:
     wrote(workspace.tokenizer, then=setting.command("tokenize"))
 
 
-def _write(tokenizer: BaseTokenizer, out: Path) -> None:
+def _write(tokenizer: BaseTokenizer, out: Annotated[Path, arg(metavar="DIR")]) -> None:
     from hma_jax.convert.atomic import atomic_directory
     from hma_jax.tokenizers.io import save_tokenizer
 

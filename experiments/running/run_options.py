@@ -42,8 +42,8 @@ class RunOptions:
     """Steps between evaluations of the loss on held-out windows; 0: none.
     They are written to RUN/validation.jsonl."""
     trace: Annotated[int | None, arg(metavar="STEPS"), UNSET] = None
-    """Record a profile of so many steps with JAX's profiler, after the first ten, in RUN/profile
-    (docs/performance.md)."""
+    """Record a profile of so many steps with JAX's profiler, after the first ten, in
+    RUN/profile (docs/performance.md)."""
 
     def check(self) -> None:
         """Raises ConfigError, in the words of the command line."""

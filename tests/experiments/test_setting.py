@@ -8,12 +8,12 @@ import shlex
 from pathlib import Path
 
 import pytest
-from tyro.extras import SubcommandApp
 
 from data_pipelines.registry import get_mixture, get_spec
 from experiments import run_study
 from experiments import setting as settings
 from experiments.cli import evaluate, tokenize, tokenizer, train
+from experiments.cli.command_line import Commands
 from experiments.cli.main import main
 from experiments.setting import Setting, StudyArguments, make_setting
 from tests.data_pipelines.fakes import make_spec, write_rlds
@@ -99,7 +99,7 @@ def anything_goes(monkeypatch):
 
 def test_a_printed_command_asks_for_the_same_again(world, monkeypatch, anything_goes):
     monkeypatch.chdir(world)
-    alone = SubcommandApp()  # parsers of all commands take longer than all else here
+    alone = Commands()  # parsers of all commands take longer than all else here
     alone.command(name="tokenize")(tokenize.tokenize)
     monkeypatch.setattr("experiments.cli.main.app", alone)
     cases = combinations()

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from tyro.extras import SubcommandApp
-
 from experiments.cli.bench import models, others
+from experiments.cli.command_line import Commands
 
 HELP = (
     "Measure speed on this machine. Every command times the fast implementation and the naive one alternately in one "
     "process, prints both, and writes a JSON record with commit, hardware and versions."
 )
 
-bench_app = SubcommandApp()
+bench_app = Commands()
 bench_app.command(name="generate")(models.generate)
 bench_app.command(name="rollout")(models.rollout)
 bench_app.command(name="train")(models.train)

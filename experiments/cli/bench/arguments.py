@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+from experiments.setting import UNSET
 from hma_jax.config.evaluation import SamplerKind
 from hma_jax.config.execution import Dtype
 
@@ -29,13 +30,13 @@ class Bench:
     """Number format of the computation."""
     robots: int = 1
     """Number of robots of the model; a batch mixes them."""
-    layers: Annotated[int | None, arg(metavar="N")] = None
+    layers: Annotated[int | None, arg(metavar="N"), UNSET] = None
     """Number of layers, instead of the model's own."""
-    width: Annotated[int | None, arg(metavar="D")] = None
+    width: Annotated[int | None, arg(metavar="D"), UNSET] = None
     """Width, instead of the model's own."""
     seed: int = 0
     """Random seed of weights and inputs."""
-    out: Path = Path("runs/bench")
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/bench")
     """Directory for the record."""
 
 

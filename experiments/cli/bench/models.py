@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
 from experiments.cli.bench.arguments import Bench, Decode
 from experiments.cli.bench.record import write
 from experiments.progress import step
+from experiments.setting import UNSET
 from hma_jax.config import ConfigError
 from hma_jax.config.execution import Remat
 
@@ -39,7 +40,7 @@ def rollout(
     frames: int = 12,
     prompt: int = 4,
     slide: Literal["exact", "streaming"] = "exact",
-    naive: bool = True,
+    naive: Annotated[bool, UNSET] = True,
 ) -> None:
     """Time whole rollouts in one compiled call, and compare them with recomputation.
 
@@ -49,7 +50,7 @@ def rollout(
         frames: Length of a rollout, prompt included; if it is longer than the model's window, the window slides.
         prompt: Frames it starts from.
         slide: How the window slides: exact computes it again for every frame, streaming does not.
-        naive: Time recomputation too, and compare the frames.
+        naive: Time recomputation too, and compare the frames. Default: yes.
     """
     from dataclasses import replace
 

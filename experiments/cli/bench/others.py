@@ -17,7 +17,7 @@ from hma_jax.config.execution import Dtype
 
 
 def quality(
-    run: Positional[Path],
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
     arguments: StudyOptions,
     frames: Annotated[int | None, UNSET] = None,
     windows: int = 12,
@@ -95,7 +95,7 @@ def tokenize(
     repeats: int = 30,
     dtype: Dtype = "float32",
     seed: int = 0,
-    out: Path = Path("runs/bench"),
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/bench"),
 ) -> None:
     """Time the encoding and decoding of a tokenizer.
 
@@ -118,11 +118,11 @@ def tokenize(
 
 
 def simulate(
-    run: Positional[Path],
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
     batch: tuple[int, ...] = (1,),
     repeats: int = 60,
     dtype: Dtype = "float32",
-    out: Path = Path("runs/bench"),
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/bench"),
 ) -> None:
     """Time a trained model as a simulator: actions in, pixels out, past the model's window.
 
@@ -146,14 +146,14 @@ def simulate(
 
 
 def load(
-    store: Annotated[Path | None, UNSET] = None,
+    store: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]"), UNSET] = (),
     windows: int = 20_000,
     batch: int = 32,
     frames: int = 12,
     size: int = 64,
     threads: tuple[int, ...] = (1, 2),
-    out: Path = Path("runs/bench"),
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/bench"),
 ) -> None:
     """Time the loading of training windows from a token store and of frames from RLDS directories, and their memory.
 
@@ -194,13 +194,13 @@ def load(
 
 
 def release(
-    checkout: Positional[Path],
-    python: Path,
+    checkout: Annotated[Positional[Path], arg(metavar="CHECKOUT")],
+    python: Annotated[Path, arg(metavar="FILE")],
     stages: Annotated[tuple[str, ...], arg(metavar="[STAGE ...]"), UNSET] = (),
     turns: int = 5,
     batch: int = 1,
     dtype: Dtype = "float32",
-    out: Path = Path("runs/bench"),
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/bench"),
 ) -> None:
     """Time the base models and those of the official PyTorch release alternately, in one process for each stage.
 
@@ -229,7 +229,12 @@ def release(
     write("release", subject, dtype, 0, {"stages": list(names), "batch": batch}, timed_stages, ratios, (), out)
 
 
-def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
+def report(
+    records: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RECORD [RECORD ...]", help_behavior_hint="(required)")
+    ],
+    figure: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
+) -> None:
     """Print records as Markdown tables, and plot them.
 
     Args:

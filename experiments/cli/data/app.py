@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from tyro.extras import SubcommandApp
-
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
+from experiments.cli.command_line import Commands
 from experiments.cli.data import convert, registry, sim
 from experiments.cli.data.view import view
 from experiments.setting import make_setting
@@ -29,14 +28,14 @@ def suite(arguments: StudyOptions, replacement: ReplaceOptions) -> None:
     wrote(setting.workspace.suite, then=setting.command("tokenizer train"))
 
 
-convert_app = SubcommandApp()
+convert_app = Commands()
 convert_app.command(name="robomimic")(convert.robomimic)
 convert_app.command(name="lerobot")(convert.lerobot)
 convert_app.command(name="epic-kitchens")(convert.epic_kitchens)
 convert_app.command(name="ego4d")(convert.ego4d)
 convert_app.command(name="egoexo4d")(convert.egoexo4d)
 
-data_app = SubcommandApp()
+data_app = Commands()
 data_app.command(name="list")(registry.data_list)
 data_app.command(name="inspect")(registry.data_inspect)
 data_app.command(name="view")(view)

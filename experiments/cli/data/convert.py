@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from data_pipelines.sources.settings import (
     Ego4dSettings,
@@ -31,16 +31,18 @@ if TYPE_CHECKING:
 class Destination:
     """Where the dataset is written."""
 
-    out: Path
+    out: Annotated[Path, arg(metavar="DIR")]
     """Directory in which NAME/1.0.0 is written."""
     name: Annotated[str | None, UNSET] = None
-    """Name of the dataset: lower-case letters, digits and _. Default: made from the source's name."""
-    skip_damaged: Annotated[bool, arg(name="skip-damaged")] = False
+    """Name of the dataset: lower-case letters, digits and _. (default: made from the source's name)"""
+    skip_damaged: Annotated[FlagCreatePairsOff[bool], arg(name="skip-damaged"), UNSET] = False
     """Leave out damaged demonstrations, episodes or videos and count them, instead of stopping."""
 
 
 def robomimic(
-    source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[RobomimicSettings]
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    destination: OmitArgPrefixes[Destination],
+    settings: OmitArgPrefixes[RobomimicSettings],
 ) -> None:
     """Convert robomimic demonstrations: an HDF5 file with camera images.
 
@@ -56,7 +58,9 @@ def robomimic(
 
 
 def lerobot(
-    source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[LeRobotSettings]
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    destination: OmitArgPrefixes[Destination],
+    settings: OmitArgPrefixes[LeRobotSettings],
 ) -> None:
     """Convert a LeRobot dataset, version 2.0, 2.1 or 3.0, with videos or images.
 
@@ -75,8 +79,8 @@ def lerobot(
 
 
 def epic_kitchens(
-    source: Positional[Path],
-    detections: Path,
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    detections: Annotated[Path, arg(metavar="DIR")],
     destination: OmitArgPrefixes[Destination],
     settings: OmitArgPrefixes[EpicKitchensSettings],
 ) -> None:
@@ -94,8 +98,8 @@ def epic_kitchens(
 
 
 def ego4d(
-    source: Positional[Path],
-    videos: Path,
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    videos: Annotated[Path, arg(metavar="DIR")],
     destination: OmitArgPrefixes[Destination],
     settings: OmitArgPrefixes[Ego4dSettings],
 ) -> None:
@@ -113,7 +117,9 @@ def ego4d(
 
 
 def egoexo4d(
-    source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[EgoExo4dSettings]
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    destination: OmitArgPrefixes[Destination],
+    settings: OmitArgPrefixes[EgoExo4dSettings],
 ) -> None:
     """Convert Ego-Exo4D takes with automatic hand poses: 2-D wrist positions as actions, 30 Hz.
 
@@ -172,13 +178,15 @@ def entry(spec: DatasetSpec) -> str:
 
 
 def import_tokens(
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER [FOLDER ...]")],
-    store: Path,
+    folders: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="FOLDER [FOLDER ...]", help_behavior_hint="(required)")
+    ],
+    store: Annotated[Path, arg(metavar="DIR")],
     name: Annotated[str | None, UNSET] = None,
-    hz: float | None = None,
+    hz: Annotated[float | None, UNSET] = None,
     patch: int = 2,
     frame_step: Annotated[int | None, arg(name="frame-step"), UNSET] = None,
-    tokenizer: Path | None = None,
+    tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
 ) -> None:
     """Read token folders of the official release (video.bin, actions, segment_ids.bin) into a token store.
 

@@ -33,9 +33,9 @@ SHEET = "contact_sheet.png"
 
 
 def data_list(
-    words: Annotated[Positional[tuple[str, ...]], arg(metavar="[WORD ...]")] = (),
-    mixture: str | None = None,
-    registry: Path | None = None,
+    words: Annotated[Positional[tuple[str, ...]], arg(metavar="[WORD ...]"), UNSET] = (),
+    mixture: Annotated[str | None, UNSET] = None,
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
     """List the datasets that the registry knows: camera, action size, rate.
 
@@ -94,15 +94,15 @@ def _joined(spec: DatasetSpec) -> str:
 
 
 def data_inspect(
-    directory: Positional[str],
-    hz: float | None = None,
+    directory: Annotated[Positional[str], arg(metavar="DATASET")],
+    hz: Annotated[float | None, UNSET] = None,
     split: str = "train",
-    out: Annotated[Path | None, UNSET] = None,
+    out: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
     episodes: int = 32,
     frames: int = 12,
-    json: Path | None = None,
-    entry: Path | None = None,
-    registry: Path | None = None,
+    json: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
+    entry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
     """Print what a dataset contains, draw a contact sheet, and suggest its registry entry.
 

@@ -51,7 +51,7 @@ REPORT = 10
 
 
 def data_sim(
-    out: Path,
+    out: Annotated[Path, arg(metavar="DIR")],
     preset: SimPreset = "smoke",
     names: Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET] = (),
     episodes: Annotated[int | None, UNSET] = None,
@@ -119,7 +119,7 @@ def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
     return [spec.name for spec in specs if spec.name not in kept]
 
 
-def data_sim_table(directory: Positional[Path]) -> None:
+def data_sim_table(directory: Annotated[Positional[Path], arg(metavar="DIR")]) -> None:
     """Print frames per second, episode lengths and success rates of `hma data sim`, as Markdown.
 
     Args:

@@ -30,15 +30,17 @@ OTHER_SPLITS = 2
 
 
 def view(
-    datasets: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET [DATASET ...]")],
-    out: Path = Path("runs/view.html"),
+    datasets: Annotated[
+        Positional[tuple[str, ...]], arg(metavar="DATASET [DATASET ...]", help_behavior_hint="(required)")
+    ],
+    out: Annotated[Path, arg(metavar="FILE")] = Path("runs/view.html"),
     split: Annotated[str | None, UNSET] = None,
-    hz: float | None = None,
+    hz: Annotated[float | None, UNSET] = None,
     stride: Annotated[int | None, UNSET] = None,
     frames: int = 12,
     episodes: int = 64,
     shown: int = 6,
-    registry: Path | None = None,
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
     """Write one HTML page about datasets: clips with their actions, statistics, windows, possible issues.
 

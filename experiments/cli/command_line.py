@@ -1,0 +1,156 @@
+"""How command lines are read and helps are printed, for all commands alike; tyro does the rest.
+
+A command is read by itself: an error names its options and its help only, not those of all commands.
+"""
+
+from __future__ import annotations
+
+import inspect
+import io
+import re
+import shutil
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, TextIO, Union, get_args
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.extras import SubcommandApp
+
+VALUES = {int: "N", float: "NUMBER", str: "NAME", Path: "PATH"}
+"""What a help calls a value, where the option itself does not say it."""
+
+BORDER = "│╭╰"
+
+BREAK = "\x00"
+
+
+class Commands(SubcommandApp):
+    """Commands by name, some of them groups of others."""
+
+    def run(self, prog: str, arguments: Sequence[str], description: str | None = None) -> None:
+        """Runs the command that the arguments name. Exits with a message where they are wrong, and after a help."""
+        shown = _wrapped() if {"-h", "--help"} & set(arguments) else nullcontext()
+        with _values(), shown:
+            self._run(prog, list(arguments), description)
+
+    def _run(self, prog: str, arguments: list[str], description: str | None) -> None:
+        found = self._subcommands.get(arguments[0]) if arguments else None
+        if found is None:
+            self._join_lines()
+            self.cli(prog=prog, description=description, args=arguments)
+            return
+        prog, arguments = f"{prog} {arguments[0]}", arguments[1:]
+        if isinstance(found.target, Commands):
+            found.target._run(prog, arguments, found.help)
+        else:
+            _join_lines(found.target)
+            tyro.cli(found.target, prog=prog, description=found.help, args=arguments)
+
+    def _join_lines(self) -> None:
+        for found in self._subcommands.values():
+            if isinstance(found.target, Commands):
+                found.target._join_lines()
+            else:
+                _join_lines(found.target)
+
+
+def joined(doc: str) -> str:
+    """A docstring with every paragraph and every argument on one line, for a help to break where it must, and a
+    default that is told in words at the end as tyro tells others."""
+    lines: list[str] = []
+    arguments = False
+    for line in inspect.cleandoc(doc).splitlines():
+        depth = len(line) - len(line.lstrip())
+        goes_on = depth > 4 if arguments else True
+        if lines and lines[-1] and line and goes_on and lines[-1] != "Args:":
+            lines[-1] += f" {line.strip()}"
+        else:
+            lines.append(line)
+        arguments |= line == "Args:"
+    return "\n".join(re.sub(r"^( +.*) Default: (.*)\.$", r"\1 (default: \2)", line) for line in lines)
+
+
+def _join_lines(function: Callable[..., Any]) -> None:
+    function.__doc__ = joined(function.__doc__ or "")  # where tyro reads the help
+
+
+def wrapped(text: str, width: int) -> str:
+    """A help with the lines outside its boxes broken, which tyro prints as they are."""
+    lines = []
+    for line in text.splitlines():
+        if len(line) <= width or line.startswith(tuple(BORDER)):
+            lines.append(line)
+            continue
+        indent = len("usage: ") * " " if "usage:" in line else ""
+        line = re.sub(r"([,|])(?=\S)", rf"\1 {BREAK}", line)  # names of choices
+        parts = textwrap.wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+        lines += [re.sub(f"(?<=[,|]) {BREAK}|{BREAK}", "", part) for part in parts]
+    return "\n".join(lines) + "\n"
+
+
+class _Caught(io.StringIO):
+    """What is printed, by one who sees the properties of the stream that it is for."""
+
+    def __init__(self, stream: TextIO):
+        super().__init__()
+        self._stream = stream
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    @property
+    def encoding(self) -> str | None:
+        return self._stream.encoding
+
+
+@contextmanager
+def _wrapped() -> Iterator[None]:
+    stream = sys.stdout
+    caught = _Caught(stream)
+    try:
+        with redirect_stdout(caught):
+            yield
+    finally:
+        if text := caught.getvalue():
+            stream.write(wrapped(text, shutil.get_terminal_size().columns))
+
+
+def _values() -> ConstructorRegistry:
+    """Rules that call values as `VALUES` does, and an option that may be left out like any other."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def plain(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        name = VALUES.get(info.type) if isinstance(info.type, type) else None
+        if name is None:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=name,
+            instance_from_str=lambda words: info.type(words[0]),
+            is_instance=lambda value: isinstance(value, (int, float) if info.type is float else info.type),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    @registry.primitive_rule
+    def optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        types = get_args(info.type) if info.type_origin in (Union, UnionType) else ()
+        given = [one for one in types if one is not NoneType]
+        if len(given) != 1 or len(types) != 2:
+            return None
+        spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(given[0], info.markers))
+        if not isinstance(spec, PrimitiveConstructorSpec):
+            return None
+        return replace(
+            spec,
+            is_instance=lambda value: value is None or spec.is_instance(value),
+            str_from_instance=lambda value: ["none"] if value is None else spec.str_from_instance(value),
+        )
+
+    return registry

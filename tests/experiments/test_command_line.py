@@ -1,0 +1,103 @@
+"""Helps and refusals of every command: as wide as the terminal, in words, about that command alone."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from experiments.cli import main as program
+from experiments.cli.command_line import Commands, joined, wrapped
+
+PYTHON = re.compile(r"\b(None|True|False|STR|INT|FLOAT|BOOL|PATH(?!=))\b|\(default: \)|Default: ")
+"""What is no word of a help: types and values of Python, an empty default, a default told in another way."""
+
+
+def names(app: Commands, *before: str) -> Iterator[tuple[str, ...]]:
+    yield before
+    for name, found in app._subcommands.items():
+        if isinstance(found.target, Commands):
+            yield from names(found.target, *before, name)
+        else:
+            yield (*before, name)
+
+
+COMMANDS = list(names(program.app))
+
+
+def said_by(capsys, *arguments: str) -> list[str]:
+    with pytest.raises(SystemExit) as end:
+        program.main(arguments)
+    out, err = capsys.readouterr()
+    assert bool(err) == bool(end.value.code)
+    return (out + err).splitlines()
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_no_line_of_a_help_is_wider_than_the_terminal(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert len(COMMANDS) > 40
+    wide = {" ".join(c): [w for w in said_by(capsys, *c, "--help") if len(w) > columns] for c in COMMANDS}
+    assert not {name: lines for name, lines in wide.items() if lines}
+
+
+def test_a_help_has_no_types_or_values_of_python(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "120")
+    said = {" ".join(c): [w for w in said_by(capsys, *c, "--help") if PYTHON.search(w)] for c in COMMANDS}
+    assert not {name: lines for name, lines in said.items() if lines}
+
+
+def broken(lines: list[str], width: int) -> list[tuple[str, str]]:
+    """Lines that end in the middle of a sentence although the next word had room."""
+    found = []
+    for before, after in zip(lines, lines[1:], strict=False):
+        end, start = before.strip("│ "), after.strip("│ ")
+        same = re.match(r"│? *", before)[0] == re.match(r"│? *", after)[0]
+        if not (same and end and start) or start[0] in "-─•{" or end[-1] in ".)─╮╯" or before.startswith("usage"):
+            continue
+        room = width - 2 * before.startswith("│") - len(before.rstrip("│ "))
+        if len(start.split()[0]) + 1 <= room:
+            found.append((before, after))
+    return found
+
+
+def test_a_help_breaks_no_sentence_where_the_source_does(monkeypatch, capsys):
+    """tokenize said "run", broke the line, and went on with "`hma tokenizer train` first"."""
+    monkeypatch.setenv("COLUMNS", "100")
+    assert broken(["│ --a  hover: hold    │", "│      the tool       │", "│      it             │"], 24)
+    wrong = {" ".join(c): broken(said_by(capsys, *c, "--help"), 100) for c in COMMANDS}
+    assert not {name: lines for name, lines in wrong.items() if lines}
+
+
+def test_lines_of_a_docstring_are_joined():
+    doc = """Do it.
+
+    First this,
+    `then` that.
+
+    Args:
+        one: Of several
+            lines. Default: as in
+            (x).
+        two: Short.
+    """
+    assert joined(doc) == (
+        "Do it.\n\nFirst this, `then` that.\n\nArgs:\n    one: Of several lines. (default: as in (x))\n    two: Short."
+    )
+    assert joined(joined(doc)) == joined(doc)
+
+
+def test_choices_of_a_usage_are_broken_between_names():
+    assert wrapped("usage: hma {one,two,three,four}\n", 20) == "usage: hma {one,\n       two,three,\n       four}\n"
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_a_mistyped_option_is_answered_by_its_own_command(columns, monkeypatch, capsys):
+    """Before, by a screen of options of other commands, and with the help of all of them."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    lines = said_by(capsys, "tokenize", "--preset", "smoke", "--steps", "3")
+    text = "\n".join(lines)
+    assert "--steps" in text and "hma tokenize --help" in text
+    assert len(lines) < 12 and "hma convert" not in text and max(map(len, lines)) <= columns
+    assert "--registry FILE" in "\n".join(said_by(capsys, "data", "inspect", "x", "--registri", "y"))
