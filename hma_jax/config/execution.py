@@ -13,6 +13,9 @@ from hma_jax.config.base import check_fields, require
 
 Dtype = Literal["float32", "bfloat16"]
 
+MAX_THREADS = 1024
+"""Threads that read windows, at most: a system starts only some thousands, and a program that asks for more hangs."""
+
 Remat = Literal["none", "products", "attention", "everything", "offload"]
 """What a block keeps for its backward pass; what it does not keep is computed again.
 
@@ -75,3 +78,7 @@ class ExecutionConfig:
         check_fields(self)
         for name in ("accumulate", "windows_at_once", "loader_threads"):
             require(getattr(self, name) >= 1, f"execution.{name} must be at least 1, got {getattr(self, name)}")
+        require(
+            self.loader_threads <= MAX_THREADS,
+            f"execution.loader_threads must be at most {MAX_THREADS:,}, got {self.loader_threads:,}",
+        )

@@ -102,6 +102,7 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
             r"train.seed must lie in \[0, 2\^32\), got 4294967296",
         ),  # its masks are those of 0
         (EvalConfig, {"seed": 2**64}, r"eval.seed must lie in \[0, 2\^32\)"),
+        (ExecutionConfig, {"loader_threads": 10**6}, "execution.loader_threads must be at most 1,024, got 1,000,000"),
         (EvalConfig, {"batch": 0}, "eval.batch must be at least 1, got 0"),
         (EvalConfig, {"perplexity_group": 0}, "eval.perplexity_group must be at least 1, got 0"),
         (Embodiment, ARM | {"std": (-1.0,)}, r"embodiment 'arm': std must not be negative, got \(-1.0,\)"),
