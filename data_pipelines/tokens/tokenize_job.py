@@ -100,19 +100,21 @@ def tokenize_dataset(
         SkippedEpisodes(source.without_location(reason), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
-    manifest = write_dataset(
-        store_root,
-        plan,
-        cut_parts(source.sizes(), part_size),
-        work.make,
-        skipped=skipped,
-        max_skipped=source.max_skipped if corrupt == "skip" else 0,
-        overwrite=overwrite,
-        wait=wait,
-        progress=progress,
-    )
+    try:
+        manifest = write_dataset(
+            store_root,
+            plan,
+            cut_parts(source.sizes(), part_size),
+            work.make,
+            skipped=skipped,
+            max_skipped=source.max_skipped if corrupt == "skip" else 0,
+            overwrite=overwrite,
+            wait=wait,
+            progress=progress,
+        )
+    finally:  # what was seen of a job that ends here is not read again
+        watch.look()
     source.save_steps()
-    watch.look()
     return manifest
 
 

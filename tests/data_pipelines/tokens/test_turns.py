@@ -99,6 +99,22 @@ def test_tokenising_tells_and_stores_the_same(tmp_path):
     assert len(said) == 1  # nothing was read
 
 
+def test_a_job_that_ends_early_tells_what_it_saw(tmp_path):
+    """It goes on after its finished parts, whose episodes are not read again."""
+
+    def turn(number, features):
+        features["steps/action/part_1"] = episode(number, len(features["steps/action/part_1"]))[:, 2:]
+
+    def stop(done, total):
+        if done:
+            raise KeyboardInterrupt
+
+    directory, said = write_rlds(tmp_path, SPEC, [20] * 8, change=turn), []
+    with pytest.raises(KeyboardInterrupt):
+        tokenize_dataset(SPEC, directory, FakeTokenizer(), tmp_path / "told", warn=said.append, progress=stop)
+    assert len(said) == 1 and "angles = [2]" in said[0]
+
+
 def test_what_is_advised_is_an_entry_that_is_not_told_again(tmp_path):
     watch, said = watched(SPEC, 3)
     watch.look()
