@@ -11,8 +11,8 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,9 @@ def convert(
     )
     if final.exists():
         return _finished(final, fingerprint, source, name)
+    new = [directory for directory in (final.parent, Path(out)) if not directory.exists()]
     with ExitStack() as stack:
+        stack.callback(_remove_empty, new)
         try:
             stack.enter_context(lock_output(final.with_name(f".{VERSION}")))
         except Held as held:
@@ -184,6 +186,13 @@ def _finish(
         stray.unlink(missing_ok=True)
     publish(partial, final)
     return Conversion(final, suggest_spec(source, name), episodes, len(kept), skipped)
+
+
+def _remove_empty(directories: Sequence[Path]) -> None:
+    """Of those, each in the next, what holds nothing."""
+    for directory in directories:
+        with suppress(OSError):
+            directory.rmdir()
 
 
 def _finished(final: Path, fingerprint: str, source: ConvertibleSource, name: str) -> Conversion:

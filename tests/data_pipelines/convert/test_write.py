@@ -174,8 +174,12 @@ def test_an_episode_that_contradicts_the_layout_is_named(tmp_path, change, messa
 
 def test_nothing_left_is_an_error_that_says_why(tmp_path):
     with pytest.raises(DataError, match="no episode can be made from it: 1 x nothing in it"):
+        convert(Counting(units=["u0"]), tmp_path / "new", "toy")
+    assert not any(tmp_path.iterdir()), "a directory that was made for it is left"
+    (tmp_path / "toy").mkdir()
+    with pytest.raises(DataError, match="no episode can be made from it"):
         convert(Counting(units=["u0"]), tmp_path, "toy")
-    assert not any((tmp_path / "toy").iterdir())
+    assert not any((tmp_path / "toy").iterdir()), "one that was there stays"
 
 
 def test_names_and_missing_libraries_are_refused_in_words(tmp_path):
