@@ -22,6 +22,10 @@ FRAME_RATE = 2.0
 """Hz at which the model sees frames unless a study says otherwise (paper section 4)."""
 
 
+MAX_STRIDE = 1_000_000
+"""Native frames per model frame: more than a recording has, and few enough to count with."""
+
+
 NOT_OF_ACTIONS = (
     "name", "image_key", "hz", "rate", "camera", "split", "note", "video_targets", "version", "unverified",
     "episodes", "median_steps", "mean_steps", "val_split", "image_corrections", "joins",
@@ -45,8 +49,20 @@ def stride_of(hz: float, rate: float | None = FRAME_RATE) -> int:
         return 1
     require(rate > 0, f"the frame rate must be positive, in Hz, got {rate}")
     ratio = hz / rate
+    require(
+        ratio <= MAX_STRIDE,
+        f"a frame of the model would span {ratio:.3g} native frames, at {hz:g} Hz and a rate of {rate:g} Hz; at most "
+        f"{MAX_STRIDE:,} are possible: correct hz, which counts native frames per second, or the rate",
+    )
     below = max(int(ratio), 1)
     return below if ratio * ratio <= below * (below + 1) else below + 1
+
+
+def split_camera_key(text: str) -> tuple[str, tuple[str, ...]]:
+    """`image_key` and `image_corrections` of a `DatasetSpec.camera_key`."""
+    words, known = text.split(" "), get_args(ImageCorrection)
+    first = next((i for i in range(1, len(words)) if all(word in known for word in words[i:])), len(words))
+    return " ".join(words[:first]), tuple(words[first:])
 
 
 @dataclass(frozen=True)

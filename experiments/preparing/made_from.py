@@ -86,8 +86,18 @@ def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[
     data = old.pop("data", {}), new.pop("data", {})
     for name in [n for n in data[0] if n in data[1]]:
         known = {fact: value for fact, value in data[1][name].items() if fact in data[0][name]}
-        lines += diff(data[0][name], known, f"data of {name}")
+        lines += diff(_with_corrections(data[0][name]), _with_corrections(known), f"data of {name}")
     return diff(old, new) + lines
+
+
+def _with_corrections(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a dataset, `image_corrections` by their own name, which `image_key` has in the same text (`camera_key`)."""
+    from data_pipelines.registry.spec import split_camera_key
+
+    if not isinstance(facts.get("image_key"), str):
+        return dict(facts)
+    key, corrections = split_camera_key(facts["image_key"])
+    return {**facts, "image_key": key, "image_corrections": list(corrections)}
 
 
 def dataset_differences(existing: Sequence[str], wanted: Sequence[str]) -> list[str]:

@@ -180,6 +180,8 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
         (["{robot}", "--entry", "x.toml"], 2, "add --hz"),
         (["{robot}", "--hz", "-3"], 2, "--hz must be positive"),
         (["{robot}", "--hz", "nan"], 2, "--hz must be positive and finite, got nan"),
+        (["{robot}", "--hz", "1e300"], 2, "a frame of the model would span 5e+299 native frames, at 1e+300 Hz"),
+        (["{robot}/features.json"], 1, "features.json: it is a file, not a directory"),
         (["{robot}", "--frames", "0"], 2, "--frames must be at least 2, got 0"),
         (["{robot}", "--episodes", "0"], 2, "--episodes must be at least 1, got 0"),
         (["{robot}", "--split", "test"], 2, "it has train. Choose one with --split"),

@@ -89,7 +89,8 @@ def resolve_version(directory: str | Location) -> Location:
     """The version directory: `directory` itself or its newest version."""
     directory = locate(directory)
     if not exists(directory, "directory"):
-        raise DataError(f"{directory}: no such directory. Give the path of an RLDS dataset.")
+        what = "it is a file, not a directory" if exists(directory, "file") else "no such directory"
+        raise DataError(f"{directory}: {what}. Give the path of an RLDS dataset.")
     if _has_info(directory):
         return directory
     inside = retry(directory, lambda: list(directory.iterdir()))

@@ -24,6 +24,7 @@ from data_pipelines.registry.openx import OPENX
 from data_pipelines.registry.openx_counts import EPISODES, LONG
 from data_pipelines.registry.openx_more import OPENX_MORE
 from data_pipelines.registry.openx_rest import OPENX_REST
+from data_pipelines.registry.spec import split_camera_key
 from data_pipelines.registry.toml_file import load_entries, put_entry, to_toml
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.embodiments import EMBODIMENTS
@@ -264,6 +265,8 @@ def test_images_are_corrected_as_the_entry_says():
     assert np.array_equal(both.correct(images[0]), images[0, ::-1, ::-1, ::-1])
     assert both.action_layout() == spec.action_layout() and both.facts() != spec.facts()
     assert spec.camera_key == spec.image_key != both.camera_key
+    for one in (spec, both, replace(both, image_key="observation/left camera")):
+        assert split_camera_key(one.camera_key) == (one.image_key, one.image_corrections)
 
 
 @pytest.mark.parametrize("wrong", [("flip",), ("swap_red_blue", "rotate_180"), ("rotate_180", "rotate_180")])
