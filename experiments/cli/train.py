@@ -211,7 +211,7 @@ def _require_free(setting: Setting, run: Path) -> None:
     whole = there == study.root.resolve() or Workspace(run).manifest.exists() or Workspace(run).record.exists()
     require(
         not whole and there not in [part.resolve() for part in parts],
-        f"--run {short(run)} is {'the directory of a study' if whole else 'a place of the study for what it makes'}; give "
+        f"--run {short(run)} is {'the directory of a study' if whole else 'a directory that the study keeps for itself'}; give "
         f"the run a directory of its own, such as {short((run if whole else study.root) / 'model')}",
     )
 

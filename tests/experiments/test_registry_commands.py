@@ -180,7 +180,6 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
         (["{robot}", "--entry", "x.toml"], 2, "add --hz"),
         (["{robot}", "--hz", "-3"], 2, "--hz must be positive"),
         (["{robot}", "--hz", "nan"], 2, "--hz must be positive and finite, got nan"),
-        (["{robot}", "--hz", "1e300"], 2, "a frame of the model would span 5e+299 native frames, at 1e+300 Hz"),
         (["{robot}/features.json"], 1, "features.json: it is a file, not a directory"),
         (["{robot}", "--frames", "0"], 2, "--frames must be at least 2, got 0"),
         (["{robot}", "--episodes", "0"], 2, "--episodes must be at least 1, got 0"),
@@ -193,6 +192,13 @@ def test_mistakes_are_one_message(arguments, code, message, robot, capsys):
     assert main(["data", "inspect", *(a.format(robot=robot) for a in arguments)]) == code
     said = capsys.readouterr().err
     assert said.startswith("error: ") and message in said
+
+
+def test_a_rate_that_no_recording_has_is_refused_before_anything_is_read(robot, capsys):
+    assert main(["data", "inspect", str(robot), "--hz", "1e300"]) == 2
+    told = capsys.readouterr()
+    assert "error: a frame of the model would span 5e+299 native frames, at 1e+300 Hz and a rate of 2 Hz" in told.err
+    assert not told.out
 
 
 def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path, capsys):

@@ -120,9 +120,11 @@ def data_inspect(
     """
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry
+    from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_reader
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
+    stride_of(hz or 1)  # raises before the dataset is read
     require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
     require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
     use_entries(registry)
