@@ -99,11 +99,10 @@ def to_official(run: RunDirectory, out: Directory, weights: Weights = "auto") ->
     for remark in write_official(loaded, out):
         say(f"note: {remark}")
     _describe(loaded)
-    again = f"hma convert from-official {_quoted(out)} --out RUN"
-    if loads_in_release(read_config(out)):
-        name = "STMAR" if loaded.model.diffusion else "STMaskGIT"
-        again = f"load it in the official release with {name}.from_pretrained({str(out)!r}), or read it again: {again}"
-    wrote(out, then=again)
+    name = "STMAR" if loaded.model.diffusion else "STMaskGIT"
+    loads = f"the official release loads it with {name}.from_pretrained({str(out)!r}); "
+    back = f"`hma convert from-official {_quoted(out)} --out RUN` makes a run of it again"
+    wrote(out, about=(loads if loads_in_release(read_config(out)) else "") + back)
 
 
 @convert_app.command(name="to-safetensors")
@@ -122,8 +121,8 @@ def to_safetensors(run: RunDirectory, out: Directory, weights: Weights = "auto")
     loaded = load_run(run, weights)
     write_neutral(loaded, out)
     _describe(loaded)
-    back = f"hma convert from-safetensors {_quoted(out)} --out RUN"
-    wrote(out, then=f"{_quoted(out / 'model.json')} explains the weights; back with {back}")
+    back = f"`hma convert from-safetensors {_quoted(out)} --out RUN` makes a run of them again"
+    wrote(out, about=f"{out / 'model.json'} explains the weights; {back}")
 
 
 @convert_app.command(name="from-safetensors")
@@ -140,7 +139,7 @@ def from_safetensors(directory: Annotated[Positional[Path], arg(metavar="DIR")],
     run = read_neutral(directory)
     write_run(run, out)
     _describe(run)
-    wrote(out, then=f"hma evaluate {_quoted(out)} with the --preset and --out of its study")
+    wrote(out, about=f"`hma evaluate {_quoted(out)} --preset PRESET --out OUT` evaluates it, with those of its study")
 
 
 @convert_app.command(name="to-stablehlo")
@@ -187,7 +186,7 @@ def to_stablehlo(
     config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
     write_stablehlo(loaded, out, config)
     _describe(loaded)
-    wrote(out, then=f"read {_quoted(out / 'model.json')} for the program's inputs and outputs")
+    wrote(out, about=f"{out / 'model.json'} lists the program's inputs and outputs")
 
 
 def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> DecodeConfig:

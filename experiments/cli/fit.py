@@ -127,7 +127,7 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
         f"{curve.name} at {prediction.position}: {prediction.mean:.4f} nats per token, "
         f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}"
     )
-    wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit, and only then run the trials")
+    wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit", about="run the trials only then")
 
 
 def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: str) -> tuple[Curve, list[Position]]:

@@ -94,7 +94,9 @@ def judge(
     from experiments.applications.judging.judge import judge_recorded, judge_run
     from experiments.applications.judging.ladder import LadderConfig
     from experiments.applications.judging.real import read_real
-    from experiments.applications.policies.tasks import AnyTask, RecordedTask, find_task
+    from experiments.applications.policies.tasks import ROBOTS, AnyTask, RecordedTask, find_task
+    from hma_jax.simulator.robots import require_robot
+    from hma_jax.training.runs import load_run
 
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
@@ -104,6 +106,8 @@ def judge(
     })  # fmt: skip
     defaults = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
     if recordings is None:
+        if robot not in ROBOTS:
+            require_robot(robot, load_run(run).table.names)
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
         defaults[2:] = 0, 0  # recordings have no expert to clone
@@ -184,8 +188,8 @@ def _write_results(judged: Judgement, counts: Mapping[str, Count] | None, out: P
     page = write_page(judged, summary, out, again)
     blind = write_blind(judged, out)
     _print_summary(summary)
-    then = f"label the clips of {blind}, and the same command with --labels labels.json"
-    wrote(out / "outcomes.csv", out / "agreement.json", page, blind, then=then)
+    about = f"a person can label the clips of {blind}; the same command with --labels labels.json compares the labels"
+    wrote(out / "outcomes.csv", out / "agreement.json", page, blind, about=about)
 
 
 def _print_summary(summary: dict) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -140,3 +141,10 @@ class Robot:
 def rest_action(low: Sequence[float], high: Sequence[float], mean: Sequence[float]) -> tuple[float, ...]:
     """The action to begin with: 0 where the range contains it, otherwise the mean, clipped to the range."""
     return tuple(0.0 if a <= 0 <= b else min(max(m, a), b) for a, b, m in zip(low, high, mean, strict=True))
+
+
+def require_robot(name: str, known: Sequence[str]) -> None:
+    """Raises ConfigError for a name that is none of the model's robots, and says which one may be meant."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
+    require(name in known, f"the model has no robot {name!r}; {hint}")

@@ -22,7 +22,7 @@ from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, find_robots, find_starts, find_tokenizer
 from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_start, read_only, whole_numbers
 from hma_jax.simulator.programs import Programs, ResetInputs, padded
-from hma_jax.simulator.robots import Outside, Robot
+from hma_jax.simulator.robots import Outside, Robot, require_robot
 from hma_jax.simulator.starts import Start
 from hma_jax.tokenizers.base import token_mismatch
 from hma_jax.tokenizers.shared import BaseTokenizer
@@ -141,7 +141,7 @@ class Simulator:
 
     def robot(self, name: str) -> Robot:
         """Raises ConfigError for one that the model does not know or that has no actions."""
-        require(name in self.robots, f"the model has no robot {name!r}; it has {', '.join(self.robots)}")
+        require_robot(name, tuple(self.robots))
         return self.robots[name]
 
     # --- Beginning ---------------------------------------------------------------------------------

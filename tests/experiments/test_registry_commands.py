@@ -6,6 +6,8 @@ import errno
 import json
 import os
 import shlex
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,10 +18,11 @@ import pytest
 from PIL import Image
 
 from data_pipelines.inspection.inspect import ExampleEpisode
-from data_pipelines.registry import get_spec, toml_file
+from data_pipelines.registry import get_spec, known_groups, toml_file
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments import run_study
+from experiments.cli.data import registry as registry_commands
 from experiments.cli.data.registry import _write_entry
 from experiments.cli.main import main
 from experiments.contact_sheet import TILE, draw_sheet
@@ -60,6 +63,40 @@ def test_list_is_filtered_by_words_and_mixture(capsys):
     assert main(["data", "list", "open-x", "wrist"]) == 0
     assert "berkeley_mvp" in capsys.readouterr().out
     assert main(["data", "list", "no_such_word"]) == 2
+
+
+@pytest.mark.parametrize("width", [60, 80, 110, 160])
+def test_names_in_a_list_are_whole_at_any_width(width, monkeypatch, capsys):
+    """They are names of directories. At 80 columns "fractal20220817_da" and "ta" stood in two lines."""
+    monkeypatch.setattr(registry_commands.console, "width", width)
+    assert main(["data", "list", "open-x"]) == 0
+    said = capsys.readouterr().out
+    assert not [line for line in said.splitlines() if len(line.rstrip()) > max(width, 70)]
+    words = set(said.split())
+    assert not [spec.name for spec in known_groups()["Open-X (Open X-Embodiment)"] if spec.name not in words]
+
+
+def test_what_is_piped_is_as_wide_as_columns_says():
+    program = "from experiments.progress import console; print(console.width)"
+    for columns, width in (("80", 80), ("", 110)):
+        environment = {**os.environ, "COLUMNS": columns}
+        said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+        assert said.stdout == f"{width}\n", said.stderr
+
+
+def test_an_entry_that_a_file_has_already_is_left_with_its_comments(robot, tmp_path, capsys):
+    file = tmp_path / "my.toml"
+    asked = ["data", "inspect", str(robot), "--hz", "4", "--entry", str(file), "--out", str(tmp_path)]
+    assert main(asked) == 0
+    assert f"wrote {file}" in capsys.readouterr().out
+    file.write_text(text := file.read_text().replace("hz = 4", "# as the driver says\nhz = 4"))
+    assert main(asked) == 0
+    said = capsys.readouterr().out
+    assert f"unchanged: {file} has this entry of my_robot" in said and f"wrote {file}" not in said
+    assert file.read_text() == text
+    file.write_text(text + 'image_corrections = ["rotate_180"]\n')
+    assert main(asked) == 0
+    assert "this replaced the file's entry of my_robot (old -> new): image_corrections" in capsys.readouterr().out
 
 
 def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, capsys):
@@ -119,7 +156,7 @@ def test_inspection_says_that_nothing_is_a_camera_and_not_that_the_rate_is_missi
     assert "observation/image" in said.out and not (tmp_path / "my.toml").exists()
     assert main(["data", "view", str(robot), "--hz", "4", "--out", str(tmp_path / "view.html")]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "no camera: none of its fields" in said and "next for my_robot: leave it out" in said
+    assert "no camera: none of its fields" in said and "note for my_robot: leave it out" in said
 
 
 def test_a_single_episode_does_not_lead_to_a_command_that_refuses_it(tmp_path, capsys):
@@ -131,7 +168,7 @@ def test_a_single_episode_does_not_lead_to_a_command_that_refuses_it(tmp_path, c
     viewed = ["data", "view", str(one), "--registry", entries, "--out", str(tmp_path / "view.html")]
     assert main(viewed) == 0
     for said in (inspected, capsys.readouterr().out):
-        assert said.splitlines()[-1].startswith("next: add another dataset")
+        assert said.splitlines()[-1].startswith("note: add another dataset")
 
 
 def test_inspection_of_short_episodes_suggests_a_prompt_that_leaves_a_frame_to_judge(robot, tmp_path, capsys):

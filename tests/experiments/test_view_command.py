@@ -136,7 +136,7 @@ def test_a_dataset_without_windows_gets_a_command_that_finds_some(toy, tmp_path,
     assert "toy: no window: the shortest window at stride 16 needs 32 steps; the longest of 4 episodes has 31" in said
     assert "hma tokenize" not in said
     assert re.search(
-        r"next for toy: hma data view \S+ --stride 1 --registry \S+  \(the shortest window at stride 16 needs 32 steps",
+        r"next for toy: hma data view \S+ --stride 1 --registry \S+  # the shortest window at stride 16 needs 32 steps",
         said,
     )
     assert main([*arguments, "--stride", "1"]) == 0

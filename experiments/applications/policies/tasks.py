@@ -22,6 +22,9 @@ TASKS = (OWN, REACH, HOVER)
 EXPERTS = {name: spec for name, spec in PHYSICS.items() if spec.success and spec.expert}
 """Robots of physics simulators that say when their one task is done, and of which there is an expert."""
 
+ROBOTS = (*SPECS, *EXPERTS)
+"""All that have a task."""
+
 PHYSICS_FRAMES = 24
 """Half as many again as an undisturbed expert takes to open the drawer, at 4 frames a second. Of other robots and rates
 nothing was measured: give `frames`."""
@@ -77,10 +80,10 @@ class Task:
 
     def __post_init__(self):
         require(
-            self.robot in SPECS or self.robot in EXPERTS,
+            self.robot in ROBOTS,
             f"robot {self.robot!r} has no task: a task needs a true simulator, which says when it is done, and a "
-            f"scripted expert. These exist for {', '.join([*SPECS, *EXPERTS])}; for other robots use `hma judge "
-            "--recordings`",
+            f"scripted expert. These exist for the robots of the suite (docs/suite.md), {', '.join(EXPERTS)}; for other "
+            "robots use `hma judge --recordings`",
         )
         known = TASKS if self.in_suite else (OWN,)
         require(self.name in known, f"{self.robot} has no task {self.name!r}; it has {', '.join(known)}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from experiments.presets import ON_ACCELERATORS, get_preset
+from experiments.program import PROGRAM
 from experiments.progress import console
 from experiments.setting import Preset, StudyArguments, command
 
@@ -26,7 +27,7 @@ def say_next(
     """Prints the command that tokenises `datasets`, by the preset that is the default and by the one for a GPU or TPU,
     or what to do before. The other arguments are those of `tokenize_command`."""
     if first := single_episode(datasets):
-        console.print(Text(f"next: {first}"), soft_wrap=True)
+        print_next(first)
         return
     default = StudyArguments.preset
     for preset, when in ((default, "next"), (ON_ACCELERATORS[default], "or, on a GPU or TPU")):
@@ -62,6 +63,12 @@ def tokenize_command(
     return command("tokenize", *arguments.words())
 
 
+def print_next(words: str, name: str = "") -> None:
+    """Prints the command that comes next, for the dataset `name` of several; advice that is none as a note."""
+    label = "next" if words.startswith(f"{PROGRAM} ") else "note"
+    console.print(Text(f"{label}{name and f' for {name}'}: {words}"), soft_wrap=True)
+
+
 def single_episode(directories: Sequence[Facts]) -> str | None:
     """What to do where the datasets hold a single episode together, of which none can be held out; else None."""
     if sum(facts.episodes for facts in directories) != 1 or len(directories[0].splits) > 1:
@@ -79,8 +86,8 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
         return "leave it out: no episode has more than one step, so there is no motion to learn"
     words = command("data view", facts.directory, "--stride", "1", *known)
     return (
-        f"{words}  (the shortest window at stride {stride} needs {2 * stride} steps, the longest episode that was read has "
-        f"{longest}: use every frame, or correct the rate with --hz)"
+        f"{words}  # the shortest window at stride {stride} needs {2 * stride} steps, the longest episode that was read has "
+        f"{longest}: use every frame, or correct the rate with --hz"
     )
 
 
@@ -95,4 +102,4 @@ def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | N
     if known.joins:
         return f"correct hz in the entry of {known.name}, by which a study reads this at {known.hz:g} Hz, not {hz:g}"
     words = command("data inspect", facts.directory, "--hz", f"{hz:g}", "--entry", registry or ENTRIES)
-    return f"{words}  (its entry says {known.hz:g} Hz, which a study uses, not {hz:g}; this writes another entry)"
+    return f"{words}  # its entry says {known.hz:g} Hz, which a study uses, not {hz:g}; this writes another entry"

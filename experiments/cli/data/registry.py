@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.markup import escape
-from rich.text import Text
+from rich.measure import Measurement
+from rich.padding import Padding
 from tyro.conf import Positional, arg
 
 from data_pipelines.errors import MAX_LISTED
-from experiments.cli.data.next_command import no_window, other_rate, say_next
+from experiments.cli.data.next_command import no_window, other_rate, print_next, say_next
 from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, say_unmatched, use_entries
 from experiments.words import few
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
 
 SHEET = "contact_sheet.png"
+
+WIDE = 10_000
+"""Columns at which every table has room."""
 
 
 def data_list(
@@ -53,7 +57,12 @@ def data_list(
         found = [s for s in specs if _fits(s, title, words) and (chosen is None or s.name in chosen)]
         shown += len(found)
         if found:
-            console.print(_table_of(title, found))
+            table = _table_of(title, found)
+            whole = Measurement.get(console, console.options.update_width(WIDE), table).minimum
+            if whole <= console.width:
+                console.print(table)
+            else:
+                _print_list(title, found)
     if not shown:
         raise ConfigError(f"no entry contains {' and '.join(map(repr, words))}; `hma data list` shows all")
     console.print(
@@ -69,23 +78,37 @@ def _fits(spec: DatasetSpec, title: str, words: Sequence[str]) -> bool:
     return all(word.lower() in text for word in words)
 
 
+def _print_list(title: str, specs: Sequence[DatasetSpec]) -> None:
+    """What `_table_of` shows, where its names have no room: they are names of directories, and never broken."""
+    console.print(f"[italic]{escape(title)}[/]")
+    for spec in specs:
+        cells = _cells(spec)
+        numbers = f"{cells[1]} dims, {cells[2]} Hz, stride {cells[3]}, {cells[4]} episodes of {cells[5]} steps"
+        console.print(f"[bold]{escape(spec.name)}[/]", soft_wrap=True)
+        console.print(Padding(f"{numbers}, {'; '.join(filter(None, cells[6:]))}", (0, 0, 0, 4)))
+    console.print()
+
+
+def _cells(spec: DatasetSpec) -> tuple[str, ...]:
+    unsure = f" [dim]* {escape(spec.unverified)}[/]" if spec.unverified else ""
+    return (
+        spec.name,
+        f"{spec.action_dim}",
+        f"{spec.hz:g}",
+        f"{spec.stride}",
+        f"{spec.episodes:,}" if spec.episodes else "?",
+        f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
+        spec.image_key.removeprefix("observation/"),
+        escape(", ".join(filter(None, (spec.note, _joined(spec))))) + unsure,
+    )
+
+
 def _table_of(title: str, specs: Sequence[DatasetSpec]):
     table = tidy_table(title, "name", "dims", "Hz", "stride", "episodes", "steps")
-    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
     table.add_column("image", overflow="fold")
     table.add_column("what it is", min_width=30)
     for spec in specs:
-        unsure = f" [dim]* {escape(spec.unverified)}[/]" if spec.unverified else ""
-        table.add_row(
-            spec.name,
-            f"{spec.action_dim}",
-            f"{spec.hz:g}",
-            f"{spec.stride}",
-            f"{spec.episodes:,}" if spec.episodes else "?",
-            f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
-            spec.image_key.removeprefix("observation/"),
-            escape(", ".join(filter(None, (spec.note, _joined(spec))))) + unsure,
-        )
+        table.add_row(*_cells(spec))
     return table
 
 
@@ -285,6 +308,9 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
     spec = suggestion.spec()
     with lock_output(path, wait=True):  # another process may add its own at the same moment
         old = [entry for entry in load_entries(path) if entry.name == spec.name] if path.exists() else []
+        if old == [spec]:  # its comments and its order stay
+            say(f"unchanged: {path} has this entry of {spec.name}")
+            return
         write_file(path, put_entry(path.read_text(encoding="utf-8") if path.exists() else "", spec, str(path)))
     wrote(path)
     if lines := [line for entry in old for line in diff(entry, spec)]:
@@ -300,5 +326,4 @@ def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, f
     if windows.total and not first:
         say_next([facts], windows.frames, entries, facts.lengths.longest // windows.stride)
     else:
-        words = first or no_window(facts, windows.stride, entries)
-        console.print(Text(f"next: {words}"), soft_wrap=True)
+        print_next(first or no_window(facts, windows.stride, entries))

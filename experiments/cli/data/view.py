@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.markup import escape
-from rich.text import Text
 from tyro.conf import Positional, arg
 
-from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, say_next
+from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, print_next, say_next
 from experiments.progress import console, step
 from experiments.setting import UNSET, command, say_unmatched, use_entries
 from experiments.wrote import wrote
@@ -158,16 +157,16 @@ def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None)
             after = "leave it out, or write it again with its pictures stored as images: it has no camera"
         elif not v.registered:
             words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", file)
-            after = f"{words}  (it is not in the registry; this writes its entry)"
+            after = f"{words}  # it is not in the registry; this writes its entry"
         elif any(r.title == MISFIT for r in v.issues):
-            after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
+            after = f"{command('data inspect', f.directory)}  # it says what the registry's entry should be"
         elif first := other_rate(f, v.hz, registry):
             after = first
         elif not window_facts(f, v.stride, frames).total:
             after = no_window(f, v.stride, registry)
         elif v.stride != v.entry.stride and v.entry.rate is not None:
             after = (
-                f"no command: its entry sets rate = {v.entry.rate:g} Hz, so a study reads it at stride {v.entry.stride}, "
+                f"its entry sets rate = {v.entry.rate:g} Hz, so a study reads it at stride {v.entry.stride}, "
                 "whatever the study's rate"
             )
         else:
@@ -175,6 +174,6 @@ def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None)
             usable.setdefault(rate, []).append(f)
             longest[rate] = min(longest.get(rate, frames), f.lengths.longest // v.stride)
             continue
-        console.print(Text(f"next for {f.name}: {after}"), soft_wrap=True)
+        print_next(after, f.name)
     for rate, facts in usable.items():
         say_next(facts, frames, registry, longest[rate], rate)

@@ -173,6 +173,16 @@ def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+def test_a_misspelt_robot_is_told_those_of_the_model(study, tmp_path, capsys):
+    """Before, fifty robots with tasks, none of which the model had."""
+    for name, hint in (("berkeley_gnm_cory_hal", f"did you mean {SPEC.name}?"), ("x", f"it has {SPEC.name}")):
+        assert main(["judge", str(study / "model"), "--robot", name, "--out", str(tmp_path / "out")]) == 2
+        assert f"the model has no robot {name!r}; {hint}" in said(capsys, error=True)
+    assert main(["judge", str(study / "model"), "--robot", SPEC.name, "--out", str(tmp_path / "out")]) == 2
+    told = said(capsys, error=True)
+    assert "has no task" in told and "pusher_sand" not in told
+
+
 @pytest.mark.parametrize("flag", ["--real", "--registry", "--split", "--reward"])
 def test_what_is_of_recordings_is_refused_without_them(tmp_path, capsys, flag):
     asked = ["--robot", "pusher_sand", "--out", str(tmp_path / "out"), flag, "1"]
