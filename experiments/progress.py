@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,8 +26,7 @@ class _Output(Console):
         raise
 
 
-_sized = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()  # otherwise nobody says how wide
-console = _Output(highlight=False, width=None if _sized else 110)
+console = _Output(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)
 
 FOLDED = 16

@@ -29,6 +29,9 @@ BORDER = "│╭╰"
 
 BREAK = "\x00"
 
+STYLE = re.compile("\x1b\\[[0-9;]*m")
+"""What a terminal takes for colours."""
+
 
 class Commands(SubcommandApp):
     """Commands by name, some of them groups of others."""
@@ -83,11 +86,12 @@ def _join_lines(function: Callable[..., Any]) -> None:
 def wrapped(text: str, width: int) -> str:
     """A help with the lines outside its boxes broken, which tyro prints as they are."""
     lines = []
-    for line in text.splitlines():
+    for styled in text.splitlines():
+        line = STYLE.sub("", styled)
         if len(line) <= width or line.startswith(tuple(BORDER)):
-            lines.append(line)
+            lines.append(styled)
             continue
-        indent = len("usage: ") * " " if "usage:" in line else ""
+        indent = len("usage: ") * " " if line.startswith("usage: ") else ""
         line = re.sub(r"([,|])(?=\S)", rf"\1 {BREAK}", line)  # names of choices
         parts = textwrap.wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
         lines += [re.sub(f"(?<=[,|]) {BREAK}|{BREAK}", "", part) for part in parts]

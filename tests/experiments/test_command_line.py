@@ -92,6 +92,14 @@ def test_choices_of_a_usage_are_broken_between_names():
     assert wrapped("usage: hma {one,two,three,four}\n", 20) == "usage: hma {one,\n       two,three,\n       four}\n"
 
 
+def test_colours_of_a_terminal_count_for_nothing():
+    """Lines of a box were broken in the middle on a terminal, as their codes made them look wider than it."""
+    box = "\x1b[37;2m│\x1b[0m \x1b[1m--out\x1b[0m  here \x1b[37;2m│\x1b[0m"
+    narrow = "\x1b[2ma\x1b[0m \x1b[2mb\x1b[0m"
+    assert wrapped(f"{box}\n{narrow}\n", 12) == f"{box}\n{narrow}\n"
+    assert wrapped("\x1b[1musage:\x1b[0m hma [-h] {a,b} RUN\n", 16) == "usage: hma [-h]\n       {a,b}\n       RUN\n"
+
+
 @pytest.mark.parametrize("columns", [80, 120])
 def test_a_mistyped_option_is_answered_by_its_own_command(columns, monkeypatch, capsys):
     """Before, by a screen of options of other commands, and with the help of all of them."""

@@ -6,8 +6,6 @@ import errno
 import json
 import os
 import shlex
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -74,14 +72,6 @@ def test_names_in_a_list_are_whole_at_any_width(width, monkeypatch, capsys):
     assert not [line for line in said.splitlines() if len(line.rstrip()) > max(width, 70)]
     words = set(said.split())
     assert not [spec.name for spec in known_groups()["Open-X (Open X-Embodiment)"] if spec.name not in words]
-
-
-def test_what_is_piped_is_as_wide_as_columns_says():
-    program = "from experiments.progress import console; print(console.width)"
-    for columns, width in (("80", 80), ("", 110)):
-        environment = {**os.environ, "COLUMNS": columns}
-        said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-        assert said.stdout == f"{width}\n", said.stderr
 
 
 def test_an_entry_that_a_file_has_already_is_left_with_its_comments(robot, tmp_path, capsys):
