@@ -4,8 +4,9 @@ for garbage.
 XLA's CPU backend takes its temporary buffers anew for every call. glibc gives blocks of that
 size back to the kernel and asks for them again, and the page faults are then a third of a
 training step. Pages of 2 MiB make them few, and a heap that keeps what is freed needs none.
-With one arena for all threads not even small blocks go back, but several threads then wait for
-one another: that is for processes of one core. docs/performance.md has the figures.
+All threads share one heap: a block that is larger than a thread's own heap may be, 64 MiB, would be
+mapped anew in every call, whatever the other settings say, and a virtual machine whose host takes back
+pages as soon as they are free has to ask for each of them. docs/performance.md has the figures.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ TUNABLES = (
     "glibc.malloc.mmap_max=0",  # large blocks come from the heap too
     f"glibc.malloc.trim_threshold={2**36}",  # which does not shrink
     f"glibc.malloc.top_pad={2**28}",  # and grows by so much
+    "glibc.malloc.arena_max=1",  # for the blocks of all threads
 )
 
 KEPT_PAGES = {"GLIBC_TUNABLES": ":".join(TUNABLES)}
@@ -40,14 +42,14 @@ def restart_keeping_pages() -> None:
     Returns where it is so already: the tunables are set, as the user wants them or by an earlier
     call. Does nothing where the C library is not glibc.
     """
-    if "GLIBC_TUNABLES" not in os.environ and _is_glibc():
+    if "GLIBC_TUNABLES" not in os.environ and is_glibc():
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | KEPT_PAGES)
 
 
 def keep_freed_memory() -> None:
     """For a process of one core; call before the first computation. Does nothing where the C library is
     not glibc."""
-    if not _is_glibc():
+    if not is_glibc():
         return
     mallopt = ctypes.CDLL(None).mallopt
     mallopt(_M_MMAP_MAX, 0)
@@ -62,5 +64,5 @@ def collect_rarely() -> None:
         gc.set_threshold(NEW_OBJECTS)
 
 
-def _is_glibc() -> bool:
+def is_glibc() -> bool:
     return platform.libc_ver()[0] == "glibc"
