@@ -108,6 +108,39 @@ def test_the_page_of_speed_shows_the_release_on_two_cores():
     assert "its frame took {:.2f} s with and {:.2f} s without, its step {:.2f} and {:.2f} s".format(*huge) in page
 
 
+def test_the_speed_on_a_processor_with_avx512():
+    def medians(name: str) -> dict[str, tuple[float, float]]:
+        record = read_record(BENCH.parent / "avx512" / f"{name}.json")
+        return {s.name: (s.timing.median, s.timing.p90) for s in record.stages}
+
+    newest = medians("release-base-float32-cpu")
+    before = [medians(f"release-before-{n}-efeaa246e532") for n in (1, 2)]
+    latents = medians("release-continuous-efeaa246e532")
+    rows = table(SPEED, "| stage | the release, `2df38753e8bf` | here |")
+    few = "continuous fill, 10 evaluations by dpm++"
+    shown = {"continuous few" if label == few else label: cells for label, cells in rows.items()}
+    assert shown.keys() == RELEASE_STAGES.keys()
+    for stage, (release, here, times, earlier) in shown.items():
+        runs = before if stage in timed_stages(newest) else [latents]
+        assert earlier == ", ".join(f"{times_longer(run, stage):.2f}" for run in runs), stage
+        if stage in timed_stages(newest):
+            theirs, ours = newest[RELEASE_PREFIX + RELEASE_STAGES[stage]][0], newest[OUR_PREFIX + stage][0]
+            assert (release, here) == (f"{1e3 * theirs:,.0f} ms", f"{1e3 * ours:,.0f} ms"), stage
+            assert times == f"{theirs / ours:.2f}", stage
+    ratios = (
+        f"{times_longer(newest, 'fill'):.1f}, {times_longer(newest, 'slide'):.1f}, {times_longer(newest, 'step'):.2f}"
+    )
+    assert f"With AVX-512: {ratios}." in " ".join(README.read_text().split())
+    steps = [times_longer(run, "step") for run in (newest, *before)]
+    page = " ".join(SPEED.read_text().split())
+    assert f"our step is {min(steps):.1f} to {max(steps):.1f} times as fast" in page
+
+
+def timed_stages(run: dict[str, tuple[float, float]]) -> set[str]:
+    """Our stages that a run timed."""
+    return {name.removeprefix(OUR_PREFIX) for name in run if name.startswith(OUR_PREFIX)}
+
+
 SUMMED = STAGES | {
     "a frame of latents while it fills, as released: DDPM, 100 steps": "continuous fill",
     "the same by DPM++, 10 steps": "continuous few",
@@ -133,7 +166,7 @@ def test_the_summary_of_speed_gives_the_range_of_four_runs():
     readme = " ".join(README.read_text().split())
     said = [[times_longer(run, stage) for run in before] for stage in ("fill", "slide", "step")]
     ranges = [f"{min(x):.{d}f}-{max(x):.{d}f}" for x, d in zip(said, (1, 1, 2), strict=True)]
-    assert f"Three earlier runs: {', '.join(ranges)} times." in readme
+    assert f"Three earlier runs: {', '.join(ranges)}." in readme
     assert f"frames {min(said[1]):.1f} to " in readme
 
 
