@@ -16,7 +16,7 @@ from hma_jax.config import MaskingConfig, ModelConfig, OptimizerConfig, TrainCon
 from hma_jax.diagnostics.coordinate_check import Size, measure
 
 FRAMES, TOKENS = 3, 16
-"""Largest window, in frames and tokens per frame. How sizes depend on the width does not depend on it."""
+"""Largest window, in frames and tokens per frame. A short window shows the same powers of the width."""
 
 BATCH = 4
 """Windows, which the models learn by heart."""
@@ -45,9 +45,7 @@ def measure_widths(
 ) -> list[Size]:
     """The sizes of activations of the study's model at `widths`, with its optimiser and its setting of masking. Windows
     are short and random, of one robot. `report` is called with (widths that are done, all of them, the next)."""
-    model = replace(
-        study.model, frames=min(study.model.frames, FRAMES), tokens=min(study.model.tokens, TOKENS)
-    )  # fmt: skip
+    model = replace(study.model, frames=min(study.model.frames, FRAMES), tokens=min(study.model.tokens, TOKENS))
     train = TrainConfig(
         steps=steps,
         batch=BATCH,

@@ -19,14 +19,17 @@ def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
     height, width = setting.study.tokenizer.image_shape
     widest = max(trials, key=lambda trial: (trial.model.width, trial.model.layers, len(trial.datasets)))
     caps = [trial.max_trajectories for trial in trials]
-    most = "all" if None in caps else f"at most {max(caps):,}"
+    some = any(trial.capped for trial in trials)  # a cap that holds for some datasets leaves the others whole
+    most = "all" if None in caps or some else f"at most {max(caps):,}"
+    steps = sorted({trial.train.steps for trial in trials})
+    longest = f"{'up to ' * (len(steps) > 1)}{counted(steps[-1], 'step')}"
     models = "a model of" if len({trial.model for trial in trials}) == 1 else "models of up to"
     name = setting.arguments.preset
     instead = ON_ACCELERATORS.get(name)
     advice = f". It is made for a processor: on a GPU or TPU take --preset {instead}" if instead else ""
     say(
         f"note: preset {name} trains {models} {in_thousands(count_parameters(widest))} parameters on images of {height} x "
-        f"{width} pixels, for {counted(widest.train.steps, 'step')} of {counted(widest.train.batch, 'window')}, with {most} "
+        f"{width} pixels, for {longest} of {counted(widest.train.batch, 'window')}, with {most} "
         f"trajectories of each dataset{advice}"
     )
 

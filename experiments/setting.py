@@ -178,13 +178,15 @@ def use_entries(registry: Path | None) -> None:
 
 
 def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
-    """Says which of the datasets `names` are read by the project's own entries, where the file has unused ones: the
-    heading of such a one may be misspelt, which reads as an entry of another dataset."""
+    """Says which of the datasets `names` (in their files) are read by the project's own entries, where the file has
+    unused ones: the heading of such a one may be misspelt, which reads as an entry of another dataset."""
     if registry is None:
         return
-    from data_pipelines.registry import find_spec
+    from data_pipelines.registry import all_specs, find_spec
     from data_pipelines.registry.toml_file import load_entries
 
+    joining = {part: spec.name for spec in all_specs() for part in spec.joins}
+    names = [joining.get(name, name) for name in names]
     given = [entry.name for entry in load_entries(registry)]
     unused, own = [n for n in given if n not in names], [n for n in names if n not in given and find_spec(n)]
     if unused and own:

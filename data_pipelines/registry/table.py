@@ -48,6 +48,9 @@ def get_spec(name: str) -> DatasetSpec:
     table = _table()
     if name in table:
         return table[name]
+    joined = next((spec.name for spec in table.values() if name in spec.joins), None)
+    if joined is not None:
+        raise ConfigError(f"{name!r} is no dataset by itself: the entry {joined!r} joins it; name {joined!r}")
     names = [*table, *(part for spec in table.values() for part in spec.joins)]
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
     if close:

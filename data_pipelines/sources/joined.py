@@ -109,7 +109,7 @@ class JoinedSource(EpisodeSource):
     def without_location(self, reason: str) -> str:
         """With the name of the part in place of where it lies."""
         for part in sorted(self.parts, key=lambda part: len(str(part.location)), reverse=True):
-            reason = reason.replace(str(part.location), part.name)
+            reason = reason.replace(str(part.location), part.name) if part.location.name else reason
         return reason
 
     def _part(self, i: int) -> tuple[EpisodeSource, int]:
@@ -125,5 +125,5 @@ class JoinedSource(EpisodeSource):
             require(
                 part.hz == known[0].hz,
                 f"{self.name} joins recordings of different rates: {known[0].location} at {known[0].hz:g} Hz, "
-                f"{part.location} at {part.hz or 0:g} Hz. Leave one of them out of `joins`, with an entry of its own.",
+                f"{part.location} at {part.hz:g} Hz. Leave one of them out of `joins`, with an entry of its own.",
             )

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,10 @@ from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, To
 from data_pipelines.tokens.store import TokenStore
 from experiments.bench.record import Stage
 from experiments.bench.timing import summarise
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.joined import Parts
+    from data_pipelines.sources.rlds.location import Location
 
 DATASETS, EPISODES, STEPS = 40, 20, 200
 """Of the store that is made when none is given: forty robots, 2 to 28 action values, 10 Hz."""
@@ -83,7 +87,7 @@ def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threa
 
 
 def time_shards(
-    sources: Sequence[tuple[DatasetSpec, Path]], frames: int, batch: int, size: int, threads: int
+    sources: Sequence[tuple[DatasetSpec, Location | Parts]], frames: int, batch: int, size: int, threads: int
 ) -> LoadTiming:
     """The same for single frames of RLDS shards, decoded and resized to `size` pixels."""
     loader = make_frame_loader(sources, size, batch, 0, threads=threads)

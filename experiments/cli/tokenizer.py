@@ -91,7 +91,7 @@ def train_tokenizer(setting: Setting, replace: Step | None) -> None:
     wrote(workspace.tokenizer, then=setting.command("tokenize"))
 
 
-def _write(tokenizer: BaseTokenizer, out: Annotated[Path, arg(metavar="DIR")]) -> None:
+def _write(tokenizer: BaseTokenizer, out: Path) -> None:
     from hma_jax.convert.atomic import atomic_directory
     from hma_jax.tokenizers.io import save_tokenizer
 

@@ -383,8 +383,8 @@ def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:
     profile, fewer = run / PROFILE, f" ({asked:,} were asked for)" if last - first + 1 < asked else ""
     which = f"step {first:,} was" if first == last else f"steps {first:,} to {last:,} were"
     say(
-        f"note: {which} profiled{fewer}. To see that: pip install xprof, then xprof --logdir {short(profile)}; or open its "
-        "perfetto_trace.json.gz at https://ui.perfetto.dev"
+        f"note: {which} profiled{fewer}. To see that: pip install xprof, then xprof --logdir {short(profile)}; or open "
+        f"{short(profile)}/plugins/profile/*/perfetto_trace.json.gz at https://ui.perfetto.dev"
     )
     return [profile]
 

@@ -68,7 +68,7 @@ def data_differences(study: Study, workspace: Workspace, data: Sequence[str], to
     try:
         sources = [source_of(name, places) for name, places in group_by_dataset(data).items()]
         lines = _differences(study, workspace, sources, tokenizer)
-    except (DataError, ConfigError):  # evaluation reads nothing of it
+    except (DataError, ConfigError):  # evaluation reads no episode of it
         return []
     return [line for line in lines if line.startswith(("spec.", "source:"))]
 

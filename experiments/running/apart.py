@@ -50,9 +50,9 @@ def call_apart(what: str, function: Callable[..., T], *arguments: Any) -> T:
 
 
 def _start(process: SpawnProcess) -> None:
-    """A terminal sends Ctrl-C to the new process too, until that has a session of its own: held back, it is one with
-    what is passed on."""
-    resource_tracker.ensure_running()  # starting it ends what is held back
+    """SIGINT is blocked while the process starts: until that has a session of its own, a terminal sends Ctrl-C to it
+    too, and with what is passed on it would get two."""
+    resource_tracker.ensure_running()  # whose start unblocks SIGINT: before
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process.start()

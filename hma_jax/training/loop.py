@@ -178,7 +178,10 @@ def fit(
             for step in range(start + 1, steps + 1):
                 if step == trace.first:
                     jax.block_until_ready(state)
+                    before = clock()
                     trace.start()
+                    log.discount(clock() - before)
+                    seconds_aside += clock() - before
                 with jax.profiler.StepTraceAnnotation("train", step_num=step):
                     state, metrics = compiled(state, batch)
                     if step < steps:

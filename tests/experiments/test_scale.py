@@ -13,6 +13,9 @@ from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
 from experiments.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, PRESETS
+from experiments.running.workspace import Workspace
+from experiments.scale import say_scale
+from experiments.setting import Setting, StudyArguments
 from experiments.study import on_user_data
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
@@ -91,6 +94,18 @@ def test_presets_for_a_processor_name_one_that_is_larger():
         assert PRESETS[other].flops_per_second > 1e12 > PRESETS[name].flops_per_second
         assert PRESETS[other].model.width > PRESETS[name].model.width
         assert (PRESETS[other].model.diffusion is None) == (PRESETS[name].model.diffusion is None)
+
+
+def test_of_trials_of_different_lengths_the_longest_is_named(capsys, tmp_path):
+    setting = Setting(StudyArguments("cpu"), PRESETS["cpu"], (), Workspace(tmp_path))
+    short = reference_trial(PRESETS["cpu"], 0)
+    long = replace(short, train=replace(short.train, steps=32_000))
+    say_scale(setting, [short, long])
+    assert "for up to 32,000 steps of 4 windows, with at most 500 trajectories" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    say_scale(setting, [long, replace(long, capped=long.datasets[:1])])
+    assert "for 32,000 steps of 4 windows, with all trajectories" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_page_says_how_large_the_models_are():

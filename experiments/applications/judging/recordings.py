@@ -82,7 +82,8 @@ class RecordedTruth:
         else:
             known = np.ones(len(outlines), bool)
             self._success = np.array([held(x[None, 1:], task.hold).any() for x in self._reached], bool)
-        # A recording that is held out of a model's training comes first here, too: by the same hash.
+        # A recording that is held out of a model's training comes first here, too: by the same hash (not in the store
+        # of a dataset that joins others).
         order = np.argsort(hash64(recorded.ids(), stream_seed("held-out", recorded.drawn_as)), kind="stable")
         enough = length > task.hold
         usable = [int(i) for i in order if known[i] and enough[i]][: config.head_episodes]
