@@ -130,6 +130,8 @@ def test_the_speed_on_a_processor_with_avx512():
     ratios = (
         f"{times_longer(newest, 'fill'):.1f}, {times_longer(newest, 'slide'):.1f}, {times_longer(newest, 'step'):.2f}"
     )
+    most = max(times_longer(run, "fill") for run in (newest, *before, *beside_the_release()))
+    assert f" to {most:.1f} times faster ([speed](#speed))" in " ".join(README.read_text().split())
     earlier = [[times_longer(run, stage) for run in before] for stage in ("fill", "slide", "step")]
     ranges = ", ".join(f"{min(times):.1f}-{max(times):.1f}" for times in earlier)
     assert f"With AVX-512: {ratios}; before, {ranges}." in " ".join(README.read_text().split())

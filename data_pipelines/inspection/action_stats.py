@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_pipelines.registry.angles import SWITCH_SHARE, AngleUnit, find_turns
+from data_pipelines.registry.angles import RECOGNISED, SWITCH_SHARE, AngleUnit, find_turns
 from data_pipelines.tokens.row_sample import QUANTILES
 from hma_jax.model.embodiments import DEAD_STD
 
-WRAPPING: dict[AngleUnit, str] = {"radian": "wrapping angle", "degree": "wrapping angle in degrees"}
+WRAPPING: dict[AngleUnit, str] = dict(zip(RECOGNISED, ("wrapping angle", "wrapping angle in degrees"), strict=True))
 """Hints for angles, by their unit."""
 
 

@@ -96,7 +96,7 @@ def _answer(
             silence_background()
         with sigterm_as_interrupt():
             answer = True, function(*arguments)
-    except BaseException as error:
+    except BaseException as error:  # also what ends a process: the parent raises it
         answer = False, _portable(error)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it is done
@@ -108,7 +108,7 @@ def _portable(error: BaseException) -> BaseException:
     trace = "".join(traceback.format_exception(error))
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:
+    except Exception:  # whatever its class raises when it is made anew
         error = RuntimeError(f"{type(error).__name__}: {error}")
     error.add_note(f"in another process:\n{trace}")
     return error

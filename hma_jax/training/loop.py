@@ -172,26 +172,32 @@ def fit(
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
 
+            @contextmanager
+            def aside() -> Iterator[None]:
+                """What is done within is not counted as training."""
+                nonlocal seconds_aside
+                before = clock()
+                yield
+                took = clock() - before
+                log.discount(took)
+                seconds_aside += took
+
             def request() -> int:
                 return STOP if stop.is_set() else SAVE if _is_late(clock() - saved, options) else 0
 
             for step in range(start + 1, steps + 1):
                 if step == trace.first:
                     jax.block_until_ready(state)
-                    before = clock()
-                    trace.start()
-                    log.discount(clock() - before)
-                    seconds_aside += clock() - before
+                    with aside():
+                        trace.start()
                 with jax.profiler.StepTraceAnnotation("train", step_num=step):
                     state, metrics = compiled(state, batch)
                     if step < steps:
                         batch = put_batch(_next(batches, step, steps))
                 if step == trace.last:
                     jax.block_until_ready(state)
-                    before = clock()
-                    trace.stop()
-                    log.discount(clock() - before)
-                    seconds_aside += clock() - before
+                    with aside():
+                        trace.stop()
                 if pending is not None:
                     _report(log, *pending, info.records)
                 pending = (step, metrics)
@@ -204,10 +210,8 @@ def fit(
                     _report(log, *pending, info.records)  # a diverged step is neither validated nor saved
                     pending = None
                 if to_validate:
-                    before = clock()
-                    log.write_validation(step, validation.measure(state))
-                    log.discount(clock() - before)
-                    seconds_aside += clock() - before
+                    with aside():
+                        log.write_validation(step, validation.measure(state))
                 if to_save:
                     log.flush()
                     _require_held(lock, run_dir, step)
