@@ -35,6 +35,8 @@ took a tenth of the time of importing and tracing, which make millions of object
 # Names and numbers of malloc.h.
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
 
+_keeps_freed_memory = False
+
 
 def restart_keeping_pages() -> None:
     """Starts the program of this process again, in this process, with `KEPT_PAGES`. Call it first of all.
@@ -49,13 +51,20 @@ def restart_keeping_pages() -> None:
 def keep_freed_memory() -> None:
     """For a process of one core; call before the first computation. Does nothing where the C library is
     not glibc."""
+    global _keeps_freed_memory
     if not is_glibc():
         return
+    _keeps_freed_memory = True
     mallopt = ctypes.CDLL(None).mallopt
     mallopt(_M_MMAP_MAX, 0)
     mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(_M_TOP_PAD, 64 * 2**20)
     mallopt(_M_ARENA_MAX, 1)
+
+
+def shares_one_heap() -> bool:
+    """Whether all threads of this process take their memory from one heap that keeps what is freed."""
+    return is_glibc() and (_keeps_freed_memory or os.environ.get("GLIBC_TUNABLES") == KEPT_PAGES["GLIBC_TUNABLES"])
 
 
 def collect_rarely() -> None:
