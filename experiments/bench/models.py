@@ -13,6 +13,7 @@ from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, requir
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params
+from hma_jax.runtime.devices import default_device
 from hma_jax.runtime.heap_holes import fill_holes_after_compiling
 
 BASE = ModelConfig(action_heads=False)
@@ -90,8 +91,9 @@ def make_subject(
     layers: int | None = None,
     width: int | None = None,
 ) -> Subject:
-    """As `make_shape`, with weights, in a process that keeps its memory as that of a training run does."""
-    fill_holes_after_compiling()
+    """As `make_shape`, with weights. Holes in the heap are filled after compiling, as in a training run."""
+    if default_device().platform == "cpu":
+        fill_holes_after_compiling()
     config, table = make_shape(name, robots, layers, width)
     declared = declare_model(config, table, execution)
     return Subject(config, execution, table, declared, declared.init(seed), seed)
