@@ -92,8 +92,7 @@ def make_subject(
     width: int | None = None,
 ) -> Subject:
     """As `make_shape`, with weights. Holes in the heap are filled after compiling, as in a training run."""
-    if default_device().platform == "cpu":
-        fill_holes_after_compiling()
+    fill_holes_after_compiling(default_device().platform)
     config, table = make_shape(name, robots, layers, width)
     declared = declare_model(config, table, execution)
     return Subject(config, execution, table, declared, declared.init(seed), seed)

@@ -2,7 +2,7 @@
 
 Small matrix products take a temporary block each, thousands of times a step. In a process that has compiled for some
 seconds, the lists in which glibc keeps free chunks of such sizes (its large bins) have hundreds of members, and it
-walks through them under the heap's lock: a training step takes up to a quarter longer, for as long as the process
+walks through them under the heap's lock: a training step takes up to a third longer, for as long as the process
 lives. After compiling, blocks that nobody uses are therefore allocated in these holes, until the next program is
 compiled. docs/performance.md has the figures.
 """
@@ -37,12 +37,13 @@ _CHUNK_HEADER = 16
 
 
 @cache
-def fill_holes_after_compiling() -> None:
+def fill_holes_after_compiling(platform: str) -> None:
     """Has holes filled whenever this process has compiled a large program, from now on.
 
-    Does nothing where threads have heaps of their own, or where glibc is older than 2.33.
+    Does nothing where the `platform` that computes is no CPU, where threads have heaps of their own, or where glibc is
+    older than 2.33.
     """
-    if shares_one_heap() and hasattr(ctypes.CDLL(None), "mallinfo2"):
+    if platform == "cpu" and shares_one_heap() and hasattr(ctypes.CDLL(None), "mallinfo2"):
         jax.monitoring.register_event_duration_secs_listener(_Listener(HeapHoles()))
 
 

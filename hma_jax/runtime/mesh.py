@@ -27,8 +27,7 @@ def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -
     """
     devices = jax.devices() if devices is None else devices
     sizes = mesh_sizes(config, len(devices))
-    if devices[0].platform == "cpu":
-        fill_holes_after_compiling()
+    fill_holes_after_compiling(devices[0].platform)
     return Mesh(arrange(sizes, devices), MESH_AXES, axis_types=(AxisType.Auto,) * 3)
 
 
