@@ -18,7 +18,7 @@ from experiments.cli.initial_model import (
     require_other_directory,
     setting_of,
 )
-from experiments.preparing.made_from import Step
+from experiments.preparing.made_from import Step, may_replace
 from experiments.progress import console, say, step
 from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
@@ -303,10 +303,26 @@ def _prepare(setting: Setting, replace: Step | None) -> None:
     from experiments.preparing.pipeline import prepare
     from hma_jax.runtime.processes import is_writer, writer_first
 
+    _require_no_tokenizer_training(setting, replace)
     with writer_first("data"):
         if is_writer():
             with setting.workspace.locked():
                 prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
+
+
+def _require_no_tokenizer_training(setting: Setting, replace: Step | None) -> None:
+    """Raises ConfigError, in all of several processes, where process 0 would train a tokenizer while it prepares alone:
+    training waits for all of them."""
+    import jax
+
+    again = may_replace("tokenizer", replace)
+    there = setting.workspace.tokenizer.exists() and not again
+    first = setting.command("tokenizer train", *(["--replace", replace] if again and replace else []))
+    require(
+        jax.process_count() == 1 or setting.tokenizer is not None or there,
+        f"several processes do not train a tokenizer: first run `{first}` in one process, then this command"
+        f"{' with --replace tokens' if again else ''}; or give a tokenizer with --tokenizer",
+    )
 
 
 def _say_scale(setting: Setting, trajectories: int | None) -> None:

@@ -126,6 +126,29 @@ def test_a_mesh_that_does_not_fit_is_refused_before_anything_is_prepared(
     assert "a mesh of data=3, fsdp=1, tensor=1 does not fit 1 device(s); set one axis to -1" in said
 
 
+@pytest.mark.parametrize(
+    ("there", "replace", "said"),
+    [
+        (False, "tokens", "first run `hma tokenizer train --preset"),
+        (True, "suite", "first run `hma tokenizer train --replace suite --preset"),
+        (True, "tokens", "it is prepared"),
+    ],
+)
+def test_several_processes_do_not_wait_for_one_that_trains_a_tokenizer(
+    there, replace, said, where, tmp_path, monkeypatch, capsys
+):
+    def prepare(*_, **__):
+        raise ConfigError("it is prepared")
+
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", prepare)
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    if there:
+        (tmp_path / "tokenizer").mkdir()
+    given = [*SMOKE, "--out", str(tmp_path), *where[where.index("--data") :], "--replace", replace]
+    assert main(["train", *given]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_a_dry_run_counts_nothing_that_is_there(train):
     train()
     said, *_ = train("--set", "train.steps=6", "--dry-run")
