@@ -55,4 +55,6 @@ def prepare(
     provenance = freeze_windows(study, workspace, replace)
     if not data and study.eval.other_actions and study.eval.context == "generated":
         make_counterfactual(study, workspace)
+    elif data:  # a study of the suite may have left frames of its own windows here
+        workspace.counterfactual.unlink(missing_ok=True)
     return provenance

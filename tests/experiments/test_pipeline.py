@@ -65,6 +65,10 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     (batch,) = eval_batches(store, table, prepared.manifest, 4, counterfactual=alone, **others)
     assert not batch["other_seen"].any()
 
+    own = [str(workspace.suite / name) for name in study.dataset_names()]
+    prepare(study, workspace, own, replace="tokenizer")  # in place of the suite
+    assert open_prepared_data(workspace).counterfactual is None
+
 
 def test_robots_of_which_a_control_has_no_other_episode_are_named(capsys):
     """Trained on shuffled actions, it was given their own without a word."""
