@@ -9,7 +9,7 @@ fit, and over parameters and training FLOPs, for the best size of a budget.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -84,8 +84,8 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> Curve | None:
         return None
     group = max(both, key=len)
     positions = tuple(
-        Position(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
-        for id, t in group.items()
+        Position(id, run, t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
+        for (id, t), run in zip(group.items(), _runs_of(group.values()), strict=True)
     )
     return Curve("joint", (TRUNK, WINDOWS), positions)
 
@@ -137,14 +137,13 @@ def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Prove
     """Over TRUNK where its trials differ in width."""
     wider = len({p.trial.model.width for p in points}) > 1
 
-    def position(p: Point) -> Position:
+    def position(p: Point, run: str) -> Position:
         x = float(trunk_parameters(p.trial.model)) if wider else float(p.x)
-        return Position(
-            trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,), p.scope or sweep.scope
-        )
+        return Position(trial_id(p.trial, provenance), run, p.trial.train.seed, (x,), p.scope or sweep.scope)
 
     name = "-".join(filter(None, (sweep.name, series)))
-    return Curve(name, (TRUNK if wider else sweep.axis,), tuple(map(position, points)))
+    positions = tuple(map(position, points, _runs_of([p.trial for p in points])))
+    return Curve(name, (TRUNK if wider else sweep.axis,), positions)
 
 
 @lru_cache
@@ -161,9 +160,24 @@ def _seen(trial: Trial) -> float:
     return float(trial.train.steps * trial.train.batch)
 
 
-def _run_of(trial: Trial) -> str:
-    """Equal for trials that differ in steps and seed alone: the branches of one run, for each of its seeds."""
-    return stable_hash(_without_steps(trial))
+def _runs_of(trials: Iterable[Trial]) -> list[str]:
+    """Equal for trials that differ in steps and seed alone, and in what follows from the seed: the branches of one run,
+    for each of its seeds. Every seed may have robots of its own."""
+    trials = list(trials)
+    names: dict[str, str] = {}  # of the first seed's trial: bootstraps draw runs in the order of their names
+    for trial in sorted(trials, key=lambda t: t.train.seed):
+        names.setdefault(_of_any_seed(trial), stable_hash(_without_steps(trial)))
+    return [names[_of_any_seed(trial)] for trial in trials]
+
+
+def _of_any_seed(trial: Trial) -> str:
+    """The same for each seed: robots are only counted, of the source of an adapted model too."""
+    values = level = _without_steps(trial)
+    while level:
+        level |= {robots: len(level[robots]) for robots in ("datasets", "evaluated", "capped")}
+        level["train"].pop("seed", None)
+        level = level["source"]
+    return stable_hash(values)
 
 
 def _all_but_size(trial: Trial) -> str:

@@ -93,6 +93,15 @@ def test_compute_is_no_power_of_the_width():
     assert [c.name for c in curves_of(plan_sweeps(study, study.axes), PROVENANCE)] == ["width"]
 
 
+@pytest.mark.parametrize("sweep", ["dilution", "transfer", "episodes", "newcomers", "fewshot"])
+def test_bootstraps_draw_among_the_seeds_of_a_position(sweep):
+    """Also where each seed has robots of its own, or adapts a model that was trained on such."""
+    for curve in curves_of(plan_sweeps(CPU_FULL, (sweep,)), PROVENANCE):
+        for x in {p.x for p in curve.positions}:
+            here = [p for p in curve.positions if p.x == x]
+            assert len({p.seed for p in here}) == 3 and len({p.run for p in here}) == 1, (curve.name, x)
+
+
 def robots_of_their_own():
     """(the curve of `dilution`, windows of all its trials): three seeds, each of which judges other robots."""
     (curve,) = curves_of(plan_sweeps(CPU_FULL, ("dilution",)), PROVENANCE)
