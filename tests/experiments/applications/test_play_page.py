@@ -167,6 +167,26 @@ def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
     browsing(test)
 
 
+def test_rewinding_ends_at_the_first_frame_and_when_the_page_is_left(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate(  # as in browsers that tell nothing of disabled buttons
+            "addEventListener('pointerup', event => { if (event.target.disabled) event.stopImmediatePropagation(); }, true)"
+        )
+        await page.hover("#back")
+        for ends in ("document.getElementById('back').disabled", "!dispatchEvent(new Event('blur')) || true"):
+            await page.mouse.down()
+            await page.wait_for_function(ends)
+            await page.evaluate("pause(false)")
+            await frames(page, 5)
+            await page.wait_for_timeout(400)
+            assert await page.inner_text("#run") == "Pause", "it still rewinds"
+            await page.mouse.up()
+        assert not page.faults
+
+    browsing(test)
+
+
 def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
