@@ -26,10 +26,11 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
-from hma_jax.runtime.processes import broadcast_from_writer, is_writer, writer_first
+from hma_jax.runtime.processes import is_writer, writer_first
 from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
     CheckpointError,
+    agree_on_latest,
     find_damage,
     hush_orbax,
     list_steps,
@@ -99,11 +100,6 @@ class Checkpoints:
     @property
     def latest_step(self) -> int | None:
         return max(list_steps(self.directory), default=None)
-
-    def agree_on_latest(self) -> int | None:
-        """The latest step as process 0 sees it: a shared disk may show the others an older state of the directory."""
-        latest = broadcast_from_writer("latest checkpoint", "" if self.latest_step is None else str(self.latest_step))
-        return int(latest) if latest else None
 
     # --- Saving ------------------------------------------------------------------------------
 
@@ -207,7 +203,7 @@ class Checkpoints:
             with writer_first("damaged checkpoints"):
                 if is_writer():
                     self._move_damaged_away()
-        step = self.agree_on_latest()
+        step = agree_on_latest(self.directory)
         if step is None:
             raise CheckpointError(f"no checkpoint in {self.directory}")
         checkpoint = self.directory / str(step)

@@ -38,6 +38,7 @@ from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Progress, RunLog, SilentLog, open_log
+from hma_jax.training.reading import agree_on_latest
 from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 from hma_jax.training.state import FINITE
 from hma_jax.training.step_trace import PROFILE, StepTrace
@@ -140,7 +141,7 @@ def fit(
         ) as checkpoints,
         _stop_requests() as stop,
     ):
-        if checkpoints.agree_on_latest() is None:
+        if agree_on_latest(checkpoints.directory) is None:
             start, state = 0, make_state()
         else:
             start, state = checkpoints.restore(shapes, options.may_change, options.skip_damaged)

@@ -18,8 +18,8 @@ import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.processes import all_gather
-from hma_jax.training.hashes import Chosen, Damaged, verify
+from hma_jax.runtime.processes import all_gather, broadcast_from_writer
+from hma_jax.training.hashes import Damaged, verify
 from hma_jax.training.run_lock import list_steps
 
 WHOLE_STATE = "state"
@@ -30,6 +30,29 @@ log = logging.getLogger(__name__)
 
 class CheckpointError(ConfigError):
     """A checkpoint that is missing, unreadable or belongs to another configuration."""
+
+
+def agree_on_latest(directory: Path) -> int | None:
+    """The latest step with a checkpoint as process 0 sees it: a shared disk may show the others an older state of the
+    directory."""
+    steps = list_steps(directory)
+    latest = broadcast_from_writer("latest checkpoint", str(steps[-1]) if steps else "")
+    return int(latest) if latest else None
+
+
+@contextmanager
+def raised_in_all(name: str) -> Iterator[None]:
+    """A CheckpointError that any of several processes raises in the block, which all go through, is raised in all."""
+    own: CheckpointError | None = None
+    try:
+        yield
+    except CheckpointError as error:
+        own = error
+    errors = all_gather(name, "" if own is None else str(own))
+    if own is not None:
+        raise own
+    if any(errors):
+        raise CheckpointError(next(filter(None, errors)))
 
 
 def find_damage(checkpoint: Path) -> Damaged | None:
@@ -61,27 +84,16 @@ def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
     """
     old = (checkpoint / WHOLE_STATE).is_dir()
     folders = {WHOLE_STATE} if old else set(shapes)
+    share = jax.process_index(), jax.process_count()
+    with raised_in_all("damage"), _reading(checkpoint):
+        verify(checkpoint, lambda name: name.split("/")[0] in folders, share)
     with _reading(checkpoint):
-        _verify_together(checkpoint, lambda name: name.split("/")[0] in folders)
         if not old:
             return ocp.load_checkpointables(checkpoint, dict(shapes))
         context = ocp.Context()
         context.pytree.loading.partial_load = True
         with context:
             return ocp.load(checkpoint, dict(shapes))
-
-
-def _verify_together(checkpoint: Path, chosen: Chosen) -> None:
-    """Each of several processes verifies its share of the files; damage that one finds is raised in all."""
-    own: Damaged | None = None
-    try:
-        verify(checkpoint, chosen, (jax.process_index(), jax.process_count()))
-    except Damaged as damage:
-        own = damage
-    found = all_gather("damage", json.dumps(own and [str(own.path), own.reason]))
-    for damage in map(json.loads, found):
-        if damage:
-            raise own or Damaged(Path(damage[0]), damage[1])
 
 
 def has_item(checkpoint: Path, name: str) -> bool:

@@ -17,7 +17,14 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params
 from hma_jax.runtime.devices import default_device
-from hma_jax.training.reading import CheckpointError, has_item, list_steps, load_items, read_description
+from hma_jax.training.reading import (
+    CheckpointError,
+    agree_on_latest,
+    has_item,
+    load_items,
+    raised_in_all,
+    read_description,
+)
 from hma_jax.training.run_lock import CHECKPOINTS
 
 
@@ -112,33 +119,35 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     """The parameters and description of a run's latest checkpoint; its moments are not read.
 
     The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint
-    while it is read, a newer one is taken. Raises CheckpointError if there is no checkpoint, or it is damaged or
-    foreign, and ConfigError for an average that the run does not keep, and for weights called otherwise.
+    while it is read, a newer one is taken. With several processes all call this, and read the same one. Raises
+    CheckpointError if there is no checkpoint, or it is damaged or foreign, and ConfigError for an average that the run
+    does not keep, and for weights called otherwise.
     """
     require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)
     directory = run_dir.absolute() / CHECKPOINTS
-    steps = list_steps(directory)
-    if not steps:
+    step = agree_on_latest(directory)
+    if step is None:
         found = "no finished checkpoint under" if directory.is_dir() else "no checkpoints at"
         raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved a checkpoint")
     while True:
         try:
-            return _read_run(run_dir, directory / str(steps[-1]), weights)
+            return _read_run(run_dir, directory / str(step), weights)
         except CheckpointError:
-            read, steps = steps[-1], list_steps(directory)
-            if not steps or steps[-1] == read:
+            read, step = step, agree_on_latest(directory)
+            if step in (None, read):
                 raise
 
 
 def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
-    described = read_description(checkpoint)
-    missing = {"model", "train", "table", "provenance"} - set(described)
-    if missing:
-        raise CheckpointError(
-            f"{run_dir}: not a run of this project (no {', '.join(sorted(missing))}); give the directory "
-            "of a training run"
-        )
+    with raised_in_all("description"):
+        described = read_description(checkpoint)
+        missing = {"model", "train", "table", "provenance"} - set(described)
+        if missing:
+            raise CheckpointError(
+                f"{run_dir}: not a run of this project (no {', '.join(sorted(missing))}); give the directory "
+                "of a training run"
+            )
     described = modernise(described, str(run_dir))
     model = from_dict(ModelConfig, described["model"])
     table = from_dict(EmbodimentTable, described["table"])
@@ -151,11 +160,13 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
     device = jax.sharding.SingleDeviceSharding(default_device())
     shapes = declare_model(model, table).shapes()
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), shapes)
+    with raised_in_all("parameters"):
+        params = load_items(checkpoint, {item: shapes})[item]
     return Run(
         model,
         from_dict(TrainConfig, described["train"]),
         table,
-        load_items(checkpoint, {item: shapes})[item],
+        params,
         int(checkpoint.name),
         described["provenance"],
         "ema" if item == "ema" else "last",

@@ -22,7 +22,7 @@ from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import inference_params
-from hma_jax.training import runs
+from hma_jax.training import reading, runs
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
 from hma_jax.training.runs import describe_run, load_model, load_run, modernise
@@ -74,6 +74,20 @@ def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_ne
 
     monkeypatch.setattr(runs, "read_description", replaced)
     assert load_run(tmp_path / "run").step == 3
+
+
+def test_several_processes_read_the_step_that_process_0_sees_and_another_one_together(averaged, tmp_path, monkeypatch):
+    """As process 1 does it, which sees a newer step already, while the first one is removed under the hands of
+    process 0."""
+    shutil.copytree(averaged[0], tmp_path / "run")
+    for step in "345":
+        shutil.copytree(tmp_path / "run" / "checkpoints" / "2", tmp_path / "run" / "checkpoints" / step)
+    latest, removed = iter("34"), iter(["the checkpoint is removed"])
+    monkeypatch.setattr(reading, "broadcast_from_writer", lambda *_: next(latest), raising=False)
+    monkeypatch.setattr(
+        reading, "all_gather", lambda name, own: [next(removed, "") if name == "parameters" else "", own]
+    )
+    assert load_run(tmp_path / "run").step == 4
 
 
 # --- Earlier versions ------------------------------------------------------------------------
