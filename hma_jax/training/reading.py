@@ -7,7 +7,6 @@ items that are asked for are read and checked.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
