@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from experiments.analysis import preregistered
 from experiments.done import newest_step
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
@@ -28,6 +29,7 @@ from experiments.setting import Setting, short
 from experiments.study import Study
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
+from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
@@ -53,8 +55,9 @@ def run_study(
     """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end.
 
     `again` is the command that tries failed trials once more. Raises ConfigError, before anything is done, if the
-    directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
-    changed, or if trials ran other sources than today's and `accept_code` is not given.
+    directory holds another study, unless `replace` allows it, or expectations that cannot be read; and before any
+    trial, if one that is finished was changed, or if trials ran other sources than today's and `accept_code` is not
+    given.
     """
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
@@ -74,6 +77,9 @@ def run_study(
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked():
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
+        every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
+        planned = plan_sweeps(study, tuple(every.values()))
+        say_unplanned(workspace, planned)
         provenance = prepare_apart(setting, replace)
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
@@ -81,8 +87,7 @@ def run_study(
                 f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again"
             )
             say(what)
-        every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
-        shown = unique_trials(plan_sweeps(study, tuple(every.values())), provenance)
+        shown = unique_trials(planned, provenance)
         trials = unique_trials(sweeps, provenance)
         require_agreement(workspace, shown, trials, sources, accept_code)
         kept = keep_axes(every, workspace.root)
@@ -99,6 +104,16 @@ def run_study(
         states = run_jobs(jobs, workspace, launcher, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
+
+
+def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
+    """Names what the user preregistered of points that the study, all of whose sweeps are `planned`, does not have.
+
+    Raises ConfigError, as the page at the end would, for a line that cannot be read or that no study can answer.
+    """
+    path = workspace.predictions / preregistered.FILE
+    if lines := preregistered.find_unplanned(preregistered.read_expected(path), planned):
+        say(f"note: {path.name} predicts what this study does not plan: {few(lines)}. The page says so")
 
 
 def prepare_apart(setting: Setting, replace: Step | None) -> Provenance:

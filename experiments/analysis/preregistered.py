@@ -11,17 +11,26 @@ import csv
 import io
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from experiments.rows import OVERALL, Row, curve, difference
 from experiments.sweeps.registry import AXES
-from experiments.sweeps.sweep import POINT
+from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.config import ConfigError, require
 
 FILE = "preregistered.csv"
 """In the folder of predictions, beside the sealed ones of fits."""
+
+METRICS = (
+    "cross_entropy", "perplexity", "perplexity_corpus", "accuracy", "diffusion_loss",
+    "psnr", "psnr_last", "psnr_copy", "psnr_random", "delta_psnr", "ssim", "lpips", "lpips_copy",
+    "action_nats", "retrieval", "retrieval_rank", "retrieval_chance",
+    "counterfactual_psnr", "counterfactual_copy", "counterfactual_gain",
+    "action_error", "action_error_of_mean", "action_gain",
+)  # fmt: skip
+"""All that trials measure; which of them depends on the model, its training and the evaluation's settings."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,8 @@ class Expected:
 
 @dataclass(frozen=True)
 class ExpectationOutcome:
-    """An expectation and its outcome: `observed`, the mean over `seeds` of the `planned` ones; None before any ran.
+    """An expectation and its outcome: `observed`, the mean over `seeds` of the `planned` ones; None without any, for
+    the reason that `lacks` says.
 
     `seed_sem` is its standard error over seeds."""
 
@@ -51,6 +61,7 @@ class ExpectationOutcome:
     seed_sem: float
     seeds: int
     planned: int
+    lacks: str = ""
 
     @property
     def inside(self) -> bool | None:
@@ -90,6 +101,7 @@ def read_expected(path: Path) -> list[Expected]:
             # A difference the other way round is the same number.
             positions = frozenset(map(_position, (e.x, e.against)))
             require(len(positions) > 1, f"{where}: x must name a point, and against, if given, another point")
+            require(e.metric in METRICS, f"{where}: no metric {e.metric!r}; known: {', '.join(METRICS)}")
             first = lines.setdefault((e.sweep, e.series, positions, e.metric, frozenset(e.seeds)), number)
             require(
                 first == number,
@@ -99,40 +111,66 @@ def read_expected(path: Path) -> list[Expected]:
     return found
 
 
+def find_unplanned(expected: Sequence[Expected], sweeps: Sequence[Sweep]) -> list[str]:
+    """What of the axes of `sweeps` is expected and not planned, each with what there is. Raises ConfigError for an
+    unknown axis."""
+    _require_axes(expected, [s.name for s in sweeps])
+    lines = []
+    for sweep in sweeps:
+        points = [(p.series, p.x, sweep.label(p.x), p.trial.train.seed) for p in sweep.points if p.role == POINT]
+        lines += [_why_unplanned(e, points) for e in expected if e.sweep == sweep.name]
+    return list(filter(None, lines))
+
+
 def compare_expected(expected: Sequence[Expected], rows: Sequence[Row]) -> list[ExpectationOutcome]:
     """The outcome of every expectation of an axis that is in `rows`; others may still be run. Raises ConfigError for an
-    unknown axis, curve, point or metric."""
+    unknown axis."""
     points: dict[str, list[Row]] = defaultdict(list)  # once, of a hundred thousand rows
     for row in rows:
         if row.role == POINT and not row.of_robot:
             points[row.sweep].append(row)
-    known = {*AXES, *(r.sweep for r in rows)}
+    _require_axes(expected, [r.sweep for r in rows])
+    return [_compare_one(e, points[e.sweep]) for e in expected if e.sweep in points]
+
+
+def _require_axes(expected: Sequence[Expected], own: Sequence[str]) -> None:
+    known = {*AXES, *own}
     for e in expected:
         require(e.sweep in known, f"{FILE}: no axis {e.sweep!r}; known: {', '.join(sorted(known))}")
-    return [_compare_one(e, points[e.sweep]) for e in expected if e.sweep in points]
+
+
+def _why_unplanned(e: Expected, points: Collection[tuple[str, float, str, int]]) -> str:
+    """What is expected and not among the axis's `points` (series, x, label, seed); '' if all is."""
+    where = f"{e.sweep}, {e.series}" if e.series else e.sweep
+    own = [(x, label, seed) for series, x, label, seed in points if series == e.series]
+    if not own:
+        return f"{where}: no such curve"
+    if absent := set(e.seeds) - {seed for _, _, seed in own}:
+        return f"{where} has no seed {', '.join(map(str, sorted(absent)))}"
+    own = [point for point in own if not e.seeds or point[2] in e.seeds]
+    for x in filter(None, (e.x, e.against)):
+        if not any(_names(x, at, label) for at, label, _ in own):
+            names = dict.fromkeys(label or f"{at:g}" for at, label, _ in sorted(own))
+            return f"{where} has no point {x!r}, but {', '.join(names)}"
+    return ""
 
 
 def _compare_one(e: Expected, rows: Sequence[Row]) -> ExpectationOutcome:
     """`rows`: of the axis, without its controls."""
-    where = f"{FILE}: {e.sweep}, {e.series}" if e.series else f"{FILE}: {e.sweep}"
-    absent = set(e.seeds) - {r.seed for r in rows}
-    require(not absent, f"{where} has no seed {', '.join(map(str, sorted(absent)))}")
+    positions = {(r.series, r.x, r.label, r.seed) for r in rows}
+    if _why_unplanned(e, positions):
+        return ExpectationOutcome(e, None, math.nan, 0, 0, "not planned")
     rows = [r for r in rows if not e.seeds or r.seed in e.seeds]
-    positions = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
-    for x in filter(None, (e.x, e.against)):
-        names = dict.fromkeys(label or f"{at:g}" for at, label, _ in sorted(positions))
-        known = any(_names(x, at, label) for at, label, _ in positions)
-        require(known, f"{where} has no point {x!r}, but {', '.join(names) or 'none, nor such a curve'}")
-    metrics = {r.metric for r in rows if r.scope == OVERALL}
-    require(not metrics or e.metric in metrics, f"{where} has no metric {e.metric!r}, but {', '.join(sorted(metrics))}")
-    planned = {seed for at, label, seed in positions if _names(e.x, at, label)}
+    planned = {r.seed for r in rows if r.series == e.series and _names(e.x, r.x, r.label)}
     points = curve(rows, e.sweep, e.metric, series=e.series)
     point, base = (next((p for p in points if _names(x, p.x, p.label)), None) for x in (e.x, e.against))
     seeds = set(point.seeds) if point else set()
     if e.against:
         seeds &= set(base.seeds) if base else set()
     if point is None or not seeds:
-        return ExpectationOutcome(e, None, math.nan, 0, len(planned))
+        measured = {r.metric for r in rows if r.scope == OVERALL}
+        lacks = "not measured" if measured and e.metric not in measured else "not run yet"
+        return ExpectationOutcome(e, None, math.nan, 0, len(planned), lacks)
     mean, error = difference(point, base) if base and e.against else (point.mean, point.seed_sem)
     return ExpectationOutcome(e, mean, error, len(seeds), len(planned))
 

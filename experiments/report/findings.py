@@ -70,7 +70,7 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
         where = f"{e.x} beside {e.against}" if e.against else e.x
         where += f", seed {', '.join(map(str, e.seeds))}" if e.seeds else ""
         predicted = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
-        observed = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
+        observed = c.lacks if c.observed is None else pm(c.observed, c.seed_sem)
         curve = [html.escape(e.series)] if sweep.has_series else []
         metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])

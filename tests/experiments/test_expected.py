@@ -5,10 +5,24 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.analysis.preregistered import FILE, Expected, compare_expected, read_expected
+from experiments import run_study
+from experiments.analysis.preregistered import (
+    FILE,
+    METRICS,
+    Expected,
+    compare_expected,
+    find_unplanned,
+    read_expected,
+)
 from experiments.report.draw import draw
-from experiments.rows import curve, difference, read_rows
+from experiments.rows import OVERALL, curve, difference, read_csv, read_rows
+from experiments.running.launchers.registry import LauncherOptions
+from experiments.running.workspace import Workspace
+from experiments.setting import StudyArguments, make_setting
+from experiments.sweeps.registry import plan_sweeps
 from hma_jax.config import ConfigError
+from hma_jax.evaluation.controllability import OPTIONAL_METRICS
+from tests.experiments.committed_findings import RESULTS
 from tests.experiments.judged import WIDE, judged_study
 
 COLUMNS = "sweep,series,x,against,metric,mean,low,high,commit"
@@ -71,18 +85,64 @@ def test_some_seeds_alone_may_be_meant(rows, tmp_path):
     assert came.observed == pytest.approx((seeds[0] + seeds[2]) / 2) and (came.seeds, came.planned) == (2, 2)
 
 
-def test_a_point_that_is_not_there_is_refused(rows):
-    for wrong, message in (
-        (replace(WIDTH, x="12"), "width has no point '12', but 8, 16"),
-        (replace(WIDTH, against="wide"), "has no point 'wide'"),
-        (replace(WIDTH, series="8,000 steps"), "nor such a curve"),
-        (replace(WIDTH, metric="cross-entropy"), "has no metric 'cross-entropy', but .*cross_entropy"),
-        (replace(WIDTH, metric="loss"), "has no metric 'loss', but .*cross_entropy"),  # not over judged robots
-        (replace(WIDTH, sweep="widht"), "no axis 'widht'"),
-        (replace(WIDTH, seeds=(1, 7)), "width has no seed 7"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            compare_expected([wrong], rows)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"x": "12"}, "width has no point '12', but 8, 16"),
+        ({"against": "wide"}, "width has no point 'wide', but 8, 16"),
+        ({"series": "8,000 steps"}, "width, 8,000 steps: no such curve"),
+        ({"seeds": (1, 7)}, "width has no seed 7"),
+    ],
+)
+def test_what_is_not_planned_yet_is_open(rows, study, wrong, message):
+    """It has to be written down before; until the plan had it, no page was drawn."""
+    early = replace(WIDTH, **wrong)
+    sweeps = plan_sweeps(study[1].study, study[1].axes)
+    assert find_unplanned([WIDTH, early, replace(WIDTH, sweep="compute")], sweeps) == [message]
+    [came] = compare_expected([early], rows)
+    assert (came.observed, came.planned, came.lacks) == (None, 0, "not planned")
+
+
+def test_an_axis_that_no_study_has_is_refused(rows):
+    for refuse in (compare_expected, find_unplanned):
+        with pytest.raises(ConfigError, match="no axis 'widht'; known: .*width"):
+            refuse([replace(WIDTH, sweep="widht")], [])
+
+
+def test_what_these_trials_do_not_measure_is_said(rows):
+    [came] = compare_expected([replace(WIDTH, metric="lpips")], rows)
+    assert came.observed is None and came.lacks == "not measured"
+
+
+def test_whatever_trials_measure_may_be_expected():
+    committed = RESULTS.glob("*/results.csv")
+    measured = {r.metric for path in committed for r in read_csv(path) if r.scope == OVERALL}
+    assert measured <= set(METRICS) and set(OPTIONAL_METRICS) < set(METRICS)
+
+
+def test_a_study_reads_what_is_expected_before_it_prepares_anything(tmp_path, monkeypatch, capsys):
+    """A typo ended it without a page after all trials had run."""
+    workspace = Workspace(tmp_path)
+    workspace.predictions.mkdir()
+
+    def prepare(*_):
+        raise ConfigError("prepares")
+
+    monkeypatch.setattr(run_study, "prepare_apart", prepare)
+
+    def run(line: str) -> str:
+        (workspace.predictions / FILE).write_text(f"{COLUMNS}\n{line}\n")
+        with pytest.raises(ConfigError) as refused:
+            run_study.run_study(
+                make_setting(StudyArguments("smoke", tmp_path)), ("width",), again="", launcher_options=LauncherOptions(), retry_failed=False,
+                accept_code=False, replace=None,
+            )  # fmt: skip
+        return str(refused.value)
+
+    assert "line 2: low must not be above" in run("width,,8,,cross_entropy,7,4,6,abc1234")
+    assert run("width,,12,,cross_entropy,5,4,6,abc1234") == "prepares"
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"note: {FILE} predicts what this study does not plan: width has no point '12', but 8, 16" in said
 
 
 @pytest.mark.parametrize(
@@ -95,6 +155,8 @@ def test_a_point_that_is_not_there_is_refused(rows):
         ("width,,8,,cross_entropy,7,4,inf,abc", "line 2: low and high must be finite"),
         ("width,,8,8.0,cross_entropy,0,-1,1,abc", "line 2: x must name a point, and against, .* another point"),
         ("width,,,,cross_entropy,5,4,6,abc", "line 2: x must name a point"),
+        ("width,,8,,cross-entropy,5,4,6,abc", "line 2: no metric 'cross-entropy'; known: cross_entropy"),
+        ("width,,8,,loss,5,4,6,abc", "line 2: no metric 'loss'"),  # not over judged robots
     ],
 )
 def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
@@ -145,6 +207,7 @@ def test_the_page_shows_both_at_the_axis(study):
     workspace.predictions.mkdir()
     (workspace.predictions / FILE).write_text(
         f"{COLUMNS}\nwidth,,8,,cross_entropy,50,40,60,abc1234\nwidth,,8,16,cross_entropy,0,-9,9,abc1234\n"
+        "width,,64,,cross_entropy,1,0,2,abc1234\n"
     )
     workspace.findings.write_text(
         "# What it says\n\nIn short: little.\n\n"
@@ -156,7 +219,9 @@ def test_the_page_shows_both_at_the_axis(study):
     axis, elsewhere = page.index("<h3>Width</h3>"), page.index("<h2>Elsewhere</h2>")
     of_axis = page[axis : page.index("</section>", axis)]
     assert "1 of 2 intervals contain the outcome" in of_axis and "<code>abc1234</code>" in of_axis
-    assert "8 beside 16" in of_axis and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
+    assert (
+        "not planned" in of_axis and "8 beside 16" in of_axis and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
+    )
     assert "<strong>Wide</strong> pays &lt;script&gt;." in of_axis and "<td>1</td>" in of_axis
     assert "its figure" not in page and axis < elsewhere
     assert "In short: little." in page and "<h2>&lt;b&gt;</h2>" in page and 'href="javascript' not in page
