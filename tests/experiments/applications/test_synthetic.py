@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.generate import generate_suite
+from experiments.analysis.bootstrap import bootstrap_intervals
 from experiments.applications import DRIVEN, FIRST, plan_actions, synthetic
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import (
@@ -89,6 +90,15 @@ def test_the_share_of_the_gap_is_that_of_the_means():
     share, control = share_closed(panel, MOST), share_closed(panel, CONTROL)
     assert share.mean == pytest.approx(0.83, abs=0.08) and share.low < 0.83 < share.high < share.low + 0.4
     assert control.high < share.low
+    # The ends are where what remains of the gap is just not significant.
+    for r in (share.low, share.high):
+        rest = panel.points[MOST] - (1 - r) * panel.points[FEW] - r * panel.points[ALL]
+        (left,) = bootstrap_intervals(replace(panel, points=(rest,), seeds=(seeds,)), 2000)
+        assert min(abs(left.low), abs(left.high)) == pytest.approx(0, abs=1e-9)
+    # Policies trained on few trajectories depend on which: of a gap that is not significant no share is known.
+    few = (np.linspace(0, 1, 400) < np.array([[0.0], [0.3], [0.6]])).astype(float)
+    alike = share_closed(replace(panel, points=(few, *panel.points[1:])), MOST)
+    assert np.isfinite(alike.mean) and np.isnan([alike.low, alike.high]).all()
 
 
 def test_policies_that_never_succeed_are_no_certainty_and_leave_no_gap_to_close(recwarn):
