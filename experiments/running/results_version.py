@@ -24,6 +24,14 @@ OF_SOME = {
         "train.masking.teacher_forcing": True,
         "train.masking.action_leak": "all",
     },
+    "no leak into blocks shows the first frame an action that comes after it": {
+        "model.action_alignment": "causal",
+        "train.masking.action_leak": "conditioning",
+    },
+    "no leak shows the first frame an action that comes after it": {
+        "model.action_alignment": "causal",
+        "train.masking.action_leak": "all",
+    },
     "what rounding leaves is no scale of actions": {"train.action_scale": "quantiles"},
     "frames of what predicts none are not judged: a policy": {"train.masking.setting": "policy"},
     "frames of what predicts none are not judged: inverse dynamics": {"train.masking.setting": "inverse"},

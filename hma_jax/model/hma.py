@@ -111,10 +111,11 @@ class HMA(nnx.Module):
         action = None
         if actions_BTU is not None:
             feature = self.stem(actions_BTU, embodiment_B, slice_B, self.dtype)
-            shown = None if hidden_BT is None or leak != "none" else ~hidden_BT
-            action = ActionFeature(feature, shown)
+            from_blocks = hidden_BT if leak == "none" else self._hidden_through_leaks(hidden_BT, positions)
+            action = ActionFeature(feature, None if from_blocks is None else ~from_blocks)
             if config.concat:
-                x = jnp.concatenate([x, self._action_tokens(feature, hidden_BT, leak, positions)], axis=2)
+                from_tokens = hidden_BT if leak != "all" else self._hidden_through_leaks(hidden_BT, positions)
+                x = jnp.concatenate([x, self._action_tokens(feature, from_tokens, positions)], axis=2)
         x = shifted(x, jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]])
         if self.norm is not None:
             x = self.norm(x)
@@ -132,11 +133,16 @@ class HMA(nnx.Module):
         x = jnp.where(unknown_BTS[..., None], 0, self.embed(frames, None, self.dtype))
         return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
-    def _action_tokens(
-        self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, leak: ActionLeak, positions: jax.Array
-    ) -> jax.Array:
+    def _hidden_through_leaks(self, hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array | None:
+        """bool [B, T]: frames whose action no leak shows. With `causal` alignment nothing led to the first one
+        (`align_hidden`); None: none."""
+        if hidden_BT is None or self.config.action_alignment == "released":
+            return None
+        return hidden_BT & (positions == 0)
+
+    def _action_tokens(self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array:
         """K copies of each frame's feature, or of its learned vector where it is hidden."""
-        if hidden_BT is not None and leak != "all":
+        if hidden_BT is not None:
             vectors_TD = jnp.take(self.action_mask.get_value(), positions, axis=0)
             feature_BTD = replaced(feature_BTD, hidden_BT, vectors_TD)
         return over_tokens(feature_BTD, self.config.action_tokens)
