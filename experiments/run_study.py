@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from experiments.analysis import preregistered
 from experiments.done import newest_step
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
@@ -111,8 +110,10 @@ def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
 
     Raises ConfigError, as the page at the end would, for a line that cannot be read or that no study can answer.
     """
-    path = workspace.predictions / preregistered.FILE
-    if lines := preregistered.find_unplanned(preregistered.read_expected(path), planned):
+    from experiments.analysis.preregistered import FILE, find_unplanned, read_expected
+
+    path = workspace.predictions / FILE
+    if lines := find_unplanned(read_expected(path), planned):
         say(f"note: {path.name} predicts what this study does not plan: {few(lines)}. The page says so")
 
 
