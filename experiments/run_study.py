@@ -102,7 +102,7 @@ def run_study(
         say_trained(jobs, former, workspace)
         states = run_jobs(jobs, workspace, launcher, retry_failed)
         draw(workspace, record)
-    require_results(jobs, states, again)
+    require_results(jobs, states, again, accept_code)
 
 
 def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
@@ -226,13 +226,17 @@ def run_jobs(jobs: Sequence[Job], workspace: Workspace, launcher: Launcher, retr
         return run_missing(jobs, workspace.trials, ledger, launcher, retry_failed=retry_failed, monitor=monitor)
 
 
-def require_results(jobs: Sequence[Job], states: dict[str, State], again: str) -> None:
-    """Raises TrialsFailed, naming every trial without a result, and the command that tries them again."""
+def require_results(jobs: Sequence[Job], states: dict[str, State], again: str, accept_code: bool) -> None:
+    """Raises TrialsFailed, naming every trial without a result, and the command that tries them again: `again`, which
+    has to accept the changed code where that stopped the sweep."""
     bad = [(job, states[job.id]) for job in jobs if states[job.id].event != FINISHED]
     if bad:
         refused = any(state.event == REFUSED for _, state in bad)
         lines = "\n".join(f"  {_without_result(job, state, refused)}" for job, state in bad)
-        raise TrialsFailed(f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\nTo try them again: {again}")
+        how = "To try them again"
+        if refused and not accept_code:
+            how, again = f"{how}, if the change of the sources alters no result", f"{again} --accept-code"
+        raise TrialsFailed(f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\n{how}: {again}")
 
 
 def _without_result(job: Job, state: State, refused: bool) -> str:

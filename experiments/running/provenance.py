@@ -98,8 +98,9 @@ def _require_same(given: Closure, found: Closure) -> None:
     names = changed(given, found) + sorted(given.keys() ^ found.keys())
     if names:
         raise CodeChanged(
-            f"the sources changed since this sweep was started: {few(names)}. The trial was not run. Run the command "
-            "again: trials that have run under the earlier sources are then counted apart"
+            f"the sources changed since this sweep was started: {few(names)}. The trial was not run. If the change alters "
+            "no result, run the command again with --accept-code: trials that have run under the earlier sources are then "
+            "counted apart. Or go back to the earlier sources"
         )
 
 

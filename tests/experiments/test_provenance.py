@@ -134,8 +134,10 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
     states = run_missing(jobs, tmp_path / "trials", ledger, LocalLauncher(tmp_path, 1, command=command))
     assert [states[f"t{i}"].event for i in range(3)] == ["refused", "missing", "missing"]
     assert "sources changed since this sweep was started: hma_jax.objective.losses." in states["t0"].message
-    with pytest.raises(study_runs.TrialsFailed) as failed:
-        study_runs.require_results(jobs, states, "hma study")
+    assert "If the change alters no result, run the command again with --accept-code" in states["t0"].message
+    for accepted, last in ((True, "again: hma study"), (False, "again, .* no result: hma study --accept-code")):
+        with pytest.raises(study_runs.TrialsFailed, match=f"To try them {last}$") as failed:
+            study_runs.require_results(jobs, states, "hma study", accepted)
     for line in ("missing: trial 1", "missing: trial 2"):
         assert f"  {line}: not started, because another trial was refused\n" in str(failed.value)
     assert not (tmp_path / "trials" / "t0" / "run").exists()
