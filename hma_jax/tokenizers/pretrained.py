@@ -7,18 +7,15 @@ on. Reading their weights from the files they are published in is `convert.pretr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import cached_property
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from einops import rearrange
 
-from hma_jax.config import Magvit2Config, SvdVaeConfig, TokenGrid, require
+from hma_jax.config import Magvit2Config, SvdVaeConfig, TokenGrid
 from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
-from hma_jax.tokenizers.base import PIECE, in_pieces
+from hma_jax.tokenizers.base import PIECE
 from hma_jax.tokenizers.magvit2 import Magvit2
 from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
@@ -77,33 +74,9 @@ class SvdVaeTokenizer(BaseTokenizer):
         mean, _ = self._declared.merge(params).moments(from_pixels(images))
         return self.tokens_of(mean)
 
-    def decode_fn(self, params: Params, tokens: jax.Array, frames: int = 1) -> jax.Array:
-        """Pure: latents [B, S, C] -> float32 [B, H, W, 3] in 0..255.
-
-        Every `frames` consecutive entries of the batch are a clip, whose frames the decoder mixes.
-        """
+    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         cells = jnp.clip(self.cells(tokens), -LATENT_LIMIT, LATENT_LIMIT)
-        return to_pixels(self._declared.merge(params).decode(cells, frames))
-
-    def decode_clips(self, clips: np.ndarray) -> np.ndarray:
-        """Latents [B, T, S, C] -> uint8 [B, T, H, W, 3], the frames of a clip decoded together.
-
-        Raises ConfigError for another shape or type.
-        """
-        clips = np.asarray(clips)
-        require(clips.ndim == 4, f"clips of latents are [B, T, S, C], got {list(clips.shape)}")
-        checked = self._checked(clips.reshape(-1, *clips.shape[2:])).reshape(clips.shape)
-        size = max(1, self.piece // clips.shape[1]) * self._mesh.size
-        return in_pieces(lambda piece: self._decode_clips(self._device_params, piece), checked, size)
-
-    @cached_property
-    def _decode_clips(self) -> Callable:
-        def decode(params: Params, clips: jax.Array) -> jax.Array:
-            batch, frames, *token = clips.shape
-            images = self.decode_fn(params, clips.reshape(-1, *token), frames)
-            return jnp.round(images).astype(jnp.uint8).reshape(batch, frames, *images.shape[1:])
-
-        return self._jit_over_devices(decode)
+        return to_pixels(self._declared.merge(params).decode(cells))
 
     def tokens_of(self, cells: jax.Array) -> jax.Array:
         """Unscaled latents [..., h, w, c], which the release stores channels first -> tokens [..., S, C]."""

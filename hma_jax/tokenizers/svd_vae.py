@@ -1,8 +1,9 @@
 """The networks of Stable Video Diffusion's VAE: images to a Gaussian over latents, latents to clips.
 
 The encoder sees single images. The decoder mixes the frames of a clip: after every residual block
-over space comes one over time, and a learned number weighs the two. Released HMA models decode
-clips of one frame. Source: the diffusers library's AutoencoderKLTemporalDecoder.
+over space comes one over time, and a learned number weighs the two. Tokens of HMA models, released ones
+too, are decoded as clips of one frame; longer clips show that the network is the original's. Source: the
+diffusers library's AutoencoderKLTemporalDecoder.
 """
 
 from __future__ import annotations

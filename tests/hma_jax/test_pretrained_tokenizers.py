@@ -193,7 +193,7 @@ def test_bit_k_of_an_id_is_the_sign_of_channel_k_and_factor_0_holds_the_low_ones
     assert np.array_equal(compose(digits, magvit2.factor_vocab), ids)
 
 
-# --- Latents and clips -------------------------------------------------------------------------
+# --- Latents -----------------------------------------------------------------------------------
 
 
 def test_tokens_are_patches_of_the_scaled_mean_and_cells_undo_it(vae):
@@ -208,22 +208,9 @@ def test_tokens_are_patches_of_the_scaled_mean_and_cells_undo_it(vae):
     np.testing.assert_allclose(vae.cells(jnp.asarray(tokens)), mean, rtol=1e-4, atol=1e-4)
 
 
-def test_frames_of_a_clip_are_decoded_together(vae):
-    tokens = vae.encode(noise(6))
-    clips = vae.decode_clips(tokens.reshape(2, 3, *tokens.shape[1:]))
-    assert clips.shape == (2, 3, 16, 16, 3) and clips.dtype == np.uint8
-    apart = vae.decode(tokens)
-    assert np.array_equal(vae.decode_clips(tokens[:, None])[:, 0], apart)
-    assert not np.array_equal(clips.reshape(apart.shape), apart)
-    alone = vae.decode_clips(tokens.reshape(2, 3, *tokens.shape[1:])[1:])
-    assert np.array_equal(alone[0], clips[1])
-
-
 def test_latents_far_outside_are_clipped_before_they_are_decoded(vae):
     edge = np.full((1, 16, 16), 25 * 0.18215, np.float32)
     assert np.array_equal(vae.decode(4 * edge), vae.decode(edge))
-    with pytest.raises(ConfigError, match=r"clips of latents are \[B, T, S, C\]"):
-        vae.decode_clips(edge)
 
 
 # --- Pixels ------------------------------------------------------------------------------------
