@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.runs import Run
 
+MEANS = "evaluation.json"
+"""Every metric's mean per dataset, with its error."""
+
 SHOWN = (
     "perplexity", "accuracy", "diffusion_loss", "psnr", "psnr_copy", "ssim", "lpips", "lpips_copy", "delta_psnr",
     "action_nats", "retrieval", "counterfactual_gain", "action_error", "action_gain",
@@ -136,10 +139,12 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     which = ", averaged weights" if trained.weights == "ema" else ""
     when = f", step {trained.step:,}" if trained.step else ""  # a run that was converted has made no step here
     console.print(table_of(summary, f"{short(run)}{when}{which}"))
+    for name in (STAMP, MEANS):  # if this is killed now, none must stand beside numbers of others
+        (place / name).unlink(missing_ok=True)
     write_evaluation(place, evaluation)
-    write_file(place / "evaluation.json", to_strict_json(summary.to_dict()))
+    write_file(place / MEANS, to_strict_json(summary.to_dict()))
     made_from.save(place, STAMP)
-    wrote(place / "evaluation.json", place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
+    wrote(place / MEANS, place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
 
 
 def table_of(summary: Summary, title: str) -> TidyTable:
