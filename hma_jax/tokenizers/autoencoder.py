@@ -32,7 +32,9 @@ class AutoencoderTokenizer(BaseTokenizer):
         return declare_tokenizer(config)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
-        return self._from_latents(self._declared.merge(params).encoder(from_pixels(images)))
+        # float32 is float32 on accelerators too: their default would flip bits of latents near zero.
+        with jax.default_matmul_precision("highest"):
+            return self._from_latents(self._declared.merge(params).encoder(from_pixels(images)))
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         return to_pixels(self._declared.merge(params).decoder(self._to_latents(tokens)))

@@ -25,7 +25,8 @@ class Tokenizer(Protocol):
     A token is an id, int32, or a vector of C latent channels, float32 of about unit standard
     deviation. Tokens run over a grid row by row, a square one where images are square. An id is
     sum_q digit_q V^q: factor 0 in the low digits. Both directions are deterministic, and an image's
-    result does not depend on the others of its batch: tokens made in one job equal those made in another.
+    result does not depend on the others of its batch: tokens made in one job equal those made in another. Another
+    kind of device sums products in another order, which may turn a bit whose latent is all but 0.
     """
 
     @property

@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -173,6 +174,13 @@ def test_tokens_do_not_depend_on_the_batch_they_came_in(tokenizer):
         assert np.array_equal(tokenizer.encode(images[i : i + 1])[0], tokens[i])
     frames = tokenizer.decode(tokens)
     assert np.array_equal(tokenizer.decode(tokens[-5:]), frames[-5:])
+
+
+def test_images_are_encoded_in_full_precision_on_every_device(tokenizer):
+    """What accelerators round more by default; a CPU does not."""
+    program = jax.jit(tokenizer.encode_fn).lower(tokenizer.params, noise(1)).as_text()
+    products = re.findall("dot_general.*", program)
+    assert products and all("precision = [HIGHEST, HIGHEST]" in product for product in products)
 
 
 @pytest.mark.parametrize("rows", [1, 4, 5, 8])
