@@ -58,21 +58,27 @@ def plan(study: Study) -> Sweep:
 
 def count_episodes(study: Study, cap: int | None) -> int:
     """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly; of others
-    what the registry says, which counts those that are held out. Raises ConfigError where it says nothing."""
+    what the registry says, less those that are held out by hash, as if none was damaged and joined datasets were one.
+    Raises ConfigError where it says nothing."""
     from data_pipelines.registry import get_spec
+    from data_pipelines.sampling.splits import count_held_out
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
-    simulated = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
-    episodes = {name: simulated.get(name) or get_spec(name).episodes for name in study.dataset_names()}
-    unknown = [name for name, n in episodes.items() if not n]
+    episodes = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
+    given = {name: get_spec(name) for name in study.dataset_names() if name not in episodes}
+    unknown = [name for name, spec in given.items() if not spec.episodes]
     require(
         not unknown,
         f"the axis episodes needs the number of trajectories, which is unknown for {few(unknown)}: write `episodes` "
         "into the entries of your registry (`hma data inspect DIR --entry FILE` counts them), or leave the axis out",
     )
+    own = study.store
+    for name, spec in given.items():
+        held_out = count_held_out(spec.episodes, own.val_fraction, own.min_val, own.max_val, own.max_val_fraction)
+        episodes[name] = spec.episodes - (0 if spec.val_split else held_out)
     most = study.trajectory_counts[-1]
-    return sum(min(n, most, cap or most) for n in episodes.values())
+    return sum(min(episodes[name], most, cap or most) for name in study.dataset_names())
 
 
 if __name__ == "__main__":

@@ -148,12 +148,22 @@ def test_trajectories_are_counted_as_they_are():
 
 def test_trajectories_that_nobody_counted_are_not_counted_as_none(monkeypatch):
     """All of them stood at 0, before 4 of each; the change along the axis then had the wrong sign."""
-    counts = {"mine": 300, "yours": 40}
-    monkeypatch.setattr("data_pipelines.registry.get_spec", lambda name: SimpleNamespace(episodes=counts[name]))
+    counts, split = {"mine": 300, "yours": 40}, {"mine": "", "yours": ""}
+    monkeypatch.setattr(
+        "data_pipelines.registry.get_spec",
+        lambda name: SimpleNamespace(episodes=counts[name], val_split=split[name]),
+    )
     study = replace(CPU_FULL, datasets=tuple(counts), dataset_counts=(1, 2), unseen=(), trajectory_counts=(4, 200))
-    found = sorted({p.x: p.trial.max_trajectories for p in find_axis("episodes")(study).points}.items())
-    # 256 takes none of the 200 that the reference has.
-    assert found == [(8, 4), (32, 16), (104, 64), (240, 200)]
+
+    def found() -> list[tuple[float, int | None]]:
+        return sorted({p.x: p.trial.max_trajectories for p in find_axis("episodes")(study).points}.items())
+
+    # Of the 40, 8 are held out; 256 takes none of the 200 that the reference has.
+    assert found() == [(8, 4), (32, 16), (96, 64), (232, 200)]
+    counts |= {"mine": 20, "yours": 20}  # 5 of each are held out: 16 and all of them were the same training twice
+    assert found() == [(8, 4), (30, 200)]
+    split["yours"] = "val"
+    assert found() == [(8, 4), (31, 16), (35, 200)]
     counts["yours"] = 0
     with pytest.raises(
         ConfigError, match="needs the number of trajectories, which is unknown for yours: write `episodes` into"
