@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.simulator import SuiteSimulator, suite_robot
-from experiments.applications.judging.rollouts import make_starts, run
+from experiments.applications.judging.rollouts import run
 from experiments.applications.policies import RandomPolicy, diffusion, find_task, load_policy, record, save_policy
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
@@ -21,7 +21,6 @@ from experiments.applications.policies.diffusion import (
 )
 from experiments.applications.policies.learning import FitConfig, log_spaced_steps
 from experiments.applications.policies.network import EncoderConfig, as_floats, random_shift
-from experiments.applications.policies.scripted import ScriptedPolicy
 from experiments.applications.policies.tasks import held
 from hma_jax.config import ConfigError
 from hma_jax.kernels.random import key_of
@@ -73,15 +72,29 @@ def test_demonstrations_are_kept_in_a_file(demos, tmp_path):
         load_demonstrations(path)
 
 
-def test_the_scripted_expert_acts_on_the_true_state_and_its_actions_elsewhere_fail():
-    simulator, starts = SuiteSimulator([ROBOT], episodes=6), make_starts(TASK, 6, 64, 1)
-    policy = ScriptedPolicy(TASK, simulator, noise=0.0)
-    good = run(simulator, policy, starts, range(6), TASK)
-    simulator.reset(starts)
-    policy.reset()
-    elsewhere = run(simulator, policy, starts, range(6), TASK, shuffled=True)
+class Replayed:
+    """A policy that gives the actions of recorded episodes."""
+
+    def __init__(self, actions):
+        self.actions = actions
+
+    def reset(self, episodes=None, *, seeds=None):
+        self.frame = -1
+
+    def act(self, images):
+        self.frame += 1
+        return self.actions[:, self.frame]
+
+
+def test_a_rollout_is_what_its_actions_do_and_the_control_executes_those_of_another_episode():
+    demos, nothing = record(TASK, 6, noise=0.0), np.zeros((0, 4), np.float32)
+    starts = [Start("gripper_wood", demos.images[i, :1], nothing, int(demos.seeds[i])) for i in range(6)]
+    simulator, policy = SuiteSimulator([ROBOT], episodes=6), Replayed(demos.actions)
+    good, elsewhere = (run(simulator, policy, starts, range(6), TASK, shuffled=s) for s in (False, True))
+    np.testing.assert_array_equal(good.images[:, :-1], demos.images)
+    np.testing.assert_array_equal(good.reached[:, :-1], demos.reached)
+    np.testing.assert_array_equal(elsewhere.actions, np.roll(demos.actions, 1, axis=0))
     assert good.reached.any(1).mean() > 0.6 > 0.4 > elsewhere.reached.any(1).mean()
-    assert not good.reached[:, 0].any() and good.images.shape == (6, 9, 64, 64, 3)
 
 
 def test_cloning_learns_and_is_a_function_of_its_seed(demos):
