@@ -144,7 +144,7 @@ def test_keys_drive_once_the_rate_is_chosen(browsing):
 
 def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
     async def test(browser, address, client):
-        page = await opened(browser, address)
+        page = await opened(browser, address, has_touch=True)
         await page.click("#robots button[data-name=arm]")
         await page.wait_for_function("document.querySelectorAll('.slider').length == 7")
         box = await page.locator("#dimension3").bounding_box()
@@ -154,6 +154,17 @@ def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
         action = (await actions(client))[0][:7]
         assert action[3] > 0.7 and action[2] == pytest.approx(0.5, abs=0.01), action
         await page.mouse.up()
+        finger = await page.context.new_cdp_session(page)
+        for kind, share in (("touchStart", 0.9), ("touchMove", 0.8)):
+            place = [{"x": box["x"] + box["width"] * share, "y": box["y"] + box["height"] / 2}]
+            await finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": place})
+        await page.wait_for_function("state.drag.size")
+        await finger.send("Input.dispatchTouchEvent", {"type": "touchCancel", "touchPoints": []})
+        await page.wait_for_function("!state.drag.size")
+        for ends in ("letGo()", "begin(state.robot, 0)"):
+            await page.evaluate(f"state.drag.set(3, 0.9); {ends}")
+            assert await page.evaluate("state.drag.size") == 0, ends
+        await frames(page, 4)
         await page.click("#run")
         await page.wait_for_timeout(300)
         before = await count(page)
