@@ -43,8 +43,9 @@ function label(value) {
 }
 function move(by) { at = Math.min(Math.max(at + by, 0), clips.length - 1); show(); }
 document.addEventListener('keydown', (event) => {
-  const keys = {s: () => label(true), f: () => label(false), ArrowLeft: () => move(-1), ArrowRight: () => move(1)};
-  const does = keys[event.key];
+  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+  const keys = {s: () => label(true), f: () => label(false), arrowleft: () => move(-1), arrowright: () => move(1)};
+  const does = keys[event.key.toLowerCase()];  // after Caps Lock, too
   if (does) { does(); event.preventDefault(); }
 });
 document.getElementById('success').onclick = () => label(true);

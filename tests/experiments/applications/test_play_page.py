@@ -162,7 +162,7 @@ def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
         await finger.send("Input.dispatchTouchEvent", {"type": "touchCancel", "touchPoints": []})
         await page.wait_for_function("!state.drag.size")
         for ends in ("letGo()", "begin(state.robot, 0)"):
-            await page.evaluate(f"state.drag.set(3, 0.9); {ends}")
+            await page.evaluate(f"state.drag.set(2, 0.9); {ends}")
             assert await page.evaluate("state.drag.size") == 0, ends
         await frames(page, 4)
         await page.click("#run")
