@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from experiments.cost import declared_table
 from experiments.done import UNKNOWN
@@ -11,17 +12,37 @@ from experiments.running.launchers.registry import LauncherOptions
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from experiments.words import few
-from hma_jax.config import MeshConfig, TrainConfig, require
+from hma_jax.config import ConfigError, MeshConfig, TrainConfig, require
 
 
 def require_trainable(study: Study, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> None:
-    """Raises ConfigError for a trial that would fail once all is prepared (`check_trials`)."""
-    share = launcher_options.share()
-    if share is None and launcher_options.name == "local":  # no accelerator was found: they have what JAX finds here
+    """Raises ConfigError for a trial that would fail once all is prepared (`check_launched`)."""
+    if launcher_options.share() is None and launcher_options.name == "local":  # they have what JAX finds here
         import jax
 
-        share = float(jax.device_count())
-    check_trials(study, sweeps, share)
+        check_trials(study, sweeps, float(jax.device_count()))
+    else:
+        check_launched(study, sweeps, launcher_options)
+
+
+def check_launched(study: Study, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> float:
+    """`check_trials` on what the launcher gives each. Where that is too much of this machine, the error names how many
+    --workers may share it."""
+    share = launcher_options.share()
+    try:
+        return check_trials(study, sweeps, share)
+    except ConfigError as error:
+        if share is None or launcher_options.name != "local":
+            raise
+        devices = share * (launcher_options.workers or 1)
+        several = replace(launcher_options, workers=int(devices) // study.execution.mesh.min_devices)
+        try:
+            check_trials(study, sweeps, several.share())
+        except ConfigError:
+            raise error from None
+        raise ConfigError(
+            f"{error}; or run several trials at a time, each on its part of this machine: --workers {several.workers}"
+        ) from error
 
 
 def devices_of(mesh: MeshConfig, share: float | None) -> float:

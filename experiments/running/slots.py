@@ -13,6 +13,8 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
 from typing import Literal
@@ -64,17 +66,24 @@ class Slot:
 
 
 def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerators | None:
-    """GPUs or TPU chips that `environment` lets this process use; None without any, or if JAX_PLATFORMS excludes
-    them."""
+    """GPUs or TPU chips that `environment` lets this process use: those that it names, or else all that are here and
+    that JAX is installed for. None without any, or if JAX_PLATFORMS excludes them."""
     platforms = environment.get("JAX_PLATFORMS", "")
     if platforms and not set(platforms.split(",")) & {"cuda", "gpu", "tpu"}:
         return None
     for kind, variable, find in (("gpu", "CUDA_VISIBLE_DEVICES", _gpus), ("tpu", "TPU_VISIBLE_CHIPS", _tpu_chips)):
         visible = environment.get(variable)
         names = find() if visible is None else _named(visible)
-        if names:
+        if names and (visible is not None or _jax_uses(kind)):
             return Accelerators(kind, names)
     return None
+
+
+def _jax_uses(kind: str) -> bool:
+    """Whether JAX has what it needs for them: without it, it computes on the processor, whatever is here."""
+    if kind == "tpu":
+        return find_spec("libtpu") is not None or "TPU_LIBRARY_PATH" in os.environ
+    return any("cuda" in plugin.value for plugin in entry_points(group="jax_plugins"))
 
 
 def _named(visible: str) -> tuple[str, ...]:

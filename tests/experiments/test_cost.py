@@ -153,9 +153,16 @@ def test_a_mesh_that_a_trial_does_not_divide_over_is_refused_before_it_is_priced
     monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", ("0", "1", "2")))
     for command in ("train", "study"):
         assert main([command, "--preset", "smoke", "--dry-run"]) == 2
-        assert "a batch of 4 cannot be divided over data=3 x fsdp=1 devices" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "a batch of 4 cannot be divided over data=3 x fsdp=1 devices" in said
+        assert ("each on its part of this machine: --workers 3" in said) == (command == "study")
         assert main([command, "--preset", "smoke", "--dry-run", "--mesh", "1", "1", "3"]) == 2
-        assert "tensor=3 does not divide the model's heads of 2" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "tensor=3 does not divide the model's heads of 2" in said and "--workers" not in said
+    study = ["study", "--preset", "smoke", "--dry-run"]
+    assert main([*study, "--mesh", "1", "1", "1"]) == 2
+    assert "does not fit 3 device(s); set one axis to -1" in (said := capsys.readouterr().err) and "--workers 3" in said
+    assert main([*study, "--workers", "3"]) == 0
 
 
 def test_a_decay_that_begins_within_the_warm_up_is_refused_before_anything_is_made(capsys, tmp_path):

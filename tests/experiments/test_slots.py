@@ -1,6 +1,7 @@
 """Trials that run at a time on one machine divide it: no GPU or chip belongs to two unless it must."""
 
 import os
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -64,7 +65,20 @@ def test_slots_share_the_cores():
 def test_what_the_user_allows_is_what_is_divided(environment, found, monkeypatch):
     monkeypatch.setattr(slots, "_gpus", lambda: ("0", "1"))
     monkeypatch.setattr(slots, "_tpu_chips", lambda: ())
+    plugins = [EntryPoint("xla_cuda13", "jax_plugins.xla_cuda13", "jax_plugins")]
+    monkeypatch.setattr(slots, "entry_points", lambda group: plugins)
     assert find_accelerators(environment) == found
+    plugins.clear()  # JAX for the processor alone, as a plain install brings it
+    assert find_accelerators(environment) == (found if environment else None)
+
+
+def test_tpu_chips_count_where_jax_has_their_library(monkeypatch):
+    monkeypatch.delenv("TPU_LIBRARY_PATH", raising=False)
+    monkeypatch.setattr(slots, "_gpus", lambda: ())
+    monkeypatch.setattr(slots, "_tpu_chips", lambda: ("0",))
+    for library, found in ((None, None), (object(), Accelerators("tpu", ("0",)))):
+        monkeypatch.setattr(slots, "find_spec", lambda name: library)
+        assert find_accelerators({}) == found
 
 
 def test_gpus_are_counted_by_their_devices_where_a_container_has_no_program_that_lists_them(tmp_path, monkeypatch):
