@@ -8,7 +8,6 @@ import json
 import logging
 from collections.abc import AsyncIterator, Callable
 from importlib.resources import files
-from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
 
@@ -36,6 +35,8 @@ EXTRA_CONNECTIONS = 32
 
 SESSIONS = web.AppKey("sessions", SessionManager)
 SOCKETS = web.AppKey("sockets", set)
+REFUSED = web.AppKey("refused", asyncio.Event)
+"""Set once the refusal of another server's page was logged: strangers cannot fill the log."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -47,7 +48,7 @@ def make_app(simulator: Simulator, truth: Truth, max_acting: int | None = None) 
     """The application; it serves as many visitors at once as the simulator has episodes. Of those, `max_acting`
     (default: all) act at once, until `SESSIONS` is told that more can."""
     app = web.Application(client_max_size=LARGEST_MESSAGE)
-    app[SOCKETS] = set()
+    app[SOCKETS], app[REFUSED] = set(), asyncio.Event()
     app.cleanup_ctx.append(lambda app: _manage_sessions(app, simulator, truth, max_acting))
     about = json.dumps(describe(simulator, truth))
     page = files("experiments.applications.play").joinpath("page.html").read_text()
@@ -112,12 +113,24 @@ def describe(simulator: Simulator, truth: Truth) -> list[dict]:
 def _same_origin(request: web.Request) -> bool:
     """Whether the page that connects came from here: others must not drive what a visitor's browser can reach."""
     origin = request.headers.get("Origin")
-    return origin is None or urlsplit(origin).netloc == request.host
+    return origin is None or origin.partition("://")[2] == request.host  # any text may be sent as one
+
+
+def _log_refusal(request: web.Request) -> None:
+    if not request.app[REFUSED].is_set():
+        request.app[REFUSED].set()
+        log.warning(
+            "refused a page of %.80r, which connects to %.80r; further refusals are not logged. If the page is this "
+            "server's own, behind a proxy, the proxy must pass the Host header (docs/simulator.md)",
+            request.headers["Origin"],
+            request.host,
+        )
 
 
 async def _drive(request: web.Request) -> web.StreamResponse:
     sessions, sockets = request.app[SESSIONS], request.app[SOCKETS]
     if not _same_origin(request):
+        _log_refusal(request)
         raise web.HTTPForbidden(text="this page is served elsewhere")
     if len(sockets) >= len(sessions.simulator) + EXTRA_CONNECTIONS:
         raise web.HTTPServiceUnavailable(text="too many connections")

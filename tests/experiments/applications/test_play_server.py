@@ -388,9 +388,12 @@ def test_requests_that_wait_are_bounded():
     serving(test)
 
 
-def test_a_page_from_elsewhere_cannot_connect():
+def test_a_page_from_elsewhere_cannot_connect_and_the_log_says_so_once(caplog):
     async def test(client):
-        answer = await client.get("/drive", headers={"Origin": "http" + "://elsewhere.example"})
-        assert answer.status == 403
+        for origin in ("elsewhere.example", "elsewhere.example:80", "["):
+            answer = await client.get("/drive", headers={"Origin": "http" + f"://{origin}"})
+            assert answer.status == 403
+        [said] = [record.getMessage() for record in caplog.records if "refused" in record.message]
+        assert "://elsewhere.example'" in said and f"'127.0.0.1:{client.port}'" in said
 
     serving(test)
