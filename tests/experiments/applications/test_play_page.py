@@ -115,7 +115,10 @@ def test_keys_move_the_robot_and_letting_go_stops_it(browsing):
         await frames(page, 3)
         pressed = (await actions(client))[0][:2]
         assert pressed[0] == 0 and pressed[1] < 0, pressed
-        await page.keyboard.up("KeyS")
+        await page.keyboard.down("Meta")
+        await frames(page, 3)
+        assert (await actions(client))[0][:2] == [0, 0], "macOS does not tell that S is let go"
+        await page.keyboard.up("Meta")
         await page.click("#run")
         await page.wait_for_timeout(300)
         before = await count(page)
