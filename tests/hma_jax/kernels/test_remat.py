@@ -6,9 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src.cudnn import fused_attention_stablehlo
 
 from hma_jax.config import ExecutionConfig
 from hma_jax.config.execution import Remat
+from hma_jax.kernels import cudnn
+from hma_jax.kernels.remat import checkpointed
 from hma_jax.model.hma import declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch
 
@@ -48,6 +51,17 @@ WEIGHTS_OVER_TIME = CONFIG.frames * CONFIG.heads / CONFIG.width
 )
 def test_a_block_keeps_what_its_policy_says(remat: str, widths: float):
     assert widths_kept(remat) == pytest.approx(widths, rel=0.02)
+
+
+@pytest.mark.parametrize("remat, computed", [("products", 1), ("attention", 1), ("everything", 2)])
+def test_what_cudnn_leaves_for_its_gradient_is_kept(monkeypatch, remat: str, computed: int):
+    """Traced only, as without a GPU the kernel does not run."""
+    monkeypatch.setattr(fused_attention_stablehlo, "check_cudnn_version", lambda: 91000)
+    block = checkpointed(lambda x, _: (jnp.sin(cudnn.within(x, 1.0)), None), remat, scanned=True)
+    qkv = jnp.zeros((1, 2, 8, 3, 2, 8), jnp.bfloat16)
+    traced = str(jax.make_jaxpr(jax.grad(lambda x: jnp.sum(block(x, None)[0])))(qkv))
+    assert traced.count("dot_product_attention_bwd") == 1
+    assert traced.count("dot_product_attention_fwd") == computed
 
 
 @pytest.mark.slow
