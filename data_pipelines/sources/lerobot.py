@@ -34,13 +34,17 @@ EPISODE, TIME, TASK, SUCCESS, REWARD = "episode_index", "timestamp", "task_index
 class LeRobotSource:
     """Cameras go by their full or short name, `observation.images.top` or `top`.
 
-    Raises DataError for a directory that is no such dataset, ConfigError for an unknown camera.
+    Raises DataError for a directory that is no such dataset and, unless `may_lose`, for episodes that the meta folder
+    has lost; ConfigError for an unknown camera.
     """
 
-    def __init__(self, root: str | Path, settings: LeRobotSettings = LeRobotSettings()):
+    def __init__(self, root: str | Path, settings: LeRobotSettings = LeRobotSettings(), *, may_lose: bool = False):
         settings.check()
         self.root, self.short_side = Path(root), settings.short_side
         self.meta = read_meta(self.root)
+        numbered = self.meta.episodes[-1].index < self.meta.stated  # else nobody knows which ones are lost
+        if self.meta.lost_why and not (may_lose and numbered):
+            raise DataError(self.meta.lost_why)
         features = self.meta.features
         _check_names(features, self.root / "meta" / "info.json")
         available = {_short(key): key for key, feature in features.items() if _is_camera(feature)}

@@ -60,14 +60,18 @@ class LeRobotDataset(EpisodeSource):
         self.location, self.split = Path(root), split
         self.schema = self.location / "meta" / "info.json"
         self.name = dataset_name(self.location)
-        self._read = LeRobotSource(root)
-        self._entries = self._read.meta.episodes
-        self.version = self._read.meta.version
+        self._read = LeRobotSource(root, may_lose=corrupt == "skip")
+        meta = self._read.meta
+        self._entries, self.version = meta.episodes, meta.version
         self._cameras = {step_key(k): name for k, name in self._read.cameras.items()}
         self._vectors = {step_key(k): name for k, name in self._read.vectors.items()}
         self.features = self._read.layout.flat_features(self._read.unsupported_images)
-        self._numbered = np.asarray([e.index for e in self._entries], np.int64)
-        self.runs = _runs(self._numbered)
+        listed = np.asarray([e.index for e in self._entries], np.int64)
+        if meta.lost_why:  # the lost ones are named too, so that every other one stays where it is in the hold-out
+            self.runs, self._numbers = (EpisodeRun("episodes", 0, meta.stated),), listed
+            self.count_skipped(meta.lost_why, meta.stated - len(listed))
+        else:
+            self.runs, self._numbers = _runs(listed), np.arange(len(listed))
         self._lengths = np.asarray([e.length for e in self._entries], np.int64)
         self._paths = sorted({p for e in self._entries for p in (e.data, *(f for f, _ in e.videos.values()))})
         self.files = len(self._paths)
@@ -75,6 +79,10 @@ class LeRobotDataset(EpisodeSource):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        return self._numbers
 
     @property
     def hz(self) -> float:

@@ -39,13 +39,18 @@ class EpisodeEntry:
 
 @dataclass(frozen=True)
 class LeRobotMeta:
-    """`features` as info.json has them; `tasks` by task_index."""
+    """`features` as info.json has them; `tasks` by task_index.
+
+    `stated`: how many episodes there are by info.json. Where fewer are listed, `lost_why` is a message on it, else "".
+    """
 
     version: str
     fps: float
     features: dict[str, dict[str, Any]]
     episodes: tuple[EpisodeEntry, ...]
     tasks: dict[int, str]
+    stated: int
+    lost_why: str
 
 
 def read_meta(root: Path) -> LeRobotMeta:
@@ -76,7 +81,16 @@ def read_meta(root: Path) -> LeRobotMeta:
                 f"{root / 'meta'}: episode {one.index} is listed twice, as happens when recording was resumed. Remove "
                 "one of the two lines, or download the dataset again."
             )
-    return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), _tasks(root, version))
+    stated, lost_why = info.get("total_episodes") or 0, ""
+    if len(episodes) < stated:
+        absent = next((n for n, e in enumerate(episodes) if e.index != n), len(episodes))
+        lost_why = (
+            f"{root / 'meta'}: it lists {len(episodes)} episodes, without episode {absent}, but total_episodes in "
+            f"info.json is {stated}. Download the meta folder again; if episodes were removed on purpose, write "
+            f"{len(episodes)} there."
+        )
+    tasks = _tasks(root, version)
+    return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), tasks, stated, lost_why)
 
 
 def _episodes_2(root: Path, info: dict[str, Any], videos: list[str]) -> list[EpisodeEntry]:
@@ -173,6 +187,15 @@ def _check_info(info: dict[str, Any], path: Path) -> None:
             raise DataError(f"{path}: {field} is {quote(info[field])}, not a path. {ADVICE}")
     if info.get("chunks_size") is not None:
         _count(info, "chunks_size", str(path))
+    if info.get("total_episodes") is not None:
+        _count(info, "total_episodes", str(path))
+    splits = info.get("splits") or {}
+    if not isinstance(splits, dict) or set(splits) - {"train"}:
+        found = ", ".join(map(quote, splits)) if isinstance(splits, dict) else quote(splits)
+        raise DataError(
+            f"{path}: splits is {found}, but every episode would be read as one of 'train'. Divide the dataset with "
+            'LeRobot\'s own scripts; to train on all its episodes, write "splits": {} there.'
+        )
     if not isinstance(features, dict):
         raise DataError(f"{path}: features is {quote(features)}, not an object. {ADVICE}")
     for name, feature in features.items():

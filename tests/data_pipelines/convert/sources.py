@@ -139,6 +139,7 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
         "fps": FPS,
         "chunks_size": 1000,
         "total_episodes": len(lengths),
+        "splits": {"train": f"0:{len(lengths)}"},
         "features": features,
         "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
         if old

@@ -148,6 +148,8 @@ def test_length_and_rows_must_agree(tmp_path):
     [
         ({"codebase_version": "v1.6"}, "codebase_version is 'v1.6'; only v2.0, v2.1, v3.0 can be read"),
         ({"fps": None}, "no 'fps'"),
+        ({"splits": {"train": "0:1", "test": "1:2"}}, "splits is 'train', 'test', but .* to train on all"),
+        ({"total_episodes": 3}, "it lists 2 episodes, without episode 2"),
         ({"video_path": None}, "'video_path' is missing"),
         (
             {"features": {"action": {"dtype": "float32", "shape": [2]}}},
@@ -208,7 +210,7 @@ def test_image_stays_below_the_root(tmp_path):
     [
         {"fps": "fast"}, {"fps": float("inf")}, {"features": [1]}, {"features": {"action": 7}},
         {"features": {"action": {"dtype": "float32"}}}, {"features": {"a": {"dtype": "x", "shape": [2**40, 2**40]}}},
-        {"data_path": 7}, {"chunks_size": -1}, {"chunks_size": "x"},
+        {"data_path": 7}, {"chunks_size": -1}, {"chunks_size": "x"}, {"total_episodes": "2"},
     ],
 )  # fmt: skip
 def test_info_of_the_wrong_kind_is_named(tmp_path, change):

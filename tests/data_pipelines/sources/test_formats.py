@@ -108,6 +108,16 @@ def test_an_episode_of_lerobot_keeps_its_name_when_others_are_gone(tmp_path):
     path = root / "meta" / "episodes.jsonl"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text(lines[0] + lines[2])
+    with pytest.raises(
+        DataError, match="meta: it lists 2 episodes, without episode 1, but total_episodes .* is 3.*write 2"
+    ):
+        open_source(root)
+    source = open_source(root, corrupt="skip")
+    assert list(source.skipped.values()) == [1]
+    assert source.ids.tolist() == ids.tolist() and source.numbers.tolist() == [0, 2]
+    assert source.episode(1, TOP.image_key, ()).steps == 7
+    info = root / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"total_episodes": 2}))
     assert open_source(root).ids.tolist() == [ids[0], ids[2]]
 
 
