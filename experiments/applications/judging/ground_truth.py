@@ -80,11 +80,12 @@ class SimulatedTruth:
         return {}
 
     def demonstrations(self) -> Demonstrations:
-        config = self.config
-        short = replace(config.task, frames=config.demonstration_frames)
+        config, task = self.config, self.config.task
+        if task.hold <= config.demonstration_frames:  # none that is shorter can succeed
+            task = replace(task, frames=config.demonstration_frames)
         with self._step(f"record {config.demonstrations} demonstrations"):
             made = record(
-                short,
+                task,
                 config.demonstrations,
                 stride=self._robot.stride,
                 image_size=self._size,
@@ -92,7 +93,7 @@ class SimulatedTruth:
                 after=0,
                 seed=config.seed,
             )
-        if seldom := describe_rare_success(made, short):
+        if seldom := describe_rare_success(made, task):
             say(seldom)
         return made
 

@@ -12,6 +12,7 @@ import pytest
 from experiments.applications.judging import judge
 from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
 from experiments.applications.judging.config import JudgeConfig
+from experiments.applications.judging.ground_truth import SimulatedTruth
 from experiments.applications.judging.head import PIECE, HeadConfig, HeadJudge, load_head
 from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
@@ -75,6 +76,15 @@ def test_what_is_too_little_to_judge_by_is_refused_before_policies_are_trained(n
     assert replace(ASKED, **{name: least})
     with pytest.raises(ConfigError, match=f"--{name.replace('_', '-')} must be at least {least}"):
         replace(ASKED, **{name: least - 1})
+
+
+@pytest.mark.parametrize(("hold", "frames"), [(4, 4), (5, 6)])
+def test_demonstrations_are_as_long_as_the_task_where_the_goal_is_held_longer_than_they_are(hold, frames):
+    task = find_task("gripper_wood", frames=6, hold=hold)
+    robot = SimpleNamespace(name="gripper_wood", action_dim=4, stride=1)
+    learned = SimpleNamespace(tokenizer=SimpleNamespace(image_size=8))
+    made = SimulatedTruth(replace(ASKED, task=task), robot, learned, step).demonstrations()
+    assert made.actions.shape[1] == frames
 
 
 @pytest.mark.parametrize("kind", ["cloned", "diffusion"])
