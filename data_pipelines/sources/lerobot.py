@@ -9,7 +9,6 @@ Depth and grey cameras are not read; `unsupported_images` lists them with their 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import quote, safe_join
 from data_pipelines.sources.convertible import Episode, Layout, UnitError, choose
-from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta
+from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_meta, read_meta
 from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
@@ -80,12 +79,10 @@ class LeRobotSource:
         files = {e.data for e in self.meta.episodes} | {f for e in self.meta.episodes for f, _ in e.videos.values()}
         sizes = {str(f.relative_to(self.root)): f.stat().st_size if f.exists() else -1 for f in sorted(files)}
         return {
-            "format": self.meta.version,
             "root": self.root.name,
+            "meta": hash_meta(self.root).hexdigest(),
             "files": sizes,
-            "features": json.dumps(self.meta.features, sort_keys=True),
             "cameras": list(self.cameras),
-            "hz": self.hz,
             "short_side": self.short_side,
         }
 

@@ -6,7 +6,6 @@ An episode is named by its `episode_index`.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import weakref
@@ -20,7 +19,7 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
-from data_pipelines.sources.lerobot_meta import EpisodeEntry
+from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_meta
 from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
@@ -90,11 +89,7 @@ class LeRobotDataset(EpisodeSource):
 
     def fingerprint(self) -> str:
         """Hash over the meta folder, statistics of episodes included, and all files' names and sizes."""
-        digest = hashlib.sha256()
-        meta = self.location / "meta"
-        for path in sorted(p for p in meta.rglob("*") if p.is_file()):
-            content = hashlib.sha256(retry(path, path.read_bytes)).hexdigest()
-            digest.update(f"{path.relative_to(meta).as_posix()}:{content};".encode())
+        digest = hash_meta(self.location)
         for path, size in self._bytes.items():
             digest.update(f"{path.relative_to(self.location).as_posix()}:{size};".encode())
         return digest.hexdigest()[:16]

@@ -7,6 +7,7 @@ parquet tables that say in which file, and at what time of a video, each one beg
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_lines, read_object
 from data_pipelines.names import quote, safe_join
 from data_pipelines.sources.parquet_rows import ADVICE, read_table
+from data_pipelines.sources.rlds.location import retry
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 
@@ -91,6 +93,15 @@ def read_meta(root: Path) -> LeRobotMeta:
         )
     tasks = _tasks(root, version)
     return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), tasks, stated, lost_why)
+
+
+def hash_meta(root: Path) -> hashlib._Hash:
+    """SHA-256, to be added to, of the names and contents of all files of the meta folder."""
+    digest, meta = hashlib.sha256(), root / "meta"
+    for path in sorted(p for p in meta.rglob("*") if p.is_file()):
+        content = hashlib.sha256(retry(path, path.read_bytes)).hexdigest()
+        digest.update(f"{path.relative_to(meta).as_posix()}:{content};".encode())
+    return digest
 
 
 def _episodes_2(root: Path, info: dict[str, Any], videos: list[str]) -> list[EpisodeEntry]:

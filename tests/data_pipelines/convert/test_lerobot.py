@@ -52,6 +52,16 @@ def test_a_camera_and_a_size_can_be_chosen(tmp_path):
         LeRobotSource(root, LeRobotSettings(("wrist",)))
 
 
+@pytest.mark.parametrize("change", [("tasks.jsonl", "push", "pull"), ("episodes.jsonl", "stack", "pack")])
+def test_a_dataset_whose_meta_folder_was_changed_is_another_source(tmp_path, change):
+    root, (name, old, new) = write_lerobot(tmp_path / "toy", "v2.1"), change
+    convert(LeRobotSource(root), tmp_path, "arm")
+    path = root / "meta" / name
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ConfigError, match="was made from another source"):
+        convert(LeRobotSource(root), tmp_path, "arm")
+
+
 def late(e, rows):
     import pyarrow as pa
 
