@@ -33,8 +33,8 @@ MEANS = "evaluation.json"
 """Every metric's mean per dataset, with its error."""
 
 SHOWN = (
-    "perplexity", "accuracy", "diffusion_loss", "psnr", "psnr_copy", "ssim", "lpips", "lpips_copy", "delta_psnr",
-    "action_nats", "retrieval", "counterfactual_gain", "action_error", "action_gain",
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "psnr_last", "psnr_copy", "ssim", "lpips", "lpips_copy",
+    "delta_psnr", "action_nats", "retrieval", "counterfactual_gain", "action_error", "action_gain",
 )  # fmt: skip
 """Metrics in the table of `hma evaluate`, where a model has them, beside what a copied frame has; evaluation.json
 holds all, and windows.parquet those of every window."""

@@ -4,7 +4,7 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
 
 * likelihood: cross-entropy (continuous: diffusion loss) of each frame, wholly masked, given the
   true frames before it;
-* fidelity: PSNR and SSIM of an autoregressive rollout from the prompt against the recorded
+* fidelity: PSNR and SSIM, means over the predicted frames, of an autoregressive rollout from the prompt against the recorded
   images (not their reconstruction by the tokenizer); windows longer than the model's are
   continued past it, and their likelihood is that of the first T frames;
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
@@ -20,7 +20,8 @@ frames.
 
 With `eval.context` "recorded" every frame is predicted from recorded ones and random actions
 replace all of a window's, as the release does: for comparison with published figures.
-DIFFERS: random and true actions share their random numbers (reference section 6.3). The
+DIFFERS: `psnr` is the mean over all predicted frames, as SSIM is; the release's PSNR is that of the last frame,
+`psnr_last` here. Random and true actions share their random numbers (reference section 6.3). The
 release's own autoregressive mode replaces one context frame only (reference section 6.2); ours is a rollout.
 
 Everything here is pure and works on tokens; how predicted ones compare as images is in `images`.

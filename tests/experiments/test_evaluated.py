@@ -36,10 +36,10 @@ def test_the_same_evaluation_may_be_repeated_of_a_later_step_too(tmp_path):
 
 def test_a_model_is_shown_beside_a_copied_frame():
     one = np.zeros(1, np.int64)
-    metrics = {"psnr": np.full(1, 9.0), "psnr_copy": np.full(1, 19.5), "ssim": np.full(1, 0.5)}
+    metrics = {"psnr_last": np.full(1, 8.0), "psnr": np.full(1, 9.0), "psnr_copy": np.full(1, 19.5)}
     table = table_of(summarise(WindowTable(np.array(["arm"]), one, one, one + 4, metrics), 1), "a run")
-    assert [column.header for column in table.columns] == ["dataset", "psnr", "psnr_copy", "ssim"]
-    assert [list(column.cells)[0] for column in table.columns] == ["arm", "9", "19.5", "0.5"]
+    assert [column.header for column in table.columns] == ["dataset", "psnr", "psnr_last", "psnr_copy"]
+    assert [list(column.cells)[0] for column in table.columns] == ["arm", "9", "8", "19.5"]
 
 
 def test_clips_of_an_evaluation_do_not_stay_beside_one_without(tmp_path):
