@@ -40,9 +40,6 @@ as long takes its connection for lost."""
 CLOSE_SECONDS = 1.0
 """Within which a page that loses its session must have been told, before its connection is closed."""
 
-RECONNECT_SECONDS = 120.0
-"""For which a session is kept after its connection was lost, for the visitor to reconnect."""
-
 IDLE_SECONDS = 900.0
 """Without a request, after which a connected visitor's session may be given to somebody else."""
 
@@ -148,25 +145,15 @@ class SessionManager:
             raise NoFreeSession
         gone = min(away, key=lambda v: (v.socket is not None, v.active))
         self._disconnect(gone, "your place was given to another visitor; reload the page")
-        self.remove(gone)
+        del self.visitors[gone.token]
+        self._free.append(gone.session.episode)
 
     def connection_lost(self, visitor: Visitor, socket: web.WebSocketResponse) -> None:
-        """The connection ended. The session is kept for RECONNECT_SECONDS."""
+        """The connection ended. The session is kept, for the visitor to reconnect, until somebody else needs it."""
         if visitor.socket is socket:
             visitor.socket = visitor.replies = visitor.transport = None
             visitor.requests.clear()
             visitor.active = time.monotonic()
-
-    def remove(self, visitor: Visitor) -> None:
-        if self.visitors.pop(visitor.token, None) is not None:
-            self._free.append(visitor.session.episode)
-
-    def remove_expired(self) -> None:
-        """Frees the sessions of those who have been away for too long."""
-        now = time.monotonic()
-        for visitor in list(self.visitors.values()):
-            if visitor.socket is None and now - visitor.active > RECONNECT_SECONDS:
-                self.remove(visitor)
 
     # --- Requests ------------------------------------------------------------------------------------
 
@@ -213,7 +200,6 @@ class SessionManager:
                     due[i].tell(message)
             if any(v.requests for v in self.visitors.values()):
                 self._wanted.set()
-            self.remove_expired()
 
     def _next_round(self) -> list[Visitor]:
         """The visitors whose oldest request is answered next: all who have one, but at most `max_acting` of those who

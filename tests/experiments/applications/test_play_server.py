@@ -57,10 +57,15 @@ def test_two_visitors_do_not_mix():
 
 def test_a_lost_connection_finds_its_episode_again():
     async def test(client):
-        player, again = Player(client), Player(client)
+        player, other, again = Player(client), Player(client), Player(client)
         await player.enter()
         await player.drive(0.5, 2)
         player.socket._response.connection.transport.abort()  # without a word
+        gone = client.server.app[server.SESSIONS].visitors[player.token]
+        await until(lambda: gone.socket is None)
+        gone.active -= 86_400  # for as long as nobody needs the place
+        await other.enter()
+        await other.drive(0.5, 1)
         hello = await again.enter(token=player.token, begin=False)
         assert (hello["token"], hello["robot"]) == (player.token, "arm")
         frame = await ask(again.socket, type="rewind", frames=0)
