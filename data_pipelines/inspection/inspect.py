@@ -24,13 +24,19 @@ from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
 from data_pipelines.sources.rlds.schema import field_slice, read_features, read_info, step_key
-from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, SourceFrame, decode_frame
+from data_pipelines.sources.source import (
+    INSTRUCTION_KEYS,
+    SUCCESS_KEY,
+    EpisodeSource,
+    SourceFrame,
+    decode_frame,
+    find_instruction,
+)
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
-INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
 MAX_ACTION_WIDTH = 256
 """Values of a field that is taken for an action by its name; wider ones are usually embeddings or flattened images. The
 field `action` itself may be wider: it may hold the actions of several steps."""
@@ -373,12 +379,10 @@ class _CameraLog:
 
 
 def _example(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> ExampleEpisode:
-    found = (record.get(key, ()) for key in INSTRUCTION_KEYS)
-    text = next((values[0] for values in found if len(values) and isinstance(values[0], bytes)), b"")
     success = record.get(SUCCESS_KEY)
     known = isinstance(success, np.ndarray) and len(success) == 1
     flag = bool(success[0]) if known else None
-    return ExampleEpisode(i, steps, flag, text.decode(errors="replace"), times, shrink(looked), actions)
+    return ExampleEpisode(i, steps, flag, find_instruction(record), times, shrink(looked), actions)
 
 
 def _size(values: np.ndarray | list[bytes]) -> int:

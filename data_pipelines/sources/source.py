@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 INSTRUCTION_KEY = "steps/language_instruction"
 
+INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
+"""Where RLDS datasets keep the text of a task."""
+
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
 
@@ -248,6 +251,13 @@ class EpisodeSource(ABC):
                 f"{self.name}: {total} episodes cannot be used, more than max_skipped={self.max_skipped}. The last: "
                 f"{without_advice(reason)} To use the others, raise the limit: --set store.max_skipped=N."
             )
+
+
+def find_instruction(record: Mapping[str, Any]) -> str:
+    """The first step's text in a record that was read with INSTRUCTION_KEYS; "" where it has none."""
+    found = (record.get(key, ()) for key in INSTRUCTION_KEYS)
+    text = next((values[0] for values in found if len(values) and isinstance(values[0], bytes)), b"")
+    return text.decode(errors="replace")
 
 
 def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception], at_least: int = 0) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from data_pipelines.registry import DatasetSpec, find_reader, get_spec
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.sources.open import open_source, source_name
 from data_pipelines.sources.rlds.images import fit_images
-from data_pipelines.sources.source import INSTRUCTION_KEY, REWARD_KEY
+from data_pipelines.sources.source import INSTRUCTION_KEYS, REWARD_KEY, find_instruction
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import FILE as MANIFEST
 from data_pipelines.tokens.manifest_file import load_manifest
@@ -100,10 +99,7 @@ class RldsTrajectories(Trajectories):
         spec = self.spec
         episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
         images = spec.correct(fit_images(episode.images, self._size))
-        instructions: Sequence[bytes] = ()
-        if INSTRUCTION_KEY in self._source.features:
-            instructions = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())
-        instruction = instructions[0].decode(errors="replace") if len(instructions) else ""
+        instruction = find_instruction(self._source.record(i, INSTRUCTION_KEYS))
         return _trajectory(self.origin(i), images, spec.convert(episode.actions), self._robot, instruction)
 
     def outline(self, i: int) -> Outline:

@@ -225,7 +225,10 @@ def test_counts_are_read_as_a_spreadsheet_saves_them(tmp_path):
     assert read_real(path) == {"a": (1, 2), "b": (0, 2), "c": (2, 2)}
 
 
-def test_every_format_says_how_long_a_recording_is_and_whether_it_succeeded(tmp_path):
+def test_every_format_says_how_long_a_recording_is_whether_it_succeeded_and_what_the_task_was(tmp_path):
+    def move(episode, features):  # as in many Open-X datasets
+        features["steps/observation/natural_language_instruction"] = features.pop("steps/language_instruction")
+
     written = (
         (
             write_lerobot(tmp_path / "toy-arm", "v3.0", camera="image"),
@@ -236,14 +239,20 @@ def test_every_format_says_how_long_a_recording_is_and_whether_it_succeeded(tmp_
             DatasetSpec("robomimic_lift", "observation/agentview", ("action",), (7,), 20),
         ),
         (write_rlds(tmp_path, SPEC, [5, 8]), SPEC),
+        (write_rlds(tmp_path / "moved", SPEC, [5, 8], change=move), SPEC),
     )
-    for (place, spec), outlines in zip(
-        written, ([(6, True), (5, False)], [(3, True), (12, False)], [(3, False), (4, True)]), strict=True
+    rlds = [(3, False), (4, True)]
+    for (place, spec), outlines, task in zip(
+        written,
+        ([(6, True), (5, False)], [(3, True), (12, False)], rlds, rlds),
+        ["push", "Lift", "push", "push"],
+        strict=True,
     ):
         zeros = (0.0,) * spec.action_dim
         recorded = RldsTrajectories(str(place), "train", spec, Robot(spec.name, 2, zeros, zeros, zeros), 8)
         assert [recorded.outline(i) for i in range(2)] == [Outline(*one) for one in outlines]
-        assert len(recorded[0]) == outlines[0][0] and len(set(recorded.ids().tolist())) == len(recorded)
+        assert len(recorded[0]) == outlines[0][0] and recorded[0].instruction == task
+        assert len(set(recorded.ids().tolist())) == len(recorded)
 
 
 def test_recordings_are_shown_as_their_entry_corrects_them(tmp_path):
