@@ -4,9 +4,9 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
 
 * likelihood: cross-entropy (continuous: diffusion loss) of each frame, wholly masked, given the
   true frames before it;
-* fidelity: PSNR and SSIM, means over the predicted frames, of an autoregressive rollout from the prompt against the recorded
-  images (not their reconstruction by the tokenizer); windows longer than the model's are
-  continued past it, and their likelihood is that of the first T frames;
+* fidelity: PSNR and SSIM, means over the predicted frames, of an autoregressive rollout from the
+  prompt against the recorded images (not their reconstruction by the tokenizer); windows longer
+  than the model's are continued past it, and their likelihood is that of the first T frames;
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
   under random action sequences, unmasking with the same random numbers;
 * controllability again, where a batch has other episodes' actions: action-nats, retrieval and counterfactual PSNR
