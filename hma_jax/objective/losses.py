@@ -99,12 +99,14 @@ def masked_loss(
     key_B: jax.Array,
     slice_B: jax.Array | None = None,
     real_BT: jax.Array | None = None,
+    training: bool = True,
 ) -> LossSums:
     """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise, and the past that
     `masking.own_past` and `displaced_past` ask for; `slice_B` as for the model.
 
     `real_BT` (bool; None: all) is False for frames that only fill up a window, at its end. They have no targets
     (`masking`), and where attention is causal no real frame sees them; where it is not, they are hidden here.
+    `training` as for `frame_diffusion_loss`.
     """
     slice_B = embodiment_B if slice_B is None else slice_B
     all_shown = masking.setting == "forward" and all(model.table.chunks)
@@ -137,7 +139,7 @@ def masked_loss(
     if masking.predicts_frames:
         weight, tokens = weigh_tokens(masked, tokens, masking)[:, FIRST_PREDICTED:], tokens[:, FIRST_PREDICTED:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.predictions, tokens, key_B, training=True)
+            per_token = frame_diffusion_loss(model, out.predictions, tokens, key_B, training)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
             logits = model.logits(out.predictions, tokens)

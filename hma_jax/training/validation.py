@@ -24,7 +24,7 @@ from hma_jax.training.state import TrainState
 from hma_jax.training.step import micro_batches
 
 SEED = 0
-"""Of masks and noise: the same for every run, so that runs compare."""
+"""Of masks and noise: the same for every run, so that runs that mask alike compare."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,10 @@ def make_sums(
 ) -> Callable[[Params, Mapping[str, jax.Array], jax.Array], tuple[LossSums, TargetCounts]]:
     """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function.
 
-    In as many micro-batches as a training step: where that fits into memory, this does too. Tokens count alike whatever
-    `masking.change_weight` is: runs that weigh them differently compare."""
-    masking = replace(masking, change_weight=1.0)
+    In as many micro-batches as a training step: where that fits into memory, this does too. What weighs
+    targets or degrades the past in training alone is left out: runs that differ in it compare. Masks, random ids and
+    label smoothing are those of training."""
+    masking = replace(masking, change_weight=1.0, own_past=0.0, own_past_rounds=1, displaced_past=0.0)
 
     def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:
         key = jax.random.fold_in(key_of(SEED), number)
@@ -103,7 +104,7 @@ def make_sums(
         def of_rows(one: Mapping[str, Any]) -> LossSums:
             return masked_loss(
                 declared.merge(params), one["masked"], one["tokens"], one["actions"], one["embodiment"], masking,
-                one["key"], real_BT=one.get("real"),
+                one["key"], real_BT=one.get("real"), training=False,
             )  # fmt: skip
 
         if accumulate == 1:

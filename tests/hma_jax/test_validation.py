@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig
+from hma_jax.model.hma import declare_model
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
 from hma_jax.training.validation import Validation, make_sums, make_validation_hook
@@ -96,8 +97,27 @@ def test_points_are_comparable_and_rows_that_fill_up_do_not_count(changes, maski
     for a, b in zip(padded[0], cut[0], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
     assert int(cut[1].tokens) < int(first[1].tokens)
-    weighed = jax.jit(make_sums(declared, TABLE, model, replace(masking, change_weight=3.0)))
-    assert weighed.lower(params, whole, 0).as_text() == sums.lower(params, whole, 0).as_text()
+
+
+FORCED = MaskingConfig(teacher_forcing=True)
+
+
+@pytest.mark.parametrize(
+    ("diffusion", "trained", "masking"),
+    [
+        pytest.param(None, None, replace(FORCED, change_weight=3.0), id="weighed ids"),
+        pytest.param(None, None, replace(FORCED, own_past=0.5, own_past_rounds=2), id="own past"),
+        pytest.param(None, None, replace(FORCED, displaced_past=0.5), id="displaced past"),
+        pytest.param(DIFFUSION, replace(DIFFUSION, weight_cap=5.0, time_shift=4.0), FORCED, id="weighed noise"),
+    ],
+)
+def test_what_weighs_or_degrades_in_training_alone_changes_no_held_out_loss(diffusion, trained, masking):
+    def program(diffusion, masking) -> str:
+        model = model_config(**SMALLER, diffusion=diffusion)
+        declared, batch = declare_model(model, TABLE), random_batch(0, model, 2) | {"valid": np.ones(2, bool)}
+        return jax.jit(make_sums(declared, TABLE, model, masking)).lower(declared.shapes(), batch, 0).as_text()
+
+    assert program(trained, masking) == program(diffusion, FORCED)
 
 
 def test_held_out_loss_is_of_micro_batches_where_training_is():
