@@ -92,14 +92,16 @@ def plan(
         for name, made in rows:
             _print_layouts(name, made)
             _print_sent(name, made)
+    averaged = train.ema_decay > 0
     report = tidy_table(
         f"{what}: {rows[0][1].parameters / 1e6:,.1f} M parameters, batch {train.batch}, {execution.dtype}, "
         f"remat {execution.remat}; per device:",
-        "topology", "mesh", "parameters", "moments", "activations", "peak", "TFLOP/step", "verdict",
+        "topology", "mesh", "parameters", "moments", *["average"] * averaged, "activations", "peak", "TFLOP/step",
+        "verdict",
     )  # fmt: skip
     for name, made in rows:
-        # The peak holds parameters, moments and whatever lives at once of what is computed.
-        sizes = (made.stored, 2 * made.stored, made.temporary, made.peak)
+        # The peak holds parameters, moments, the average and whatever lives at once of what is computed.
+        sizes = (made.stored, 2 * made.stored, *[made.stored] * averaged, made.temporary, made.peak)
         shown = [size_of(x) if made.peak else "" for x in sizes]
         shape = " x ".join(map(str, made.mesh.values()))
         verdict = "" if name == "local" and limit is None else "fits"

@@ -194,6 +194,11 @@ def test_memory_gives_a_verdict_where_the_compiler_has_none(planned):
         assert planned(*memory)[1].endswith(verdict)
 
 
+def test_an_average_of_the_weights_has_a_column(planned):
+    for averaging, copies in ((), 2), (("--set", "train.ema_decay=0.9"), 3):
+        assert planned("--preset", "smoke", *averaging)[1].count(" 0 B ") == copies
+
+
 def test_the_plan_of_a_study_is_of_the_model_that_it_trains(planned):
     (model, table, train, execution, _), _ = planned(
         "--preset", "paper", "--set", "model.width=768", "--set", "train.batch=8", "--mesh", "1", "-1", "1"
