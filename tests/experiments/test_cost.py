@@ -81,6 +81,19 @@ def test_samplers_of_latents_are_paid_for_step_by_step():
     assert flops(100) > 3 * flops(10)  # the rest is the trunk's
 
 
+def test_what_other_sequences_cost_is_as_the_page_says():
+    page = " ".join((Path(__file__).parents[2] / "docs" / "statistics.md").read_text().split())
+    trial = reference_trial(PAPER, 0)
+    with_others, without = (
+        estimate(replace(trial, eval=replace(trial.eval, other_actions=n))) for n in (trial.eval.other_actions, 0)
+    )
+    whole = with_others.evaluation_flops
+    own, whole = (x / with_others.train_flops for x in (whole - without.evaluation_flops, whole))
+    assert trial.eval.other_actions == 15
+    assert f"Fifteen cost {own:.0%}".replace("%", " %") in page
+    assert f"of `paper`, and the whole evaluation {whole:.0%}.".replace("%", " %") in page
+
+
 def test_the_plan_says_what_it_counts(capsys):
     plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=60"]
     assert main(plan) == 0
