@@ -129,6 +129,30 @@ def test_keys_move_the_robot_and_letting_go_stops_it(browsing):
     browsing(test)
 
 
+def test_a_gamepad_drives_by_axes_that_are_known_and_neither_it_nor_a_held_key_ends_a_pause(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.click("#robots button[data-name=arm]")
+        await page.evaluate("navigator.getGamepads = () => [window.pad]")
+        for mapping, trigger in (("", 0.5), ("standard", 0.29)):
+            await page.evaluate(f"pad = {{mapping: '{mapping}', axes: [1, 0, -1, 0]}}")
+            await frames(page, 3)
+            assert (await actions(client))[0][:4] == pytest.approx([0.71, 0.5, trigger, 0.5], abs=0.01)
+        await page.keyboard.down("ArrowRight")
+        await page.click("#run")
+        await page.keyboard.down("ArrowRight")  # it repeats
+        await page.wait_for_timeout(300)
+        assert await page.inner_text("#run") == "Resume"
+        await page.keyboard.up("ArrowRight")
+        await page.evaluate("pad.axes = [0, 0, 0, 0]")
+        await page.wait_for_function("!state.directed")
+        await page.evaluate("pad.axes = [1, 0, 0, 0]")
+        await page.wait_for_function("state.running")
+        assert not page.faults
+
+    browsing(test)
+
+
 def test_keys_drive_once_the_rate_is_chosen(browsing):
     """And do not choose another one."""
 
