@@ -242,6 +242,22 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
     browsing(test, visitors=1)
 
 
+def test_a_browser_that_keeps_nothing_drives_and_finds_the_episode_again(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.add_init_script(
+            "Object.defineProperty(window, 'sessionStorage', {get() { throw new DOMException(); }})"
+        )
+        await page.reload()
+        await page.wait_for_selector("body[data-count]")
+        await page.evaluate("state.socket.close()")
+        await frames(page, 5)
+        visitors = client.server.app[SESSIONS].visitors
+        assert len(visitors) == 2 and await page.evaluate("token") in visitors and not page.faults
+
+    browsing(test)
+
+
 def test_nothing_is_sent_before_the_greeting(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
@@ -255,7 +271,7 @@ def test_nothing_is_sent_before_the_greeting(browsing):
         await page.wait_for_function("window.open_")
         await page.wait_for_timeout(200)
         assert await page.evaluate("sent") == []
-        await page.evaluate("hear({type: 'hello', token: token(), robot: state.robot.name, start: 0})")
+        await page.evaluate("hear({type: 'hello', token, robot: state.robot.name, start: 0})")
         assert (await page.evaluate("sent"))[:1] == ["rewind"]
         assert not page.faults
 
