@@ -22,6 +22,12 @@ def is_dataset_name(text: object) -> bool:
     return isinstance(text, str) and _NAME.fullmatch(text) is not None
 
 
+def made_name(text: str) -> str:
+    """A name, made from `text`, for a dataset that is written: lower-case letters, digits and '_'; first a letter."""
+    name = re.sub(r"[^a-z0-9_]+", "_", text.lower()).strip("_")
+    return name if name[:1].isalpha() else f"dataset_{name}"
+
+
 def safe_join(root: Path, text: object) -> Path:
     """`root` / `text`. Raises ValueError, saying why, unless `text` is a relative path that stays below `root`."""
     if not isinstance(text, str) or not 0 < len(text) <= MAX_PATH_LENGTH or not text.isprintable():

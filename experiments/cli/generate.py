@@ -59,6 +59,7 @@ def generate(
         registry: TOML file with your own registry entries.
     """
     from data_pipelines.convert.write import convert
+    from data_pipelines.names import made_name
     from data_pipelines.sources.convertible import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
@@ -92,7 +93,7 @@ def generate(
     count = len(recorded) if episodes is None else min(episodes, len(recorded))
     mark = checkpoint_hash(run, simulator.model.step)
     source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)
-    called, eta = name or f"{driven.name}_generated", Eta()
+    called, eta = name or made_name(f"{driven.name}_generated"), Eta()
     with step(f"generate {count} episodes of {driven.name}") as update:
         done = convert(
             source, out, called, shard_bytes=SHARD_BYTES, origin=source.origin() | {"run": str(run)},

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from data_pipelines.names import MAX_NAME_LENGTH, is_dataset_name, quote, safe_join
+from data_pipelines.names import MAX_NAME_LENGTH, is_dataset_name, made_name, quote, safe_join
 from data_pipelines.registry import DatasetSpec, all_specs
 from data_pipelines.registry.toml_file import load_entries
 from hma_jax.config import ConfigError
@@ -76,6 +76,14 @@ def test_path_inside(text):
 def test_path_that_may_leave(text):
     with pytest.raises(ValueError):
         safe_join(Path("/root"), text)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [("pusher_sand", "pusher_sand"), ("My-Arm 2.0", "my_arm_2_0"), ("7_dof", "dataset_7_dof"), ("Ä", "dataset_")],
+)
+def test_a_name_is_made_of_any_text(text, name):
+    assert made_name(text) == name
 
 
 def test_values_of_others_are_shown_on_one_short_line():

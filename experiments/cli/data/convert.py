@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,9 +137,10 @@ def _convert(
 ) -> None:
     from data_pipelines.convert.write import convert
     from data_pipelines.errors import DataError, without_advice
+    from data_pipelines.names import made_name
     from data_pipelines.sources.convertible import UnitError, unsupported_images_text
 
-    name = destination.name or re.sub(r"[^a-z0-9_]+", "_", default_name.lower()).strip("_")
+    name = destination.name or made_name(default_name)
     with step(f"convert {len(source.units)} to {name}") as update:
         try:
             done = convert(

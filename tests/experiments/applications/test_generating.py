@@ -201,11 +201,12 @@ def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
 @pytest.mark.slow
 def test_a_run_outside_a_study_begins_with_the_recordings_it_is_given(recorded, tmp_path, capsys):
     """As one that was converted: there are neither starts beside it nor held-out frames of its robot."""
-    mine = EmbodimentTable((replace(TABLE.entries[0], name="my_robot"),))
+    mine = EmbodimentTable((replace(TABLE.entries[0], name="My-Arm"),))
     run = make_run(tmp_path / "converted", table=mine)
     with pytest.raises(ConfigError, match="Move the run into the directory of a study"):
         load_simulator(run)
-    assert generate(run, recorded, tmp_path / "out", "--robot", "my_robot", "--episodes", "2") == 0
+    assert generate(run, recorded, tmp_path / "out", "--robot", "My-Arm", "--episodes", "2") == 0
+    assert (tmp_path / "out" / "my_arm_generated" / "1.0.0").is_dir()
     assert "2 episodes. PSNR against the recording" in " ".join(capsys.readouterr().out.split())
 
 
