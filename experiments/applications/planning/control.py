@@ -10,6 +10,7 @@ import numpy as np
 from experiments.applications.planning.goals import Cost
 from experiments.applications.planning.models import Model
 from experiments.applications.planning.search import Score, SearchConfig, SearchResult, repeat_knots, warm_start
+from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 
 Search = Callable[[Score, SearchConfig, np.ndarray, np.random.Generator], SearchResult]
@@ -43,7 +44,10 @@ class Planner:
         self._mean = np.repeat(self._units.rest[None], config.knots, 0)
 
     def plan(self, execute: int) -> np.ndarray:
-        """Raw actions [execute, A], one for each frame, from the state that the model observed last."""
+        """Raw actions [execute, A], one for each frame, from the state that the model observed last. Raises ConfigError
+        unless `execute` lies in 1..frames of a plan."""
+        most = self._config.frames
+        require(1 <= execute <= most, f"execute must lie in 1..{most}, the frames of a plan, got {execute}")
 
         def score(candidates: np.ndarray) -> np.ndarray:
             actions = self._units.denormalise(repeat_knots(candidates, self._config))

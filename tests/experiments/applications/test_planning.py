@@ -110,6 +110,9 @@ def test_every_plan_of_a_planner_has_its_own_numbers_and_a_warm_start():
     first, second, same, different = (number for number, _ in began)
     assert first == same and len({first, second, different}) == 3
     np.testing.assert_allclose(began[1][1], [[0.2], [0.3], [0.3]])
+    for execute in (0, 7):
+        with pytest.raises(ConfigError, match=f"execute must lie in 1..6, the frames of a plan, got {execute}"):
+            one.plan(execute)
 
 
 def test_a_goal_counts_in_the_second_half_of_the_horizon():
