@@ -103,7 +103,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
         isinstance(config, TokenizerConfig),
         "the study's tokenizer cannot be trained here; give the directory of an imported one with --tokenizer",
     )
-    sources = [(spec, path) for spec, path in sources if spec.name not in study.unseen]
+    sources = _seen(study, sources)
     made_from = tokenizer_made_from(study, sources)
     if _in_place(workspace.tokenizer, made_from, replace):
         return
@@ -129,6 +129,21 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
     write_file(aside / QUALITY, json.dumps(dataclasses.asdict(quality)))
     made_from.save(aside)
     publish(aside, workspace.tokenizer)
+
+
+def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
+    """Raises ConfigError if the workspace has another tokenizer than the one that is given by its directory `source`
+    or, without, than the study would train."""
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    if source is None:
+        _in_place(workspace.tokenizer, tokenizer_made_from(study, _seen(study, sources)), None)
+    else:
+        _adopted(load_tokenizer(source, expect=study.tokenizer), source, workspace, None)
+
+
+def _seen(study: Study, sources: Sequence[Source]) -> list[Source]:
+    return [(spec, path) for spec, path in sources if spec.name not in study.unseen]
 
 
 def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
@@ -157,27 +172,42 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
     from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
 
     tokenizer = load_tokenizer(source, expect=study.tokenizer)
-    place, made_from = workspace.tokenizer, MadeFrom({ORIGIN: f"{GIVEN} {tokenizer.identity}"})
-    if place.exists():
-        existing = read_stamp(place)
-        if existing == made_from:
-            return
-        try:
-            identity = load_tokenizer(place).identity
-        except ConfigError as error:
-            lines = [str(error)]
-        else:
-            if identity == tokenizer.identity:  # trained here, or the very directory that is given
-                return
-            origin = existing.inputs[ORIGIN] if existing else "not written down"
-            lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
-        require_same("tokenizer", place, lines, replace)
+    if _adopted(tokenizer, source, workspace, replace):
+        return
     _say_held_out_elsewhere(read_stamp(source), study)
     aside = workspace.root / "tokenizer.adopted"
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
-    made_from.save(aside)
-    publish(aside, place)
+    _given(tokenizer).save(aside)
+    publish(aside, workspace.tokenizer)
+
+
+def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: Step | None) -> bool:
+    """Whether the tokenizer that is given, by its directory `source`, is there. ConfigError if another one is, unless
+    allowed."""
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    place = workspace.tokenizer
+    if not place.exists():
+        return False
+    existing = read_stamp(place)
+    if existing == _given(tokenizer):
+        return True
+    try:
+        identity = load_tokenizer(place).identity
+    except ConfigError as error:
+        lines = [str(error)]
+    else:
+        if identity == tokenizer.identity:  # trained here, or the very directory that is given
+            return True
+        origin = existing.inputs[ORIGIN] if existing else "not written down"
+        lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
+    require_same("tokenizer", place, lines, replace)
+    return False
+
+
+def _given(tokenizer: Tokenizer) -> MadeFrom:
+    return MadeFrom({ORIGIN: f"{GIVEN} {tokenizer.identity}"})
 
 
 def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None:

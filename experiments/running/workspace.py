@@ -16,7 +16,7 @@ from experiments.study import Study
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
-from hma_jax.runtime.locks import Held, exclusive
+from hma_jax.runtime.locks import Held, Lock, exclusive
 from hma_jax.runtime.outputs import unwritable
 
 
@@ -149,7 +149,7 @@ class Workspace:
         return self.root / "study.json"
 
     @contextmanager
-    def locked(self, lock: str = ".lock") -> Iterator[None]:
+    def locked(self, lock: str = ".lock") -> Iterator[Lock]:
         """Makes the directory and holds the right to write in it, or what another `lock` is for; it dies with its
         process.
 
@@ -158,7 +158,7 @@ class Workspace:
         with ExitStack() as stack:
             try:
                 self.root.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(exclusive(self.root / lock))
+                held_lock = stack.enter_context(exclusive(self.root / lock))
             except Held as held:
                 raise Busy(
                     f"another command is using {self.root} ({held.who}); wait until it has finished, or choose "
@@ -167,7 +167,7 @@ class Workspace:
                 ) from None
             except OSError as error:
                 raise unwritable(self.root, error) from error
-            yield
+            yield held_lock
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def out(made, tmp_path) -> Path:
 
 def contents(root: Path) -> dict[str, bytes]:
     """Everything that was made, but for what only a report reads."""
-    files = (p for p in root.rglob("*") if p.is_file() and p.name not in (".lock", "data.json"))
+    files = (p for p in root.rglob("*") if p.is_file() and p.name not in (".lock", ".asked.json", "data.json"))
     return {str(p.relative_to(root)): p.read_bytes() for p in files}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ import pytest
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.tokens import part_maker
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from experiments.cli import tokenize as cli_tokenize
 from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import sources
@@ -114,6 +116,22 @@ def test_who_joins_needs_a_tokenizer_and_replaces_nothing(data, tokenizer, tmp_p
         assert f"hma tokenizer train --preset smoke --out {tmp_path} --data {data[1]} {data[2]}" in message
         assert main([*arguments, *tokenizer, "--replace", "tokens"]) == 2
         assert "with --replace no other command may use the directory" in capsys.readouterr().err
+    assert not (tmp_path / "tokens").exists()
+
+
+def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli_tokenize, "_freeze", lambda _: stop())  # which would wait for the holder
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path)]
+    shutil.copytree(tokenizer[1], tmp_path / "tokenizer")  # trained on both datasets
+    setting = make_setting(StudyArguments("smoke", tmp_path, tuple(data[1:])))
+    with Workspace(tmp_path).locked() as lock:
+        assert main([*arguments, *data[:2]]) == 2
+        assert f"datasets: 2 -> 1, without {BASE.name}" in capsys.readouterr().err.replace("\n", " ")
+        cli_tokenize._write_asked(setting, lock)
+        assert main([*arguments, *data, *tokenizer, "--set", "store.min_val=1", "--set", "model.frames=3"]) == 2
+        message = capsys.readouterr().err
+        assert "cannot be shared" in message and "--tokenizer: 'not given' -> 'given'" in message
+        assert "store.min_val: 2 -> 1" in message and "model.frames: " in message
     assert not (tmp_path / "tokens").exists()
 
 
