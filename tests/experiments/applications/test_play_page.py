@@ -169,6 +169,24 @@ def test_keys_drive_once_the_rate_is_chosen(browsing):
     browsing(test)
 
 
+def test_the_robots_own_rate_can_be_chosen_where_it_is_known(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        own = page.locator("#own")
+        assert await own.is_disabled() and await page.input_value("#rate") == "8", "the fakes do not know it"
+        for hz, rate, chosen in ((6, "3", "8"), (5, "2.5", "2.5"), (0, "0", "8")):
+            await page.evaluate(f"Object.assign(state.robot, {{hz: {hz}, stride: 2}}); begin(state.robot, 0)")
+            assert await page.input_value("#rate") == chosen
+            assert await own.get_attribute("value") == rate and await own.is_disabled() == (not hz)
+            if hz:
+                assert await own.text_content() == f"{rate} (real time)"
+                await page.evaluate("own.selected = true")
+        await frames(page, 3)
+        assert not page.faults
+
+    browsing(test)
+
+
 def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address, has_touch=True)
