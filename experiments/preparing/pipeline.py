@@ -50,7 +50,7 @@ def prepare(
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace)
     else:
-        adopt_tokenizer(tokenizer, study, workspace, replace)
+        adopt_tokenizer(tokenizer, study, workspace, sources, replace)
     make_store(study, workspace, sources, replace=replace, batch=batch, threads=threads)
     provenance = freeze_windows(study, workspace, replace)
     if not data and study.eval.other_actions and study.eval.context == "generated":

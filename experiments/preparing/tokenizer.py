@@ -163,8 +163,11 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     return True
 
 
-def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: Step | None = None) -> None:
-    """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already.
+def adopt_tokenizer(
+    source: Path, study: Study, workspace: Workspace, sources: Sequence[Source] = (), replace: Step | None = None
+) -> None:
+    """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already. A note says
+    of which `sources` it may know held-out frames.
 
     Raises ConfigError if it is not the kind that the study is made for, or if another one is there, unless
     `replace` allows it.
@@ -174,7 +177,7 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
     tokenizer = load_tokenizer(source, expect=study.tokenizer)
     if _adopted(tokenizer, source, workspace, replace):
         return
-    _say_held_out_elsewhere(read_stamp(source), study)
+    _say_held_out_elsewhere(read_stamp(source), study, sources)
     aside = workspace.root / "tokenizer.adopted"
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
@@ -210,8 +213,9 @@ def _given(tokenizer: Tokenizer) -> MadeFrom:
     return MadeFrom({ORIGIN: f"{GIVEN} {tokenizer.identity}"})
 
 
-def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None:
-    """Of a tokenizer that was trained on datasets of the study with fewer episodes held out: those are among these."""
+def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study, sources: Sequence[Source]) -> None:
+    """Of a tokenizer that was trained on datasets of the study with fewer episodes held out (those are among these), or
+    as they were before they grew: the hold-out is drawn among all episodes of a dataset."""
     inputs = trained_from.inputs if trained_from is not None else {}
     trained_with, study_settings = inputs.get("store", {}), to_dict(study.store)
     more = [
@@ -224,6 +228,17 @@ def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None
         say(
             f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it "
             "may have been trained on frames that are held out here"
+        )
+    shards = {name: facts.get("shards") for name, facts in inputs.get("data", {}).items()}
+    changed = [
+        spec.name
+        for spec, path in sources
+        if shards.get(spec.name) not in (None, open_source((spec, path), study.store).fingerprint())
+    ]
+    if changed:
+        say(
+            f"note: the tokenizer was trained on other recordings of {few(changed)}: unless they only `joins` more "
+            "directories now, it may have been trained on frames that are held out here"
         )
 
 
