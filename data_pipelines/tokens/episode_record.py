@@ -51,7 +51,7 @@ def encode_episode(item: StoredEpisode) -> bytes:
     ]
     if item.frames is not None:
         parts.append(np.ascontiguousarray(item.frames, np.uint8))
-    return b"".join(part.tobytes() for part in parts)
+    return b"".join(parts)  # which copies them once
 
 
 def decode_episode(data: bytes) -> StoredEpisode:
