@@ -17,13 +17,15 @@ MAX_THREADS = 1024
 """Threads that read windows, at most: a system starts only some thousands, and a program that asks for more hangs."""
 
 Remat = Literal["none", "products", "attention", "everything", "offload"]
-"""What a block keeps for its backward pass; what it does not keep is computed again.
+"""What a block of the trunk or a diffusion head keeps for its backward pass; what it does not keep is computed again.
 
     none        whatever the gradient asks for: most memory, nothing computed twice
     products    matrix products and attention; norms and activations are computed again
     attention   attention and the first product of the MLP
     everything  the block's input alone
-    offload     the block's input alone, in the memory of the host
+    offload     the block's input alone, in the trunk in the memory of the host
+
+On CPUs diffusion heads keep everything: XLA merges their second computation with the first.
 """
 
 Attention = Literal["auto", "plain", "cpu", "cudnn", "splash"]
@@ -61,8 +63,9 @@ class ExecutionConfig:
     """Number format, memory, kernels and devices of a program."""
 
     dtype: Dtype = "float32"  # number format of the computation; parameters are stored in float32
-    # What the backward pass recomputes to save memory. The default takes the least memory. Where there is four times
-    # as much for activations, "products" is a seventh faster on CPU (twelve layers; docs/performance.md).
+    # What the backward pass recomputes, in the trunk and in diffusion heads, to save memory. The default takes the least
+    # memory. Where there is four times as much for activations, "products" is a seventh faster on CPU (twelve layers;
+    # docs/performance.md).
     remat: Remat = "everything"
     attention: Attention = "auto"  # implementation of attention; auto: chosen by platform and shapes
     accumulate: int = 1  # micro-batches per optimiser step

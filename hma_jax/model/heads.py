@@ -15,6 +15,7 @@ import numpy as np
 from flax import nnx
 
 from hma_jax.config import ExecutionConfig, ModelConfig
+from hma_jax.kernels import remat
 from hma_jax.kernels.dense import contract, from_actions, take_by_robot, to_actions
 from hma_jax.kernels.pointwise import layer_norm, shifted
 from hma_jax.model.embodiments import EmbodimentTable
@@ -47,9 +48,10 @@ class ResBlock(nnx.Module):
         self.modulation = Linear((width, 3 * width), ("W", "F"), init=zeros, role="vector")
 
     def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
-        shift, scale, gate = jnp.split(self.modulation(jax.nn.silu(condition)), 3, axis=-1)
-        h = self.norm(x) * (1 + scale) + shift
-        return x + gate * self.out(jax.nn.silu(self.into(h)))
+        modulation = remat.product(self.modulation(jax.nn.silu(condition)))
+        shift, scale, gate = jnp.split(modulation, 3, axis=-1)
+        h = remat.attention(self.into(self.norm(x) * (1 + scale) + shift))
+        return x + gate * remat.product(self.out(jax.nn.silu(h)))
 
 
 class Denoiser(nnx.Module):
@@ -61,9 +63,9 @@ class Denoiser(nnx.Module):
     the order of its constructors, and the actions' with a Xavier gain of 0.1.
     """
 
-    def __init__(self, config: ModelConfig, channels: int, dtype: jnp.dtype, axis: str = "C"):
+    def __init__(self, config: ModelConfig, channels: int, execution: ExecutionConfig, axis: str = "C"):
         width = config.diffusion.width
-        self.dtype, self.of_actions = dtype, axis == "U"
+        self.dtype, self.remat, self.of_actions = jnp.dtype(execution.dtype), execution.remat, axis == "U"
         small = normal(0.02)
         self.multiplier = config.mup_multiplier("readout")
         self.time_in = Linear((TIME_FEATURES, width), ("W", "F"), init=small, role="vector")
@@ -85,6 +87,8 @@ class Denoiser(nnx.Module):
         y = y + self.condition((z / self.multiplier).astype(self.dtype))
         x = self._into(x.astype(self.dtype))
         for block in self.blocks:
+            if self.remat != "none":  # which keeps all on a mesh too: no block gathers weights of its own
+                block = remat.checkpointed(block.__call__, self.remat, scanned=False)
             x = block(x, y)
         shift, scale = jnp.split(self.modulation(jax.nn.silu(y)), 2, axis=-1)
         x = layer_norm(x, FINE_EPS) * (1 + scale) + shift
@@ -120,9 +124,9 @@ class ActionRegression(nnx.Module):
 class ActionDenoiser(nnx.Module):
     """One denoiser per robot, over its chunk padded to U."""
 
-    def __init__(self, config: ModelConfig, table: EmbodimentTable, dtype: jnp.dtype):
-        self.dtype = dtype
-        self.robots = stack(lambda: Denoiser(config, table.action_width, dtype, "U"), table.size, axis="E")
+    def __init__(self, config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig):
+        self.dtype = jnp.dtype(execution.dtype)
+        self.robots = stack(lambda: Denoiser(config, table.action_width, execution, "U"), table.size, axis="E")
 
     def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, slice_B: jax.Array) -> jax.Array:
         """Normalised, noised chunks -> float32 [B, T, 2 U], noise first. `time_BT` may have axes of size 1."""
@@ -140,7 +144,7 @@ def make_action_head(config: ModelConfig, table: EmbodimentTable, execution: Exe
     if not config.action_heads:
         return None
     if config.diffusion:
-        head = ActionDenoiser(config, table, jnp.dtype(execution.dtype))
+        head = ActionDenoiser(config, table, execution)
     else:
         head = ActionRegression(config, table)
     return used("actions_predicted", head)

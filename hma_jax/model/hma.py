@@ -60,7 +60,7 @@ class HMA(nnx.Module):
         self.trunk = Trunk(config, table.size, execution)
         self.frame_head = make_frame_head(config)
         self.denoiser = (
-            used("frames_predicted", Denoiser(config, config.diffusion.token_channels, self.dtype))
+            used("frames_predicted", Denoiser(config, config.diffusion.token_channels, execution))
             if config.diffusion
             else None
         )

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from jax._src.cudnn import fused_attention_stablehlo
 
-from hma_jax.config import ExecutionConfig
+from hma_jax.config import DiffusionConfig, ExecutionConfig
 from hma_jax.config.execution import Remat
 from hma_jax.kernels import cudnn
 from hma_jax.kernels.remat import checkpointed
 from hma_jax.model.hma import declare_model
-from tests.tiny import TABLE, lively_params, model_config, random_batch
+from tests.tiny import SMALLER, TABLE, lively_params, model_config, random_batch
 
 CONFIG = model_config(width=16, layers=5, tokens=12, action_tokens=4)
 BATCH = random_batch(0, CONFIG, 2)
@@ -62,6 +62,30 @@ def test_what_cudnn_leaves_for_its_gradient_is_kept(monkeypatch, remat: str, com
     traced = str(jax.make_jaxpr(jax.grad(lambda x: jnp.sum(block(x, None)[0])))(qkv))
     assert traced.count("dot_product_attention_bwd") == 1
     assert traced.count("dot_product_attention_fwd") == computed
+
+
+def test_the_denoiser_keeps_what_its_policy_says_and_its_gradients_are_the_same():
+    tokens, width, depth = 16, 8, 2
+    config = model_config(**SMALLER, diffusion=DiffusionConfig(channels=3, patch=1, width=width, depth=depth))
+    _, params = lively_params(config)
+    x, z = jnp.linspace(-1, 1, 3 * tokens).reshape(-1, 3), jnp.ones((tokens, config.width))
+    kept, gradients = {}, {}
+    for remat in ("none", "products", "attention", "everything"):
+        declared = declare_model(config, TABLE, ExecutionConfig(remat=remat))
+
+        def loss(params, declared=declared):
+            return jnp.sum(declared.merge(params).denoiser(x, jnp.arange(tokens), z) ** 2)
+
+        backward = jax.eval_shape(lambda p, loss=loss: jax.vjp(loss, p)[1], params)
+        numbers = sum(leaf.size for leaf in jax.tree.leaves(backward) if leaf.shape[:1] == (tokens,))
+        kept[remat] = numbers / (tokens * width * depth)
+        if remat in ("none", "everything"):
+            gradients[remat] = jax.tree.leaves(jax.jit(jax.grad(loss))(params))
+    assert kept["attention"] - kept["everything"] == 1  # the first product
+    assert kept["products"] - kept["everything"] == 5  # shift, scale, gate, and both products
+    assert kept["none"] > kept["products"] + 3
+    for got, want in zip(gradients["everything"], gradients["none"], strict=True):
+        np.testing.assert_allclose(got, want, atol=2e-5 * np.abs(want).max())
 
 
 @pytest.mark.slow
