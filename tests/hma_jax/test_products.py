@@ -13,6 +13,7 @@ from hma_jax.config import ExecutionConfig, MaskingConfig
 from hma_jax.diagnostics.products import Product, count_products, total_flops
 from hma_jax.model.flops import forward_flops_per_window, train_flops_per_step
 from hma_jax.model.hma import declare_model
+from hma_jax.training.optimizer import muon_direction
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
 from hma_jax.training.validation import make_sums
@@ -65,6 +66,20 @@ def test_a_training_step_has_the_products_that_the_formula_counts(masking):
     found = total_flops(count_products(step, state, random_batch(0, model, 1)))
     # More than the formula: weights of attention within frames, always computed again. Less: frame 0 is not read out.
     assert 1.0 < found / train_flops_per_step(model, TABLE, train) < 1.1
+
+
+def test_muon_multiplies_what_the_page_says():
+    """docs/own_data.md: of each layer, of each robot in it, and of each robot's stem."""
+    model = model_config(width=32, layers=3)
+    declared = declare_model(model, TABLE)
+    hidden = {name: spec for name, spec in declared.leaves().items() if spec.role == "hidden"}
+
+    def update(momenta):
+        return [muon_direction(momenta[name], spec, 1.0) for name, spec in hidden.items()]
+
+    momenta = {name: jax.ShapeDtypeStruct(spec.shape, jnp.float32) for name, spec in hidden.items()}
+    of_a_layer, of_stems = 420 + 110 * TABLE.size, 30 * TABLE.size
+    assert total_flops(count_products(update, momenta)) == (model.layers * of_a_layer + of_stems) * model.width**3
 
 
 @pytest.mark.parametrize("setting", ["full", "policy"])
