@@ -63,9 +63,9 @@ class ExecutionConfig:
     """Number format, memory, kernels and devices of a program."""
 
     dtype: Dtype = "float32"  # number format of the computation; parameters are stored in float32
-    # What the backward pass recomputes, in the trunk and in diffusion heads, to save memory. The default takes the least
-    # memory. Where there is four times as much for activations, "products" is a seventh faster on CPU (twelve layers;
-    # docs/performance.md).
+    # What the backward pass recomputes, in the trunk and in diffusion heads, to save memory. The default takes the
+    # least memory. Where there is four times as much for activations, "products" is a seventh faster on CPU (twelve
+    # layers; docs/performance.md).
     remat: Remat = "everything"
     attention: Attention = "auto"  # implementation of attention; auto: chosen by platform and shapes
     accumulate: int = 1  # micro-batches per optimiser step
