@@ -44,7 +44,8 @@ def words_of(page: Path) -> str:
 def rows_of_trained() -> list[dict]:
     """Of all models that were watched for a minute from the same four starts of each robot."""
     names = (
-        "chained", "weighed", "long", "mended", "coarse", "resumed", "displaced", "larger", "grown", "drawn", "kept",
+        "chained", "weighed", "long", "mended", "coarse", "resumed", "displaced", "larger", "hours", "grown", "drawn",
+        "kept",
     )  # fmt: skip
     return [row for name in names for row in read_rows(RESULTS / f"{name}.csv")]
 
@@ -58,7 +59,7 @@ def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, floa
 
     rows = rows_of_trained()
     cells = {(row["variant"], row["robot"], row["start"], row["part"]): row for row in rows if row["part"] > 1}
-    assert len(cells) == 12 * 8 * 4 * 2
+    assert len(cells) == 13 * 8 * 4 * 2
     apart = [
         {**row, measure: goodness(row) - goodness(cells[beside, *place])}
         for (variant, *place), row in cells.items()

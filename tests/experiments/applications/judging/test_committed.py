@@ -137,7 +137,7 @@ def test_what_the_expert_can_do_is_as_the_page_says():
             ("arm_chalk", "reach"), ("gripper_night", "own"), ("arm_sand", "own"), ("arm_chalk", "own"),
         )
     )  # fmt: skip
-    assert f"reaches the mark in {worst} to 100 % of episodes" in page
+    assert f"reaches the mark in {worst} to 100 % of 50 true episodes" in page
     assert f"two grippers in {most} and 100 %" in page and f"in {fewest} to {hard} %." in page
 
 
