@@ -239,6 +239,18 @@ def test_size_and_data_keep_objects():
         assert cells == (found[:1] + [""] * 3 if other == "larger" else found), label
 
 
+def test_robots_of_the_model_that_two_cores_train_stay_and_objects_do_not():
+    rows, page = by_place("hours_ten.csv"), words_of(PAGE)
+    first, last = ([row for (_, _, minute), row in rows.items() if minute == at] for at in (1, 10))
+    tools, *follows = (
+        over_robots(of, measure)[0] for of, measure in ((last, "tool_found"), (first, "follows"), (last, "follows"))
+    )
+    said = f"tools are found in {100 * tools:.0f} % of the frames of the last minute, "
+    said += '"follows" is {:.2f} in the first and {:.2f} in the last. '.format(*follows)
+    objects = (100 * over_robots(of, "object_found")[0] for of in (first, last))
+    assert said + "Objects are found in {:.0f} and {:.0f} %.".format(*objects) in page
+
+
 def test_half_of_what_was_hidden_comes_back():
     rows, page = read_rows(RESULTS / "grown_hidden.csv"), words_of(PAGE)
     hidden, control = ([row for row in rows if row["kind"] == kind] for kind in ("hidden", "control"))
