@@ -12,9 +12,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from experiments.analysis.preregistered import METRICS
 from experiments.applications import DRIVEN
 from experiments.presets import PRESETS
 from experiments.report.draw import draw_again
+from experiments.rows import TRAINING
 from experiments.running.ledger import FINISHED
 from experiments.running.sealed import read_result
 from experiments.running.workspace import Workspace
@@ -45,6 +47,7 @@ def test_every_trial_of_a_table_is_finished_and_judged(name):
     rows, trials = rows_of(name), Workspace(RESULTS / name).trials
     assert {r.status for r in rows} == {FINISHED}
     assert all(r.metric for r in rows)
+    assert {r.metric for r in rows if r.scope != TRAINING} <= {*METRICS}, "what is measured can be expected"
     assert len({r.manifest for r in rows}) == 1, "judged on different windows"
     for trial in {r.trial for r in rows} if trials.exists() else ():
         read_result(trials / trial)  # whole, and as it was written
