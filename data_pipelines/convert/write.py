@@ -181,10 +181,10 @@ def _finish(
         metadata={**metadata, "hz": source.hz, "left_out": skipped},
         module="data_pipelines.convert",
     )
-    # Without the journal all shards are made again, so it is removed last. Hidden files are of killed writers.
-    for stray in [*partial.glob("part-*"), *partial.glob(".*"), partial / JOURNAL]:
+    for stray in [*partial.glob("part-*"), *partial.glob(".*")]:  # hidden files are of killed writers
         stray.unlink(missing_ok=True)
     publish(partial, final)
+    (final / JOURNAL).unlink(missing_ok=True)  # only now: a run that finds shards without it makes all of them again
     return Conversion(final, suggest_spec(source, name), episodes, len(kept), skipped)
 
 
@@ -203,6 +203,8 @@ def _finished(final: Path, fingerprint: str, source: ConvertibleSource, name: st
         f"{final} exists already and was made from another source or with other settings; choose another --name or "
         "--out, or remove it",
     )
+    if (final / JOURNAL).exists():  # that run was killed in its last moment
+        (final / JOURNAL).unlink(missing_ok=True)
     return Conversion(final, suggest_spec(source, name), sum(lengths), len(lengths), metadata["left_out"])
 
 

@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from hma_jax.runtime.files import write_file
+
 
 class Journal:
     """A file that one process at a time appends to, under the output's lock. A written line survives a crash."""
@@ -20,7 +22,7 @@ class Journal:
             return []
         *whole, cut = self.path.read_bytes().split(b"\n")
         if cut:
-            self.path.write_bytes(b"".join(line + b"\n" for line in whole))
+            write_file(self.path, b"".join(line + b"\n" for line in whole))
         return [json.loads(line) for line in whole]
 
     def append(self, values: dict[str, Any]) -> None:

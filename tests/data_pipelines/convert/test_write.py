@@ -15,6 +15,7 @@ import pytest
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from data_pipelines.inspection.inspect import inspect_dataset
+from data_pipelines.publishing.files import publish
 from data_pipelines.sources import robomimic, video
 from data_pipelines.sources.convertible import Episode, Layout, Skipped, UnitError, require_module
 from data_pipelines.sources.human import detections
@@ -115,6 +116,38 @@ def test_stopped_between_the_last_shard_and_the_end(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             convert(Counting(), tmp_path / "b", "toy", shard_bytes=1)
     assert convert(Counting(), tmp_path / "b", "toy", shard_bytes=1).episodes == whole.episodes
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+@pytest.mark.parametrize("name", ["sync_tree", "remove"])
+def test_killed_while_it_publishes_it_keeps_its_shards(tmp_path, monkeypatch, name):
+    """Forcing a large dataset to the disk takes minutes."""
+    whole = convert(Counting(), tmp_path / "a", "toy", shard_bytes=1)
+    with monkeypatch.context() as patched:
+
+        def die(directory):
+            raise KeyboardInterrupt
+
+        patched.setattr(f"data_pipelines.publishing.files.{name}", die)
+        with pytest.raises(KeyboardInterrupt):
+            convert(Counting(), tmp_path / "b", "toy", shard_bytes=1)
+    unreadable = Counting(damaged=tuple(range(8)))  # nothing is read again
+    again = convert(unreadable, tmp_path / "b", "toy", shard_bytes=1)
+    assert again.episodes == whole.episodes and contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_killed_after_it_published_it_leaves_nothing_more(tmp_path, monkeypatch):
+    whole = convert(Counting(), tmp_path / "a", "toy")
+
+    def die(made, final):
+        publish(made, final)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("data_pipelines.convert.write.publish", die)
+        with pytest.raises(KeyboardInterrupt):
+            convert(Counting(), tmp_path / "b", "toy")
+    assert convert(Counting(), tmp_path / "b", "toy").episodes == whole.episodes
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 

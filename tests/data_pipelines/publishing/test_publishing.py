@@ -87,7 +87,10 @@ def test_a_line_of_a_journal_that_a_crash_cut_off_does_not_count(tmp_path):
     for i in range(3):
         journal.append({"step": i})
     journal.path.write_bytes(journal.path.read_bytes()[:-4])
-    assert journal.read() == [{"step": 0}, {"step": 1}]
+    torn = journal.path.read_bytes()
+    with open(journal.path, "rb") as before:
+        assert journal.read() == [{"step": 0}, {"step": 1}]
+        assert before.read() == torn, "it was overwritten: killed in that moment, all lines would be lost"
     journal.append({"step": 5})
     assert journal.read() == [{"step": 0}, {"step": 1}, {"step": 5}]
 
