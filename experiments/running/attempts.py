@@ -80,13 +80,21 @@ def is_alive(directory: Path) -> bool:
 
 
 def read_start(directory: Path) -> dict[str, Any] | None:
-    """Of the latest attempt: host, process, an engine's job and a token of its own; None before its process is up."""
-    return _read(directory / STARTED)
+    """Of the latest attempt: host, process, an engine's job and a token of its own; None before its process is up, or
+    if the file cannot be read now."""
+    return _read_now(directory / STARTED)
 
 
 def read_progress(directory: Path) -> dict[str, Any] | None:
-    """{phase, done, total}, or None before there is any."""
-    return _read(directory / PROGRESS)
+    """{phase, done, total}, or None before there is any, or if the file cannot be read now."""
+    return _read_now(directory / PROGRESS)
+
+
+def _read_now(path: Path) -> dict[str, Any] | None:
+    try:
+        return _read(path)
+    except OSError:  # a shared disk that does not answer for a while; the next poll reads it again
+        return None
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -97,10 +105,14 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def outcome(directory: Path, ended: AttemptEnd) -> State:
-    """How an attempt that has ended left its trial."""
-    if (directory / RESULT).exists():
-        return State(FINISHED)
-    if failure := _read(directory / FAILURE):
+    """How an attempt that has ended left its trial: LOST too if what it left cannot be read now."""
+    try:
+        if (directory / RESULT).exists():
+            return State(FINISHED)
+        failure = _read(directory / FAILURE)
+    except OSError as error:  # the next attempt finds the result, if there is one
+        return State(LOST, f"the files in {directory} cannot be read now ({error.strerror})")
+    if failure:
         return State(failure["state"], failure["message"])
     log = f"output in {directory / OUTPUT}"
     if ended.code is None:

@@ -8,6 +8,7 @@ next run goes on with what is there, and waits for trials that still run on othe
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import time
 from collections import Counter
@@ -32,6 +33,7 @@ from experiments.running.attempts import (
 )
 from experiments.running.launchers.base import Launcher
 from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
+from hma_jax.config import ConfigError
 from hma_jax.runtime.files import write_file
 
 TRIES = 3
@@ -39,6 +41,11 @@ TRIES = 3
 
 POLL_SECONDS = 5.0
 """Seconds between two checks of trials that an earlier runner started elsewhere."""
+
+RELAUNCH_SECONDS = 60.0
+"""Seconds until trials that the launcher did not take, though it took others before, are launched again."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -114,6 +121,8 @@ class _Run:
         self.running: list[_Attempt] = []
         self.lost = Counter[str]()
         self.polled = -POLL_SECONDS
+        self.launched = False  # whether the launcher has taken any trial
+        self.relaunch_at = 0.0
 
     def run_all(self) -> None:
         while self.waiting or self.running or self.elsewhere:
@@ -136,12 +145,21 @@ class _Run:
     def _launch(self) -> None:
         room = max(self.launcher.at_once - len(self.running), 0)
         chosen = self._runnable()[:room]
-        if not chosen:
+        if not chosen or time.monotonic() < self.relaunch_at:
             return
-        self.waiting = [entry for entry in self.waiting if entry not in chosen]
         directories = [self._prepare(job, state) for job, state in chosen]
         now = time.monotonic()
-        for (job, state), directory, handle in zip(chosen, directories, self.launcher.launch(directories), strict=True):
+        try:
+            handles = self.launcher.launch(directories)
+        except ConfigError as error:
+            if not self.launched:  # its settings are wrong
+                raise
+            log.warning("%s; trying again in %.0f s", error, RELAUNCH_SECONDS)  # trials that run already go on
+            self.relaunch_at = now + RELAUNCH_SECONDS
+            return
+        self.launched = True
+        self.waiting = [entry for entry in self.waiting if entry not in chosen]
+        for (job, state), directory, handle in zip(chosen, directories, handles, strict=True):
             self.running.append(_Attempt(job, directory, handle, now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 

@@ -133,8 +133,9 @@ class _ProgressFile:
             return
         self.last = (phase, now)
         aside = self.path.with_suffix(".tmp")
-        aside.write_text(json.dumps({"phase": phase, "done": done, "total": total}))
-        aside.replace(self.path)
+        with suppress(OSError):  # it is only shown; what must not be lost raises where it is written
+            aside.write_text(json.dumps({"phase": phase, "done": done, "total": total}))
+            aside.replace(self.path)
 
 
 if __name__ == "__main__":

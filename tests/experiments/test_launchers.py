@@ -200,6 +200,13 @@ def test_a_result_that_is_late_on_the_shared_disk_is_waited_for(submitted, monke
     assert place.ended(handle).code is None
 
 
+def test_a_shared_disk_that_does_not_answer_ends_no_trial(submitted, monkeypatch):
+    place, fake, handle = submitted
+    fake.states["7_0"] = "RUNNING"
+    handle.paths.result_pickle.mkdir()  # reading it fails, as on a disk that is cut off
+    assert place.ended(handle) is None
+
+
 def test_a_job_that_stopped_is_not_brought_back_by_slurm_beside_the_next_one(submitted):
     place, fake, handle = submitted
     handle.paths.result_pickle.write_bytes(pickle.dumps(("success", 130)))

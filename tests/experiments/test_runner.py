@@ -1,5 +1,6 @@
 """The runner survives crashes, interruptions and its own death, and repeats nothing."""
 
+import errno
 import gc
 import json
 import os
@@ -19,6 +20,7 @@ from experiments.running.children import child_environment
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import TRIES, Job, Monitor, run_missing
+from hma_jax.config import ConfigError
 from hma_jax.runtime import locks
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely
 from tests.experiments import fake_trial
@@ -99,6 +101,53 @@ def test_the_reason_is_kept_of_a_trial_that_is_lost_before_it_has_begun(tmp_path
     state = run_missing([job("a")], tmp_path / "trials", ledger, place)["a"]
     assert state.event == "lost" and "out of memory?" in state.message
     assert events(tmp_path, "a") == ["lost"] * TRIES
+
+
+def test_trials_that_are_not_taken_again_at_first_end_no_sweep(tmp_path, monkeypatch, caplog):
+    """Slurm's controller restarts, or a limit is reached, while other trials run."""
+    monkeypatch.setattr(runner, "RELAUNCH_SECONDS", 0.05)
+    place = fake_trial.launcher(tmp_path, 2)
+    launch, refused = place.launch, iter([False, True, True])
+
+    def sometimes(directories):
+        if next(refused, False):
+            raise ConfigError("Slurm does not take the jobs")
+        return launch(directories)
+
+    place.launch = sometimes
+    jobs = [job("lost", "SIGKILL"), job("other", steps=3)]
+    states = run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert {state.event for state in states.values()} == {"finished"}
+    assert events(tmp_path, "lost") == ["running", "lost", "running", "finished"]
+    assert caplog.text.count("does not take the jobs; trying again") == 2
+
+
+def test_trials_that_are_never_taken_end_the_sweep(tmp_path):
+    place = fake_trial.launcher(tmp_path, 1)
+    place.launch = lambda directories: (_ for _ in ()).throw(ConfigError("no such partition"))
+    with pytest.raises(ConfigError, match="no such partition"):
+        run_missing([job("a")], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+
+
+@pytest.mark.parametrize("name", ["started.json", "progress.json", "failure.json"])
+def test_a_shared_disk_that_does_not_answer_once_stops_no_sweep(tmp_path, monkeypatch, name):
+    read, failed = Path.read_text, []
+
+    def sometimes(path, *arguments, **options):
+        if path.name == name and not failed:
+            failed.append(path)
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+        return read(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "read_text", sometimes)
+    states = run(tmp_path, [job("a", "full disk"), job("b")], workers=2)
+    assert failed and {state.event for state in states.values()} == {"finished"}
+
+
+def test_progress_that_cannot_be_written_ends_no_trial(tmp_path):
+    report = trial_main._ProgressFile(tmp_path / "gone/progress.json", lambda: False)
+    report("training", 1, 2)
+    assert not (tmp_path / "gone").exists()
 
 
 def test_failed_trials_run_again_only_on_request_and_keep_their_checkpoint(tmp_path):

@@ -146,7 +146,7 @@ class SlurmLauncher(Launcher):
         """What the job's process left when it ended by itself."""
         try:
             kind, value = pickle.loads(job.paths.result_pickle.read_bytes())
-        except FileNotFoundError:
+        except OSError:  # not there, or a shared disk that does not answer for a while
             return None
         if kind == "success":
             return AttemptEnd(value)
