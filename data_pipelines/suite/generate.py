@@ -23,6 +23,7 @@ from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import write_dataset
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.parent import die_with
 
 GENERATOR_VERSION = 8
 """Raise it when simulation, rendering or encoding change: datasets of older versions are then made again."""
@@ -135,9 +136,8 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(
         count,
         mp_context=multiprocessing.get_context("spawn"),
-        # A terminal sends Ctrl-C to all; a process would give up one dataset and go on with the next.
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
+        initializer=_enter_process,
+        initargs=(os.getpid(),),
     )
     others = set(multiprocessing.active_children())
     try:
@@ -148,6 +148,12 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
             process.terminate()
         raise
     pool.shutdown()
+
+
+def _enter_process(parent: int) -> None:
+    die_with(parent)
+    # A terminal sends Ctrl-C to all; a process would give up one dataset and go on with the next.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewest: int) -> None:

@@ -6,23 +6,20 @@ pools take their size from the cores that a process may use.
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import logging
 import os
 import signal
 import sys
-import threading
-import time
 import warnings
 from pathlib import Path
 
 from experiments.running.slots import Slot
 from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely, keep_freed_memory
+from hma_jax.runtime.parent import die_with
 
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
-_PR_SET_PDEATHSIG = 1
 
 CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
 """Variables of a slot that the user's environment overrides. Which accelerators a slot has is not among them: they are
@@ -61,7 +58,7 @@ def enter_child(parent: int = 0) -> None:
     collect_rarely()
     parent = parent or int(os.environ.get(_PARENT, "0"))
     if parent:
-        _die_with(parent)
+        die_with(parent)
 
 
 def silence_background() -> None:
@@ -79,19 +76,3 @@ def background_is_silent() -> bool:
 
 
 def _say_nothing(_: object) -> None: ...
-
-
-def _die_with(parent: int) -> None:
-    """A parent killed with -9 cannot stop its children, so each child watches for itself."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it died before the line above
-            os._exit(1)
-        return
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

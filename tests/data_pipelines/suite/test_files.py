@@ -162,25 +162,34 @@ def test_bytes_do_not_depend_on_the_number_of_workers(suite, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "everyone", (False, pytest.param(True, marks=pytest.mark.slow)), ids=("by kill", "by a terminal")
+    "send, number",
+    [
+        (os.kill, signal.SIGINT),
+        pytest.param(os.killpg, signal.SIGINT, marks=pytest.mark.slow),
+        (os.kill, signal.SIGKILL),
+    ],
+    ids=["by kill", "by a terminal", "by kill -9"],
 )
-def test_ctrl_c_ends_processes_that_have_hours_to_do(tmp_path, everyone):
-    """A terminal sends it to every process of the command, kill to one."""
+def test_processes_that_have_hours_to_do_end_with_their_command(tmp_path, send, number):
+    """A terminal sends Ctrl-C to every process of the command, kill to one; SIGKILL no program can pass on."""
     call = f"generate_suite(Path({str(tmp_path)!r}), scale=1000.0, names={NAMES}, workers=2)"
     program = f"from pathlib import Path; from data_pipelines.suite.generate import generate_suite; {call}"
-    with subprocess.Popen(
-        [sys.executable, "-c", program], start_new_session=True, stderr=subprocess.PIPE, text=True
-    ) as command:
+    with (
+        open(tmp_path / "said", "w+") as said,  # no pipe: a process that stays would keep it open
+        subprocess.Popen([sys.executable, "-c", program], start_new_session=True, stderr=said) as command,
+    ):
         deadline = time.monotonic() + 60
         while len(list(tmp_path.glob("*/.*.scratch.*"))) < 2 and time.monotonic() < deadline:
-            assert command.poll() is None, command.stderr.read()
+            assert command.poll() is None, (tmp_path / "said").read_text()
             time.sleep(0.05)
-        (os.killpg if everyone else os.kill)(command.pid, signal.SIGINT)
-        assert "KeyboardInterrupt" in command.communicate(timeout=30)[1]
+        send(command.pid, number)
+        command.wait(30)
+    assert number == signal.SIGKILL or "KeyboardInterrupt" in (tmp_path / "said").read_text()
     with pytest.raises(ProcessLookupError):  # nobody is left of its session
         for _ in range(100):
             os.killpg(command.pid, 0)
             time.sleep(0.1)
+        os.killpg(command.pid, signal.SIGKILL)
 
 
 def test_another_seed_gives_other_episodes(suite, tmp_path):
