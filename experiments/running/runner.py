@@ -224,7 +224,11 @@ class _Run:
             return
         self.polled = time.monotonic()
         for job in list(self.elsewhere):
-            if is_alive(self.trials / job.id):
+            try:
+                if is_alive(self.trials / job.id):
+                    continue
+            except OSError as error:
+                log.warning("the lock of %s cannot be read (%s); asking again", job.title, error.strerror)
                 continue
             self.elsewhere.remove(job)
             state = outcome(self.trials / job.id, AttemptEnd(None, "its process is gone"))

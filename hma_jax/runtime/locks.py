@@ -29,7 +29,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -82,8 +82,14 @@ class Lock:
     holder: Holder
 
     def lost(self) -> bool:
-        """Whether it is another's by now, or gone: possible with a lease only, or if files are removed."""
-        return _read_holder(self.path) != self.holder
+        """Whether it is another's by now, or gone: possible with a lease only, or if files are removed.
+
+        A lock file that cannot be read now, as on a shared disk that does not answer for a while, counts as held.
+        """
+        try:
+            return _read_holder(self.path) != self.holder
+        except OSError:
+            return False
 
 
 @contextmanager
@@ -92,7 +98,7 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
 
     `lease`: holds it against other machines too where the file system does not (see above). `remove`: the file
     goes when the lock is given back. Raises Held at once if another process, or another thread, has it, and
-    OSError if the file cannot be written.
+    OSError if the file cannot be read and written.
     """
     fd, locked = _open(path, lease)
     try:
@@ -111,11 +117,12 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
             with _renewed(fd) if lease else nullcontext():
                 yield lock
         finally:
-            if not lock.lost():
-                if remove:
-                    path.unlink(missing_ok=True)
-                else:
-                    os.ftruncate(fd, 0)
+            with suppress(OSError):  # a disk that does not answer: what is left in the file ends with the lock or lease
+                if _read_holder(path) == lock.holder:
+                    if remove:
+                        path.unlink(missing_ok=True)
+                    else:
+                        os.ftruncate(fd, 0)
     finally:
         os.close(fd)
 
@@ -180,9 +187,11 @@ def _same_file(fd: int, path: Path) -> bool:
 
 
 def _read_holder(path: Path) -> Holder | None:
+    """None if it is gone, given back, or its holder has not written its name yet. Raises OSError if it cannot be
+    read."""
     try:
         return Holder(**json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError):  # gone, given back, or its holder has not written its name yet
+    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError):
         return None
 
 

@@ -26,6 +26,7 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
+from hma_jax.runtime.files import sync, sync_tree
 from hma_jax.runtime.processes import is_writer, writer_first
 from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
@@ -151,9 +152,11 @@ class Checkpoints:
         return self._orbax
 
     def _finish(self, step: int, response: Any) -> None:
-        """In the background: waits for Orbax, then lists what it wrote."""
+        """In the background: waits for Orbax, then flushes what it wrote to disk and lists it."""
         response.result()
         if is_writer():
+            sync_tree(self.directory / str(step))  # Orbax flushes arrays alone, neither its other files nor their names
+            sync(self.directory)
             write_list(self.directory / str(step))
 
     def _failed(self, step: int, error: Exception) -> SaveError:
@@ -197,7 +200,7 @@ class Checkpoints:
 
         `may_change` says which fields of its description ('train.steps') may differ, at its step. With `skip_damaged`,
         checkpoints after the newest whole one are moved to `damaged` beside this directory. Raises
-        CheckpointError naming every other difference, or the file that is damaged.
+        CheckpointError naming every other difference, or the file that is damaged; ReadError if one cannot be read now.
         """
         if skip_damaged:
             with writer_first("damaged checkpoints"):

@@ -27,6 +27,16 @@ class Damaged(Exception):
         self.path, self.reason = path, reason
 
 
+class ReadError(OSError):
+    """A file cannot be read now: a shared disk does not answer, or too many files are open. It may be whole."""
+
+    def __init__(self, path: Path, error: OSError):
+        super().__init__(
+            f"{path} cannot be read now ({error.strerror}), so it is not known whether it is damaged. Run the same "
+            "command again when its disk answers; if it never does, remove the checkpoint to continue from an earlier one"
+        )
+
+
 def write_list(checkpoint: Path) -> None:
     """Lists every file under `checkpoint`: path, size in bytes, SHA-256."""
     rows = [[name, path.stat().st_size, _sha256(path)] for name, path in _files(checkpoint)]
@@ -37,14 +47,17 @@ def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[in
     """Compares the `chosen` files with the list. False if there is no list.
 
     With `share` (i, n) the i-th of n processes compares every n-th file, so that each is read by one of them.
-    Raises Damaged for the first file that is missing or differs, the list itself included.
+    Raises Damaged for the first file that is missing or differs, the list itself included, and ReadError for one that
+    cannot be read.
     """
     path = checkpoint / NAME
     try:
         text = path.read_text()
     except FileNotFoundError:
         return False
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ReadError(path, error) from error
+    except ValueError as error:
         raise Damaged(path, f"cannot be read ({error})") from error
     rows = [row for row in _rows(path, text) if chosen(row[0])]
     for name, size, digest in rows[share[0] :: share[1]]:
@@ -70,8 +83,10 @@ def _compare(path: Path, size: int, digest: str) -> None:
             raise Damaged(path, f"has {found} bytes, but {size} were written")
         if _sha256(path) != digest:
             raise Damaged(path, "its contents have changed since it was written (SHA-256 differs)")
-    except OSError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise Damaged(path, f"cannot be read ({error.strerror})") from error
+    except OSError as error:
+        raise ReadError(path, error) from error
 
 
 def _files(checkpoint: Path) -> Iterator[tuple[str, Path]]:

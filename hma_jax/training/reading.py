@@ -18,7 +18,7 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.processes import all_gather, broadcast_from_writer
-from hma_jax.training.hashes import Damaged, verify
+from hma_jax.training.hashes import Damaged, ReadError, verify
 from hma_jax.training.run_lock import list_steps
 
 WHOLE_STATE = "state"
@@ -55,7 +55,7 @@ def raised_in_all(name: str) -> Iterator[None]:
 
 
 def find_damage(checkpoint: Path) -> Damaged | None:
-    """The first damaged file; None if there is none, or no list of hashes."""
+    """The first damaged file; None if there is none, or no list of hashes. Raises ReadError."""
     try:
         verify(checkpoint)
     except Damaged as damage:
@@ -64,7 +64,8 @@ def find_damage(checkpoint: Path) -> Damaged | None:
 
 
 def read_description(checkpoint: Path) -> dict[str, Any]:
-    """The description of the run that wrote it. Raises CheckpointError if its files are damaged."""
+    """The description of the run that wrote it. Raises CheckpointError if its files are damaged, ReadError if they
+    cannot be read now."""
     with _reading(checkpoint):
         listed = verify(checkpoint, lambda name: "/" not in name)
         if not listed:
@@ -79,7 +80,8 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
 def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
     """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says.
 
-    With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing.
+    With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing, ReadError if
+    one cannot be read now.
     """
     old = (checkpoint / WHOLE_STATE).is_dir()
     folders = {WHOLE_STATE} if old else set(shapes)
@@ -110,6 +112,8 @@ def _reading(checkpoint: Path) -> Iterator[None]:
             f"the checkpoint {checkpoint} is damaged: {damage.path.relative_to(checkpoint)} {damage.reason}; "
             + _advice(checkpoint)
         ) from damage
+    except ReadError:
+        raise
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise CheckpointError(

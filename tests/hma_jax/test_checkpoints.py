@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import shutil
 from pathlib import Path
 
@@ -13,7 +15,7 @@ import pytest
 from hma_jax.config import ConfigError
 from hma_jax.training import hashes
 from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
-from hma_jax.training.hashes import NAME, Damaged, verify, write_list
+from hma_jax.training.hashes import NAME, Damaged, ReadError, verify, write_list
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import find_damage, list_steps, load_items
 from tests.toy import fit_toy, toy_shapes, toy_state
@@ -87,6 +89,25 @@ def test_a_file_that_is_missing_or_cut_is_refused_too(run_dir: Path):
         fit_toy(run_dir, 8)
 
 
+@pytest.mark.parametrize("name", ["params/_METADATA", NAME])
+def test_a_file_that_cannot_be_read_now_is_not_taken_for_damaged(name: str, run_dir: Path, monkeypatch):
+    """A shared disk that does not answer, or too many open files."""
+    path, real = run_dir / "checkpoints" / "6" / name, open
+
+    def fail(file, *arguments, **options):
+        if Path(file) == path:
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
+        return real(file, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hashes, "open", fail, raising=False)
+        patch.setattr(Path, "read_text", lambda self, *_: fail(self).read())
+        with pytest.raises(ReadError, match=f"{path} cannot be read now .Too many open files.*same command again"):
+            fit_toy(run_dir, 8, options=SKIP)
+    assert list_steps(run_dir / "checkpoints") == [4, 6] and not (run_dir / "damaged").exists()
+    assert fit_toy(run_dir, 8, options=SKIP).resumed_from == 6
+
+
 @pytest.mark.parametrize("item", ["params", "opt_state", "_CHECKPOINT_METADATA"])
 def test_a_run_goes_on_from_before_the_damage_when_told_to_and_ends_as_if_nothing_had_been(
     item: str, run_dir: Path, tmp_path: Path
@@ -151,6 +172,27 @@ def test_parameters_are_read_without_the_moments(run_dir: Path):
 
 
 # --- Failing saves ---------------------------------------------------------------------------
+
+
+def test_a_checkpoint_is_on_disk_before_it_is_listed(tmp_path: Path, monkeypatch):
+    """Orbax flushes its arrays alone; after a loss of power its other files would be empty, or the checkpoint gone."""
+    import hma_jax.training.checkpoints as module
+
+    synced, missing, fsync = set(), [], os.fsync
+
+    def record(fd: int) -> None:
+        synced.add(os.fstat(fd).st_ino)
+        fsync(fd)
+
+    def check(checkpoint: Path) -> None:
+        paths = [checkpoint.parent, checkpoint, *checkpoint.rglob("*")]
+        missing.append([path.name for path in paths if path.stat().st_ino not in synced])
+
+    monkeypatch.setattr(os, "fsync", record)
+    monkeypatch.setattr(module, "write_list", check)
+    with Checkpoints(tmp_path, {"toy": 1}) as checkpoints:
+        checkpoints.save(1, toy_state())
+    assert missing == [[]]
 
 
 def test_a_save_that_fails_in_the_background_is_one_message_and_keeps_the_last(tmp_path: Path, monkeypatch):

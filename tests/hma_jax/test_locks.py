@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
 import os
@@ -108,6 +109,41 @@ def test_where_no_lock_is_taken_a_lease_still_excludes(tmp_path: Path, monkeypat
     assert not caplog.records
     with exclusive(path):
         assert "supports no locks" in caplog.text
+
+
+def unreadable(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+    """As on a shared disk that does not answer for a while."""
+    read = Path.read_text
+
+    def fail(self: Path, *arguments, **options) -> str:
+        if self == path:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+        return read(self, *arguments, **options)
+
+    monkeypatch.setattr(Path, "read_text", fail)
+
+
+def test_a_lock_is_lost_when_it_is_gone_or_another_s_not_when_its_disk_does_not_answer(tmp_path: Path, monkeypatch):
+    path = tmp_path / "run" / "lock"
+    path.parent.mkdir()
+    with exclusive(path, lease=True, remove=True) as lock:
+        with monkeypatch.context() as patch:
+            unreadable(patch, path)
+            assert not lock.lost()
+        leave(path, age=0)
+        assert lock.lost()
+        path.unlink()
+        assert lock.lost()
+        path.parent.rmdir()
+        path.parent.write_text("no directory")
+        assert lock.lost()
+
+
+def test_a_lease_that_cannot_be_read_is_not_taken_for_free(tmp_path: Path, monkeypatch):
+    leave(tmp_path / "lock", age=0)
+    unreadable(monkeypatch, tmp_path / "lock")
+    with pytest.raises(OSError, match=os.strerror(errno.ESTALE)), exclusive(tmp_path / "lock", lease=True):
+        pass
 
 
 def test_a_lease_is_renewed_while_it_is_held_and_given_back_at_the_end(tmp_path: Path, monkeypatch):
