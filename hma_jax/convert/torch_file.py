@@ -3,7 +3,7 @@
 Such a file is a zip: `data.pkl` describes the tensors, `data/KEY` holds their elements. A pickle
 is a program; this reader knows the few names that a state dict of tensors needs and refuses every
 other by name, before anything is called. In the checkpoint of a whole training run the state dict is
-one entry among others; what a trainer keeps there is passed over without being made.
+one entry among others; whatever else a trainer keeps there is passed over without being made.
 """
 
 from __future__ import annotations
@@ -37,13 +37,6 @@ STORAGES = {
 }
 
 
-BOOKKEEPING = ("lightning", "lightning_fabric", "omegaconf", "pytorch_lightning", "typing")
-"""Packages whose objects trainers keep beside the weights. An `_Ignored` stands for each."""
-
-CONTAINERS = ("bool", "dict", "float", "int", "list", "set", "str", "tuple")
-"""Of builtins: types that those objects name."""
-
-
 @dataclass(frozen=True, slots=True)
 class _StorageType:
     dtype: np.dtype
@@ -60,7 +53,7 @@ class _Refused(ConfigError):
 
 
 class _Ignored:
-    """Takes whatever a pickle does to an object, and keeps nothing of it."""
+    """Stands for any object of a trainer: takes whatever a pickle does to it, and keeps nothing of it."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> _Ignored:
         del args, kwargs
@@ -83,8 +76,8 @@ class _Ignored:
 
 
 class _Reader(pickle.Unpickler):
-    """Knows ordered dictionaries, storages and how a tensor is made of one; and what of a `whole`
-    training run is passed over."""
+    """Knows ordered dictionaries, storages and how a tensor is made of one. Of a `whole` training run all else is
+    passed over."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, root: str, whole: bool):
         super().__init__(archive.open(f"{root}data.pkl"))
@@ -98,24 +91,27 @@ class _Reader(pickle.Unpickler):
             return self._rebuild
         if module == "torch" and name in STORAGES:
             return _StorageType(np.dtype(STORAGES[name]))
-        known = module.partition(".")[0] in BOOKKEEPING or module == "builtins" and name in CONTAINERS
-        if self.whole and known:
+        if self.whole:
             return _Ignored
         raise _Refused(
             f"{self.path} needs {module}.{name}, which a plain state dict of tensors does not; for safety it is not "
             "read. Save only the tensors, best as model.safetensors"
         )
 
-    def persistent_load(self, pid: Any) -> _Storage:
+    def persistent_load(self, pid: Any) -> _Storage | _Ignored:
         kind, storage_type, key, _, _ = pid
+        if storage_type is _Ignored:
+            return _Ignored()
         if kind != "storage" or not isinstance(storage_type, _StorageType) or not isinstance(key, str):
             raise pickle.UnpicklingError(f"unknown kind of data {kind!r}")
         return _Storage(storage_type.dtype, key)
 
     def _rebuild(
-        self, storage: _Storage, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *rest: Any
-    ) -> Stored:
+        self, storage: _Storage | _Ignored, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *rest: Any
+    ) -> Stored | _Ignored:
         del rest  # gradients and hooks
+        if isinstance(storage, _Ignored):
+            return storage
         numbers = (offset, *shape, *stride)
         if not all(type(n) is int and n >= 0 for n in numbers) or len(shape) != len(stride):
             raise pickle.UnpicklingError(f"a tensor of shape {shape} and strides {stride} from {offset}")

@@ -80,14 +80,12 @@ def test_other_files_of_diffusers(name, tmp_path):
         np.testing.assert_array_equal(got, tensors["quant_conv.bias"].astype(np.float16))
 
 
-def test_malicious_checkpoint_is_refused_and_not_run(tmp_path):
+def test_code_in_a_checkpoint_is_not_run(tmp_path):
     victim = tmp_path / "was_here"
-    alone = tmp_path / "magvit2.ckpt"
-    write_torch(alone, Malicious(victim), {})
-    hidden = checkpoint(tmp_path / "hidden", {"hyper_parameters": Malicious(victim)})
-    for path in (alone, hidden):
-        with pytest.raises(ConfigError, match=rf"{path}.* needs (posix|nt)\.system"):
-            small(path)
+    alone = write_torch(tmp_path / "magvit2.ckpt", Malicious(victim), {})
+    with pytest.raises(ConfigError, match="something other than names and tensors"):
+        small(alone)
+    small(checkpoint(tmp_path / "hidden", {"hyper_parameters": Malicious(victim)}))  # passed over
     assert not victim.exists()
 
 

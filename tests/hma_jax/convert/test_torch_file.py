@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import collections
+import functools
 import io
 import os
 import pickle
@@ -129,6 +131,25 @@ def test_an_official_checkpoint_may_be_a_torch_file(name, tmp_path):
     write_torch(folder / name, *state_dict({f"module.{key}": x for key, x in tensors.items()}))
     write_official(read_official(folder), tmp_path / "b")
     assert (tmp_path / "b" / "model.safetensors").read_bytes() == (tmp_path / "expected.safetensors").read_bytes()
+
+
+def test_what_a_trainer_keeps_is_passed_over_whatever_it_is(tmp_path):
+    """In protocol 2, which torch writes, built-in types are of `__builtin__`, and bytes come out of a call of one."""
+    besides = {
+        "types": [set, int, bytes],
+        "sets": [{1, 2}, frozenset("a"), collections.Counter("aab"), collections.defaultdict(list, a=[1])],
+        "bytes": [b"a", bytearray(b"b")],
+        "numpy": [np.float64(1.5), np.arange(3), np.dtype("int8")],
+        "others": [tmp_path, argparse.Namespace(lr=1), functools.partial(max, 3)],
+        "torch": [Call(Global("torch", "device"), "cpu"), Storage("ComplexFloatStorage", "9", 1)],
+        "made": rebuild(Storage("ComplexFloatStorage", "9", 1), (1,), (1,)),
+    }
+    state, elements = state_dict({"w": np.arange(3, dtype=np.float32)})
+    for name, kept in besides.items():
+        path = write_torch(tmp_path / f"{name}.ckpt", {"hyper_parameters": kept, "state_dict": state}, elements)
+        assert read_torch(path, within="state_dict")["w"].read().tolist() == [0, 1, 2], name
+        with pytest.raises(ConfigError, match="needs|cannot be read"):
+            read_torch(path)
 
 
 class Malicious:
