@@ -16,15 +16,15 @@ import os
 import struct
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import google_crc32c
 import numpy as np
 
-from data_pipelines.errors import CorruptRecordError
+from data_pipelines.errors import CorruptRecordError, UnreachableError
 from data_pipelines.sources.rlds.location import Descriptor, RandomAccessFile, is_remote, locate, open_random_access
 from hma_jax.runtime.files import naming
 
@@ -149,7 +149,7 @@ def open_record(path: str | Location, offset: int, length: int) -> Iterator[byte
 
     Up to MAX_WHOLE_READ bytes it is read at once. A larger payload is verified in pieces and given as a view that reads
     on access; from a remote store it passes through an unnamed temporary file, so that every byte is fetched
-    once. Raises CorruptRecordError as `read_record` does.
+    once. Raises CorruptRecordError as `read_record` does, UnreachableError if there is no room for that file.
     """
     path = locate(path)
     if length <= MAX_WHOLE_READ:
@@ -161,9 +161,9 @@ def open_record(path: str | Location, offset: int, length: int) -> Iterator[byte
             _verify(_stream(file, path, offset, length, None), footer, path, offset)
             yield FileView(file, offset + HEADER, length)
             return
-        with tempfile.TemporaryFile() as copy:
-            _verify(_stream(file, path, offset, length, copy), footer, path, offset)
-            copy.flush()
+        crc, copy = _copy_to_disk(file, path, offset, length)
+        with copy:
+            _verify(crc, footer, path, offset)
             yield FileView(Descriptor(copy.fileno()), 0, length)
 
 
@@ -217,6 +217,24 @@ def _stream(file: RandomAccessFile, path: Location, offset: int, length: int, co
         if copy is not None:
             copy.write(piece)
     return _mask(crc)
+
+
+def _copy_to_disk(file: RandomAccessFile, path: Location, offset: int, length: int) -> tuple[int, IO[bytes]]:
+    """The masked checksum of a payload, and a temporary file that holds it."""
+    try:
+        with ExitStack() as closing:
+            copy = closing.enter_context(tempfile.TemporaryFile())
+            crc = _stream(file, path, offset, length, copy)
+            copy.flush()
+            closing.pop_all()
+            return crc, copy
+    except OSError as error:  # here and not in the caller, who may be writing files of its own
+        where = tempfile.tempdir or "the temporary directory"
+        raise UnreachableError(
+            f"{where}: the record at byte {offset} of {path}, {length} bytes, cannot be kept there while it is read "
+            f"({error.strerror or error}). Set TMPDIR to a directory on a disk with space, and run the same command "
+            "again."
+        ) from error
 
 
 def _verify(crc: int, footer: bytes, path: Location, offset: int) -> None:

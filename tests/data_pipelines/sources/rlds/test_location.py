@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 from tests.data_pipelines.shards import index_shard
+from tests.full_disk import full_disk
 
 UPath = pytest.importorskip("upath").UPath
 
@@ -79,6 +81,22 @@ def test_large_remote_record_is_fetched_once_and_in_pieces(remote, monkeypatch):
     assert dataset.episode(4, *KEYS).steps == 9
     assert sum(asked) == dataset.sizes()[4] + tfrecord.FOOTER and max(asked) == 256
     assert dataset.record(4).keys() == expected.keys()
+
+
+@pytest.mark.parametrize("place", ["full", "missing"])
+def test_no_room_for_the_copy_of_a_large_record_is_no_fault_of_the_token_store(remote, tmp_path, monkeypatch, place):
+    monkeypatch.setattr(tfrecord, "MAX_WHOLE_READ", 100)
+    temporary = tmp_path / "temporary"
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    if place == "full":
+        temporary.mkdir()
+    dataset = RldsDataset(remote, corrupt="skip")
+    with full_disk(100), pytest.raises(UnreachableError, match=rf"{temporary}: .*00000-of-00002.*TMPDIR") as caught:
+        dataset.episode(0, *KEYS)
+    assert not dataset.skipped and ("File too large" if place == "full" else "No such file") in str(caught.value)
+    temporary.mkdir(exist_ok=True)
+    with pytest.raises(OSError, match="of the caller"), tfrecord.open_record(*dataset._locate(0)):
+        raise OSError("of the caller")
 
 
 def watch(fs, monkeypatch) -> list[int]:
