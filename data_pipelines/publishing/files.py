@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from pathlib import Path
 
@@ -22,8 +23,9 @@ def publish(made: Path, final: Path) -> None:
 
 def remove(directory: Path) -> None:
     """Removes a directory, if it exists: renames it first, so that no reader sees it half removed."""
-    gone = directory.with_name(f".{directory.name.lstrip('.')}.removed")
-    shutil.rmtree(gone, ignore_errors=True)  # of a process that died here
+    prefix = f".{directory.name.lstrip('.')}.removed"
     if directory.exists():
-        os.rename(directory, gone)
+        # A name of its own: NFS keeps the directory of files that are open elsewhere.
+        os.rename(directory, directory.with_name(f"{prefix}.{secrets.token_hex(4)}"))
+    for gone in directory.parent.glob(f"{prefix}*"):  # also those of processes that died here
         shutil.rmtree(gone, ignore_errors=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.publishing import files
-from data_pipelines.publishing.files import publish
+from data_pipelines.publishing.files import publish, remove
 from data_pipelines.publishing.fingerprint import is_complete
 from data_pipelines.publishing.journal import Journal
 from data_pipelines.publishing.output_lock import find_held_lock, lock_output
@@ -53,6 +53,18 @@ def test_a_directory_takes_the_place_of_another_and_leaves_nothing(tmp_path):
     (tmp_path / "made" / "new").touch()
     publish(tmp_path / "made", tmp_path / "1.0.0")
     assert [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*")] == ["1.0.0", "1.0.0/new"]
+
+
+def test_what_could_not_be_removed_is_in_nobodys_way(tmp_path, monkeypatch):
+    """NFS keeps files that are open elsewhere as .nfs*, and their directory with them."""
+    monkeypatch.setattr(files.shutil, "rmtree", lambda path, ignore_errors: None)
+    for _ in range(2):
+        (tmp_path / "1.0.0" / "open").mkdir(parents=True)
+        remove(tmp_path / "1.0.0")
+    assert not (tmp_path / "1.0.0").exists()
+    monkeypatch.undo()
+    remove(tmp_path / "1.0.0")  # whoever comes by later
+    assert not list(tmp_path.iterdir())
 
 
 def test_everything_is_forced_to_the_disk_before_it_is_seen(tmp_path, monkeypatch):
