@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from data_pipelines.errors import DataError, without_advice
+from data_pipelines.errors import DataError, UnreachableError, without_advice
 from data_pipelines.publishing.files import remove, sync
 from data_pipelines.publishing.output_lock import backoff, find_held_lock, lock_output
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, SkippedEpisodes, SplitFacts
@@ -230,6 +230,8 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
     if final.exists():
         try:
             outdated = bool(_changes(load_manifest(final / FILE), plan))
+        except UnreachableError:  # it may be intact
+            raise
         except DataError:  # damaged, or of an older format
             outdated = True
         if outdated:

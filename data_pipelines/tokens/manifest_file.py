@@ -13,6 +13,7 @@ import numpy as np
 from data_pipelines.columns import Column, Columns
 from data_pipelines.errors import DataError
 from data_pipelines.names import truncate
+from data_pipelines.sources.rlds.location import retry
 from data_pipelines.tokens.manifest import COLUMNS_FILE, EPISODE_COLUMNS, READABLE_FORMATS, SPLITS, Manifest
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict
@@ -21,11 +22,11 @@ from hma_jax.config.json import from_dict
 def load_manifest(path: Path) -> Manifest:
     """Reads a manifest of the current format, or of the previous one, whose columns are in its JSON.
 
-    Raises DataError if it is missing, damaged or of another format.
+    Raises DataError if it is missing, damaged or of another format, UnreachableError where the disk fails.
     """
     advice = "Remove the dataset from the store and tokenise it again."
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(retry(path, path.read_bytes))
         if values.get("format") not in READABLE_FORMATS:
             raise DataError(
                 f"{path}: manifest format {values.get('format')!r}, but only "
@@ -36,7 +37,7 @@ def load_manifest(path: Path) -> Manifest:
         manifest = from_dict(Manifest, values)
         manifest.check()
         return replace(manifest, **{s: replace(manifest.split(s), **columns_by_split[s]) for s in SPLITS})
-    except OSError as error:
+    except FileNotFoundError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
     except (ValueError, AttributeError, TypeError, KeyError, OverflowError, RecursionError) as error:
         if isinstance(error, ConfigError):
@@ -57,7 +58,8 @@ def _from_json(path: Path, values: dict[str, Any]) -> EpisodeColumns:
 def _from_file(path: Path, values: dict[str, Any]) -> EpisodeColumns:
     """The columns beside a manifest, which says what they are."""
     stated = values.pop("columns")
-    columns = Columns(path.with_name(COLUMNS_FILE))
+    file = path.with_name(COLUMNS_FILE)
+    columns = retry(file, lambda: Columns(file))
     columns_by_split = {s: {name: Column.of(columns, f"{s}.{name}") for name in EPISODE_COLUMNS} for s in SPLITS}
     for split, by_name in columns_by_split.items():
         for name, column in by_name.items():

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
+from data_pipelines.sources.rlds.location import retry
 
 
 @dataclass(frozen=True)
@@ -85,16 +86,24 @@ def moments_path(part: Path) -> Path:
 
 
 def read_moments(part: Path, episodes: int) -> np.ndarray | None:
-    """float64 [episodes, 1 + 2 A], memory-mapped; None if there is no such file beside `part`."""
+    """float64 [episodes, 1 + 2 A], memory-mapped; None if there is no such file beside `part`.
+
+    Raises DataError for a damaged file, UnreachableError where the disk fails.
+    """
     path = moments_path(part)
+
+    def read() -> np.ndarray:
+        try:
+            return np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
+            raise DataError(
+                f"{path}: the action statistics cannot be read ({error}). Remove the file, and they are computed again."
+            ) from error
+
     try:
-        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+        rows = retry(path, read)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
-        raise DataError(
-            f"{path}: the action statistics cannot be read ({error}). Remove the file, and they are computed again."
-        ) from error
     if rows.ndim != 2 or len(rows) != episodes or rows.dtype != np.float64:
         raise DataError(
             f"{path}: {rows.dtype} {list(rows.shape)} cannot be the action statistics of {episodes} episodes. Remove "

@@ -5,9 +5,12 @@ Owns the reading of what `part_files` writes. Knows nothing of windows or mixtur
 
 from __future__ import annotations
 
+import os
+import resource
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ from array_record.python import array_record_module
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sources.rlds.array_record import READ_OPTIONS
+from data_pipelines.sources.rlds.location import read_through, retry
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
@@ -29,15 +33,17 @@ from hma_jax.model.embodiments import DEAD_STD, EmbodimentTable
 _File = tuple[str, str, int]  # dataset, split, part
 
 MAX_OPEN_FILES = 512
-"""Files kept open. Opening one again takes about as long as two windows: mixed from 40 datasets of
-one part each, 72 thousand frames are read per second on one core, of 25 parts each 44 thousand.
+"""Files kept open, at most half of those that the process may open. Opening one again takes about as long as two
+windows: mixed from 40 datasets of one part each, 72 thousand frames are read per second on one core, of 25 parts each
+44 thousand.
 """
 
 
 class TokenStore:
     """Opens every dataset under `root`. Thread-safe; pickles (files are reopened).
 
-    Raises DataError if `root` is no store, a manifest is damaged, or a dataset lies under another name than its own.
+    Raises DataError if `root` is no store, a manifest is damaged, or a dataset lies under another name than its own;
+    later also where a dataset was replaced or removed meanwhile.
     """
 
     def __init__(self, root: str | Path):
@@ -47,6 +53,8 @@ class TokenStore:
         found = sorted(p.parent for p in self.root.glob(f"*/{FILE}") if not p.parent.name.startswith("."))
         if not found:
             raise DataError(f"{self.root}: the token store is empty. Tokenise datasets into it first.")
+        # Before their contents: what is replaced in between is noticed.
+        self._stamps = {directory.name: _stamp(directory / FILE) for directory in found}
         self._manifests = {directory.name: load_manifest(directory / FILE) for directory in found}
         for directory, manifest in zip(found, self._manifests.values(), strict=True):
             if directory.name != manifest.spec.name:
@@ -82,8 +90,21 @@ class TokenStore:
         return EmbodimentTable(tuple(self.manifest(name).embodiment(rate, scale=scale) for name in names))
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
-        """Episode `i` of a split, in store order. Raises DataError for a damaged record."""
+        """Episode `i` of a split, in store order. Raises DataError for a damaged record, UnreachableError where the
+        disk fails."""
         part, at = self._locate(name, split, i)
+        try:
+            return self._read(name, split, part, at)
+        except (DataError, OSError):
+            # The library's errors do not tell damage from a disk that failed. What fails again is damage, if the file
+            # can be read; if it is missing, the second error says so.
+            with self._lock:
+                self._readers.pop((name, split, part), None)
+            with suppress(FileNotFoundError):
+                read_through(self._path(name, split, part))
+            return self._read(name, split, part, at)
+
+    def _read(self, name: str, split: str, part: int, at: int) -> StoredEpisode:
         reader = self._reader(name, split, part)
         try:
             # A range: the same for a list of records takes time that grows with all records of the file.
@@ -148,6 +169,7 @@ class TokenStore:
             for name, manifest in self._manifests.items()
             for split in SPLITS
         }
+        self._max_open = min(MAX_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
         self._lock = threading.Lock()
         self._readers: OrderedDict[_File, array_record_module.ArrayRecordReader] = OrderedDict()
 
@@ -169,7 +191,7 @@ class TokenStore:
             reader = self._readers.get(key)
             if reader is None:
                 reader = self._readers[key] = self._open(name, split, part)
-                if len(self._readers) > MAX_OPEN_FILES:
+                if len(self._readers) > self._max_open:
                     self._readers.popitem(last=False)  # closed when the last thread is done with it
             else:
                 self._readers.move_to_end(key)
@@ -178,12 +200,13 @@ class TokenStore:
     def _open(self, name: str, split: str, part: int) -> array_record_module.ArrayRecordReader:
         path, expected = self._path(name, split, part), self.manifest(name).split(split).parts[part]
         advice = f"Remove {path.parent} and tokenise the dataset again."
-        if not path.is_file():
-            raise DataError(f"{path}: the file is missing from the token store. {advice}")
-        try:
+        try:  # a missing file is to the library one without records
             reader = array_record_module.ArrayRecordReader(str(path), options=READ_OPTIONS)
         except RuntimeError as error:
             raise DataError(f"{path}: not a readable ArrayRecord file ({error}). {advice}") from error
+        self._check_not_replaced(name)  # not before: it might be replaced in between
+        if _stamp(path) is None:
+            raise DataError(f"{path}: the file is missing from the token store. {advice}")
         if reader.num_records() != expected:
             raise DataError(
                 f"{path}: {reader.num_records()} episodes, but the manifest says {expected}: "
@@ -191,9 +214,36 @@ class TokenStore:
             )
         return reader
 
+    def _check_not_replaced(self, name: str) -> None:
+        """Raises DataError if the dataset is not the one whose manifest was read: tokens of both would be mixed."""
+        path = self.root / name / FILE
+        stamp = _stamp(path)
+        if stamp == self._stamps[name]:
+            return
+        if stamp is None:
+            raise DataError(
+                f"{path.parent}: the dataset was removed while it was in use. Put it back, and run the same command "
+                "again."
+            )
+        if load_manifest(path).hash() != self._manifests[name].hash():
+            raise DataError(
+                f"{path.parent}: the dataset was replaced while it was in use, and tokens of both must not be mixed. "
+                "Start a new run with the new one, or put the old one back and run the same command again."
+            )
+        self._stamps[name] = stamp
+
     def __getstate__(self) -> dict:
-        return {"root": self.root, "_manifests": self._manifests}
+        return {"root": self.root, "_manifests": self._manifests, "_stamps": self._stamps}
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
         self._start()
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Size and time of change of a file, None without one. Raises UnreachableError."""
+    try:
+        status = retry(path, lambda: os.stat(path))
+    except FileNotFoundError:
+        return None
+    return status.st_size, status.st_mtime_ns

@@ -91,7 +91,7 @@ def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:
     """How the datasets that are in the store were made otherwise; a line that holds for several is said once."""
-    from data_pipelines.errors import DataError
+    from data_pipelines.errors import DataError, UnreachableError
     from data_pipelines.tokens.dataset_writer import differences
     from data_pipelines.tokens.tokenize_job import plan_dataset
 
@@ -107,6 +107,8 @@ def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], 
         )  # fmt: skip
         try:
             lines = differences(workspace.store, plan)
+        except UnreachableError:  # it may be intact
+            raise
         except DataError as error:  # damaged, or of an older format
             lines = [str(error)]
         for line in lines:

@@ -26,7 +26,7 @@ POLL_SECONDS = 30.0
 
 def main(directory: Path) -> int:
     """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; LOST: its files could not be
-    written; STOPPED or INTERRUPTED: the next attempt goes on from here."""
+    written, or its data not be read; STOPPED or INTERRUPTED: the next attempt goes on from here."""
     enter_child()  # before anything imports JAX
     try:
         with sigterm_as_interrupt(), attempt(directory) as lock:
@@ -46,7 +46,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     if closure is None:
         return Exit.REFUSED
 
-    from data_pipelines.errors import DataError
+    from data_pipelines.errors import DataError, UnreachableError
     from experiments.running.initial_model import initial_from_trial
     from experiments.running.job import read_job
     from experiments.running.ledger import DIVERGED, FAILED, LOST
@@ -82,7 +82,8 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         _print_traceback()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
-        lost = isinstance(error, OSError)  # a disk that is full or gone is no fault of the trial
+        # A disk that is full or gone is no fault of the trial.
+        lost = isinstance(error, (OSError, UnreachableError))
         state = LOST if lost else DIVERGED if isinstance(error, DivergedError) else FAILED
         with suppress(OSError):  # the same disk, most likely: then the code says it alone
             write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))

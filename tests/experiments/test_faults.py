@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import pytest
 
+from data_pipelines.errors import UnreachableError
 from data_pipelines.tokens import part_maker
 from experiments.analysis.tables import read_side
 from experiments.cli.evaluate import MEANS
@@ -20,7 +21,7 @@ from experiments.cli.main import main
 from experiments.evaluated import STAMP
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
-from experiments.running.attempts import AttemptEnd, outcome
+from experiments.running.attempts import AttemptEnd, State, outcome
 from experiments.running.shared_runs import SharedTraining
 from experiments.running.workspace import Workspace
 from hma_jax.evaluation import evaluate as evaluation
@@ -164,6 +165,16 @@ def test_a_trial_on_a_full_disk_is_lost_not_failed_so_that_the_same_command_goes
     state = outcome(tmp_path, AttemptEnd(Exit.LOST))
     assert state.event == "lost"
     assert ("provenance.json" if room else "is the disk full?") in state.message
+
+
+def test_a_trial_whose_data_cannot_be_read_now_is_lost_not_failed(tmp_path, monkeypatch):
+    def away(*_, **__):
+        raise UnreachableError("tokens/arm: cannot be read (Stale file handle)")
+
+    write_job(tmp_path, monkeypatch)
+    monkeypatch.setattr(trials, "run_trial", away)
+    assert trial_main.main(tmp_path) == Exit.LOST
+    assert outcome(tmp_path, AttemptEnd(Exit.LOST)) == State("lost", "tokens/arm: cannot be read (Stale file handle)")
 
 
 # --- Not finite ------------------------------------------------------------------------------

@@ -49,6 +49,10 @@ MAX_OPEN_FILES = 128
 """Files that `OpenFiles` keeps open by default: half of the smallest usual limit of open files per process."""
 
 
+CHUNK = 4 * 2**20
+"""Bytes of a file in memory at a time while `read_through` reads it."""
+
+
 class RandomAccessFile(Protocol):
     """An open file of `size` bytes, any range of which can be read."""
 
@@ -125,6 +129,20 @@ def read_head(location: Location, max_bytes: int) -> bytes:
             return file.read(max_bytes)
 
     return retry(location, read)
+
+
+def read_through(path: Path) -> None:
+    """Reads a file to its end, which tells a disk that fails from contents that are damaged.
+
+    Raises FileNotFoundError if there is none, UnreachableError where the disk fails.
+    """
+
+    def read() -> None:
+        with open(path, "rb", buffering=0) as file:
+            while file.read(CHUNK):
+                pass
+
+    retry(path, read)
 
 
 class OpenFiles:

@@ -1,17 +1,28 @@
 from __future__ import annotations
 
+import builtins
+import errno
+import io
 import json
+import os
 import pickle
+import resource
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import DataError, UnreachableError
+from data_pipelines.sources.rlds import location
+from data_pipelines.tokens import store as store_module
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode, encode_episode, token_dtype
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import FakeTokenizer
 
 
 def make_item(**changes) -> StoredEpisode:
@@ -157,3 +168,123 @@ def test_damaged_or_missing_file(copy, spoil):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if spoil == "truncate" else 0])
     with pytest.raises(DataError, match=r"train-00000-of-00001.array_record: .*tokenise the dataset again"):
         TokenStore(copy).episode("arm", "train", 0)
+
+
+# --- A disk that fails is no damage ----------------------------------------------------------
+
+
+class Failing:
+    """The reader of a disk that fails: the library gives an error of its own where it reads, none where it opens."""
+
+    def __init__(self, reader, count: int):
+        self.reader, self.count = reader, count
+
+    def num_records(self) -> int:
+        return self.count
+
+    def read(self, first: int, end: int) -> list[bytes]:
+        raise RuntimeError("pread() failed: Stale file handle")
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """`failing(times, path, opening)`: so often `path` cannot be read, or not even be opened; gives the waits."""
+
+    def start(times: int, path: Path, opening: bool = False) -> list[float]:
+        waits, left = [], [times]
+        plain, library = builtins.open, store_module.array_record_module.ArrayRecordReader
+
+        def fails(place) -> bool:
+            failed = str(place) == str(path) and left[0] > 0
+            left[0] -= failed
+            return failed
+
+        def opened(place, *args, **options):
+            if fails(place):
+                raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(place))
+            return plain(place, *args, **options)
+
+        def reader(place, **options):
+            real = library(place, **options)
+            return Failing(real, 0 if opening else real.num_records()) if fails(place) else real
+
+        for owner in (builtins, io):  # pathlib takes it from there
+            monkeypatch.setattr(owner, "open", opened)
+        monkeypatch.setattr(store_module, "array_record_module", SimpleNamespace(ArrayRecordReader=reader))
+        monkeypatch.setattr(location.time, "sleep", waits.append)
+        return waits
+
+    return start
+
+
+@pytest.mark.parametrize("opening", [False, True])
+@pytest.mark.parametrize("times", [1, 3])
+def test_a_disk_that_comes_back_is_read_on(copy, failing, opening, times):
+    store = TokenStore(copy)
+    waits = failing(times, copy / "arm/train-00000-of-00001.array_record", opening)
+    assert store.episode("arm", "train", 5).episode == store.manifest("arm").train.episodes[5]
+    assert len(waits) == times - 1
+
+
+@pytest.mark.parametrize("opening", [False, True])
+def test_a_disk_that_stays_away_is_no_reason_to_remove_the_dataset(copy, failing, opening):
+    path = copy / "arm/train-00000-of-00001.array_record"
+    store = TokenStore(copy)
+    failing(10**6, path, opening)
+    with pytest.raises(UnreachableError, match=rf"{path}: cannot be read .*Too many open files.*same command again"):
+        store.episode("arm", "train", 5)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "episodes.columns", "train-00000-of-00001.moments.npy"])
+def test_what_stands_beside_the_episodes_is_read_again_too(copy, failing, name):
+    waits = failing(2, copy / "arm" / name)
+    assert TokenStore(copy).action_moments("arm", np.arange(3)).count > 0
+    assert len(waits) == 2
+    failing(10**6, copy / "arm" / name)
+    with pytest.raises(UnreachableError, match=rf"{name}: cannot be read .*Too many open files.*same command again"):
+        TokenStore(copy).action_moments("arm", np.arange(3))
+
+
+def test_a_dataset_whose_manifest_cannot_be_read_now_is_not_replaced(copy, rlds, failing):
+    failing(10**6, copy / "arm" / "manifest.json")
+    spec, directory = next((spec, directory) for spec, directory in rlds.items() if spec.name == "arm")
+    with pytest.raises(UnreachableError):
+        tokenize_dataset(spec, directory, FakeTokenizer(), copy, overwrite=True)
+    assert (copy / "arm" / "manifest.json").exists()
+
+
+def test_files_kept_open_leave_room_for_those_of_the_rest(copy, monkeypatch):
+    store = TokenStore(copy)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    assert store._max_open == min(512, before[0] // 2)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (256, before[1]))  # as on macOS
+        assert pickle.loads(pickle.dumps(store))._max_open == 128
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+# --- Replaced while it is read -----------------------------------------------------------------
+
+
+def test_a_dataset_that_was_replaced_meanwhile_is_not_mixed_with_the_old_one(copy, rlds):
+    store = TokenStore(copy)
+    kept = store.episode("arm", "val", 0)
+    again = pickle.loads(pickle.dumps(store))
+    spec, directory = next((spec, directory) for spec, directory in rlds.items() if spec.name == "arm")
+    tokenize_dataset(spec, directory, FakeTokenizer("another"), copy, overwrite=True)
+    assert np.array_equal(store.episode("arm", "val", 0).tokens, kept.tokens)  # of the file that is open
+    for reader in (store, again):
+        with pytest.raises(DataError, match=rf"{copy / 'arm'}: .*replaced .*new run"):
+            reader.episode("arm", "train", 0)
+    shutil.rmtree(copy / "arm")
+    with pytest.raises(DataError, match=rf"{copy / 'arm'}: .*removed"):
+        store.episode("arm", "train", 0)
+
+
+def test_a_dataset_that_was_replaced_by_an_equal_one_is_read_on(store_root, copy):
+    store = TokenStore(copy)
+    shutil.rmtree(copy / "arm")
+    shutil.copytree(store_root / "arm", copy / "arm")
+    os.utime(copy / "arm" / "manifest.json")
+    assert store.episode("arm", "train", 0).episode == store.manifest("arm").train.episodes[0]
