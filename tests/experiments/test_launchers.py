@@ -273,6 +273,27 @@ def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_pat
     assert (copy.directory, copy.cache) == (attempt.directory, attempt.cache)
 
 
+@pytest.mark.parametrize(("grace", "to_save"), [(600, 590), (12, 6)])
+def test_a_trial_has_the_grace_of_its_job_to_save(tmp_path, monkeypatch, grace, to_save):
+    pytest.importorskip("submitit")
+    fake, submitted = FakeSlurm(tmp_path / "slurm", monkeypatch), []
+    fake.submit_array = lambda attempts: submitted.extend(attempts) or attempts
+    SlurmLauncher(tmp_path, None, SlurmSettings(grace=grace), executor=fake).launch([tmp_path])
+    (attempt,) = submitted
+    attempt._code = 130  # it has saved
+    assert attempt.grace == attempt.checkpoint().function.grace == to_save
+
+
+def test_a_trial_that_does_not_end_within_its_grace_is_killed(tmp_path):
+    attempt = Attempt(tmp_path, tmp_path / "compiled", lambda directory: ["sleep", "60"], grace=0.2)
+    (tmp_path / "stop").touch()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which the child inherits
+    try:
+        assert attempt.run() == -signal.SIGKILL
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 130), (signal.SIGUSR2, 77)])
 def test_a_signal_to_the_engines_process_stops_its_trial_in_order(tmp_path, sent, code):
     """SIGTERM of scancel, and SIGUSR2, on which submitit asks for a checkpoint in the signal's handler."""

@@ -25,10 +25,10 @@ STOP = "stop"
 
 
 class Attempt:
-    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk."""
+    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk. `grace`: seconds to save."""
 
-    def __init__(self, directory: Path, cache: Path, command: Command):
-        self.directory, self.cache, self.command = directory, cache, command
+    def __init__(self, directory: Path, cache: Path, command: Command, grace: float = GRACE_SECONDS):
+        self.directory, self.cache, self.command, self.grace = directory, cache, command, grace
         (directory / STOP).unlink(missing_ok=True)  # it asked an earlier attempt
         self._child: subprocess.Popen | None = None
         self._code: int | None = None
@@ -74,7 +74,7 @@ class Attempt:
         if self._code is not None:
             return
         self._request_stop()
-        deadline = time.monotonic() + GRACE_SECONDS
+        deadline = time.monotonic() + self.grace
         while self._code is None and time.monotonic() < deadline:
             time.sleep(POLL_SECONDS)
         if self._code is None:

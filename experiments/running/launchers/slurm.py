@@ -37,6 +37,9 @@ ASKED_TO_STOP = {"CANCELLED", "PREEMPTED", "TIMEOUT"}
 OVER = ASKED_TO_STOP | {COMPLETED, "BOOT_FAIL", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "REVOKED"}
 """States of a job that will not run again."""
 
+REQUEUE = 10.0
+"""Seconds of a job's `grace` that submitit gets to put it back into the queue; the trial has the others to save."""
+
 LINGER = 30.0
 """Seconds for a job's last words to reach this machine through a shared disk."""
 
@@ -78,7 +81,7 @@ class SlurmAttempt(Attempt):
         from submitit.helpers import DelayedSubmission
 
         self.end()
-        return DelayedSubmission(SlurmAttempt(self.directory, self.cache, self.command))
+        return DelayedSubmission(SlurmAttempt(self.directory, self.cache, self.command, self.grace))
 
 
 class SlurmLauncher(Launcher):
@@ -100,6 +103,7 @@ class SlurmLauncher(Launcher):
         executor: Any = None,
     ):
         self._root, self._command = root, command
+        self._grace = max(settings.grace - REQUEUE, settings.grace / 2)
         self._executor = executor or _make_executor(root / "slurm", workers, settings)
         self._polled = -math.inf
         self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
@@ -112,7 +116,7 @@ class SlurmLauncher(Launcher):
     def launch(self, directories: Sequence[Path]) -> list[Any]:
         from submitit.core.utils import FailedJobError
 
-        attempts = [SlurmAttempt(d, self._root / "compiled", self._command) for d in directories]
+        attempts = [SlurmAttempt(d, self._root / "compiled", self._command, self._grace) for d in directories]
         jobs: list[Any] = []
         try:
             for first in range(0, len(attempts), LARGEST_ARRAY):
