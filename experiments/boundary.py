@@ -48,7 +48,7 @@ def guarded(
         return Exit.UNREAD
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
-        what = "stopped by SIGTERM" if code == Exit.STOPPED else "interrupted"
+        what = "stopped by a signal" if code == Exit.STOPPED else "interrupted"
         anew = f"starts again from the beginning, but keeps {keeps}" if keeps else "begins anew"
         _say(f"{what}; the same command {'continues from here' if resumes else anew}")
         _end_together(request, code)

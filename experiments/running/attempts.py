@@ -35,7 +35,7 @@ RUN = "run"
 """The training run, with its checkpoints."""
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-"""Signals that ask an attempt to stop. It saves and ends with 128 + n; before it is ready to save, with -n."""
+"""Signals that ask an attempt to stop. It saves and ends with 130 or 143; before it is ready to save, with -n."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import termios
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,11 +32,11 @@ class Exit(IntEnum):
     LOST = 75
     UNREAD = 128 + signal.SIGPIPE  # whoever read the output does so no more, as `| head`
     INTERRUPTED = 128 + signal.SIGINT  # Ctrl-C; what could be saved is, and the same command goes on
-    STOPPED = 128 + signal.SIGTERM  # the same, asked for by SIGTERM
+    STOPPED = 128 + signal.SIGTERM  # the same, asked for by SIGTERM or SIGHUP
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as schedulers send it: a program ends as it does on Ctrl-C."""
+    """SIGTERM, as schedulers send it, or SIGHUP of a terminal that is closed: a program ends as it does on Ctrl-C."""
 
 
 _pending: list[Exit] = []
@@ -46,9 +48,10 @@ _active_blocks = 0
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """SIGTERM raises Terminated in the main thread while the block runs; by default it would end the process at once.
+    """SIGTERM and SIGHUP raise Terminated in the main thread while the block runs; by default they would end the
+    process at once. SIGHUP that is ignored, as under nohup, stays so.
 
-    Both signals are held back during imports: an exception in the middle of one is swallowed where a library tries
+    They and SIGINT are held back during imports: an exception in the middle of one is swallowed where a library tries
     whether a module exists, leaves a module half initialised, or crashes a library's C code. They are held back during
     compilation too, which cannot be interrupted: an exception raised before the compiled program is used ends the
     process by a segmentation fault.
@@ -60,7 +63,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
             again.daemon = True
             again.start()
             return
-        _pending.append(Exit(128 + number))
+        _pending.append(take_signal(number))
         raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
     global _active_blocks
@@ -68,8 +71,9 @@ def sigterm_as_interrupt() -> Iterator[None]:
         yield  # only the main thread may install handlers
         return
     before = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # otherwise it is ignored, or handled already
-        before[signal.SIGINT] = signal.signal(signal.SIGINT, stop)
+    for number, default in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) is default:  # otherwise it is ignored, or handled already
+            before[number] = signal.signal(number, stop)
     _active_blocks += 1
     try:
         yield
@@ -115,6 +119,23 @@ def _in_import_or_compiler(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+def take_signal(number: int) -> Exit:
+    """The code after a stop request by SIGINT, SIGTERM or SIGHUP; called by the handlers of these signals.
+
+    Printing on a terminal that is closed would raise OSError, before anything is saved: from now on it goes nowhere.
+    A terminal that is closed sends SIGHUP by its shell and again when the shell ends: further ones are ignored.
+    """
+    if number == signal.SIGHUP:
+        signal.signal(number, signal.SIG_IGN)
+    for stream in (1, 2):
+        try:
+            termios.tcgetattr(stream)
+        except termios.error as error:
+            if error.args[0] != errno.ENOTTY:  # it was a terminal
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    return Exit.INTERRUPTED if number == signal.SIGINT else Exit.STOPPED
 
 
 def exit_of_interrupt(request: KeyboardInterrupt) -> Exit:

@@ -32,7 +32,7 @@ import numpy as np
 
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.cores import usable_cores
-from hma_jax.runtime.exits import Exit, leave_stop_pending, take_pending_stop
+from hma_jax.runtime.exits import Exit, leave_stop_pending, take_pending_stop, take_signal
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
@@ -45,7 +45,7 @@ from hma_jax.training.step_trace import PROFILE, StepTrace
 
 
 class Interrupted(RuntimeError):
-    """The run was asked to stop (Ctrl-C, SIGTERM) and saved its state first. `exit` is the code to end with."""
+    """The run was asked to stop (Ctrl-C, SIGTERM, SIGHUP) and saved its state first. `exit` is the code to end with."""
 
     def __init__(self, message: str, exit: Exit = Exit.INTERRUPTED):
         super().__init__(message)
@@ -291,19 +291,23 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator[_Stop]:
-    """An event set by SIGINT or SIGTERM; a second signal acts as usual. A request that the block did not act on is left
-    pending for the code after it."""
+    """An event set by SIGINT, SIGTERM or SIGHUP; a second SIGINT or a second SIGTERM acts as usual, but not one of
+    another kind: schedulers send several. A request that the block did not act on is left pending for the code after
+    it."""
     event = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield event  # only the main thread may install handlers
         return
-    previous = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+    previous = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    if previous[signal.SIGHUP] is signal.SIG_IGN:  # under nohup
+        del previous[signal.SIGHUP]
 
     def on_signal(number: int, frame: object) -> None:
         del frame
-        event.exit = Exit(128 + number)
+        event.exit = take_signal(number)
         event.set()
-        signal.signal(number, previous[number])
+        if number != signal.SIGHUP:
+            signal.signal(number, previous[number])
 
     for number in previous:
         signal.signal(number, on_signal)

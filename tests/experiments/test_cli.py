@@ -394,4 +394,4 @@ def test_sigterm_ends_like_an_interruption_with_a_last_word(tmp_path):
     process.terminate()
     out, said = process.communicate(timeout=60)
     assert (process.returncode, out) == (143, "saved\n")
-    assert said == "stopped by SIGTERM; the same command continues from here\n"
+    assert said == "stopped by a signal; the same command continues from here\n"

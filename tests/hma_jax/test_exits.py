@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pty
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -24,13 +27,59 @@ def test_every_code_is_documented():
     assert len(set(Exit)) == len(Exit)
 
 
-def test_sigterm_ends_a_block_as_ctrl_c_does_with_a_code_of_its_own():
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_sigterm_and_sighup_end_a_block_as_ctrl_c_does_with_a_code_of_their_own(number):
+    before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt) as stopped, sigterm_as_interrupt():
-        os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getsignal(number) is not signal.SIG_DFL
+        os.kill(os.getpid(), number)
     assert stopped.type is Terminated and exit_of_interrupt(stopped.value) == Exit.STOPPED == 143
     assert exit_of_interrupt(KeyboardInterrupt()) == Exit.INTERRUPTED == 130
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.getsignal(number) is before
+
+
+def test_what_is_printed_on_a_closed_terminal_does_not_keep_a_program_from_saving(tmp_path: Path):
+    program = (
+        "import fcntl, sys, termios, time; from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt\n"
+        "fcntl.ioctl(1, termios.TIOCSCTTY, 0)\n"  # its closing sends SIGHUP
+        "try:\n"
+        "    with sigterm_as_interrupt():\n"
+        "        print('at work', flush=True)\n"
+        "        time.sleep(60)\n"
+        "except KeyboardInterrupt as request:\n"
+        "    print('saving', flush=True)\n"
+        "    print('saving', file=sys.stderr, flush=True)\n"
+        "    sys.exit(exit_of_interrupt(request))"
+    )
+    terminal, its = pty.openpty()
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=its, stderr=its, start_new_session=True)
+    os.close(its)
+    said = b""
+    while b"at work" not in said:
+        said += os.read(terminal, 1000)
+    os.close(terminal)
+    assert process.wait(30) == Exit.STOPPED
+
+
+def test_a_second_sighup_does_not_interrupt_what_the_first_began():
+    """A shell whose terminal is closed sends it to its jobs, and the system does once more when the shell ends."""
+    saved = []
+    with pytest.raises(Terminated), sigterm_as_interrupt():
+        try:
+            os.kill(os.getpid(), signal.SIGHUP)
+        finally:
+            os.kill(os.getpid(), signal.SIGHUP)
+            saved.append(True)
+    assert saved
+
+
+def test_under_nohup_sighup_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with sigterm_as_interrupt():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])

@@ -284,6 +284,28 @@ def test_a_request_that_was_lost_before_training_stops_it_after_a_step(tmp_path:
     assert stopped.value.exit == Exit.STOPPED and list_steps(tmp_path / "checkpoints") == [1]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_saves_before_it_stops_training_and_one_of_another_kind_changes_nothing(number, tmp_path: Path):
+    def stop(step: int, steps: int, metrics: dict) -> None:
+        if step == 1:
+            again = [signal.SIGHUP] if number == signal.SIGHUP else []  # a closed terminal sends it twice
+            for sent in (number, *again, signal.SIGTERM if number == signal.SIGINT else signal.SIGINT):
+                assert signal.getsignal(sent) is not signal.SIG_DFL
+                signal.raise_signal(sent)
+
+    with sigterm_as_interrupt(), pytest.raises(Interrupted, match="the same command resumes"):
+        fit_toy(tmp_path, steps=1000, progress=stop)
+    assert list_steps(tmp_path / "checkpoints")
+
+
+def test_under_nohup_training_ignores_sighup(tmp_path: Path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        fit_toy(tmp_path, steps=2, progress=lambda step, *_: signal.raise_signal(signal.SIGHUP))
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_a_request_in_the_last_step_stops_what_comes_after_training(tmp_path: Path):
     """A trial's evaluation, say, which may take longer than its training."""
 
