@@ -37,6 +37,9 @@ def _contract_backward(
     dy = dy.astype(x.dtype)
     outs = w.ndim - axes
     dx = jnp.tensordot(dy, w, (tuple(range(dy.ndim - outs, dy.ndim)), tuple(range(axes, w.ndim))))
+    if is_split():  # a split dimension must stay one of its own
+        dw = jnp.tensordot(x.reshape(-1, *w.shape[:axes]), dy.reshape(-1, *w.shape[axes:]), (0, 0))
+        return dx, dw
     wide, narrow = math.prod(w.shape[:axes]), math.prod(w.shape[axes:])
     dw = _product_over_rows(x.reshape(-1, wide), dy.reshape(-1, narrow))
     return dx, dw.reshape(w.shape)

@@ -32,6 +32,13 @@ def run_on(devices: int, program: str, *arguments: str) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def test_a_weight_whose_heads_are_split_gets_its_gradient_where_they_are():
+    """Each device computed that of all heads, from the activations of all devices."""
+    found = run_on(8, "communicated")
+    assert found["kinds"] == {"all-reduce": 1}
+    assert found["temporary"] < 2**17
+
+
 def check_forty_robots(kind: str, steps: int, meshes: tuple[str, ...], robots: int = 40) -> dict[str, Any]:
     found = run_on(8, "forty_robots", kind, str(steps), str(robots), ONE, *meshes)
     losses = found[ONE]["losses"]
