@@ -251,11 +251,17 @@ def run_trial(
         trial, prepared, directory / RUN, execution=execution, keep=keep, progress=progress, **beginning
     )
 
+    weights, loss = trained.state.weights, last_loss(trained.losses)
+    seconds = {"train_seconds": trained.seconds, "compile_seconds": trained.compile_seconds}
+    layout = jax.tree.map(lambda x: x.sharding, weights)
+    del trained, beginning  # moments and initial parameters would lie on the devices beside what evaluation computes
+
     subject = (trial.model, table, prepared, trial.eval, trial.train.masking.setting)
-    evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)
+    evaluation = evaluate_on(trial.evaluated, weights, *subject, execution=execution, progress=progress)
+    del weights
     untrained = None
     if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
-        fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))
+        fresh = declared.init(trial.train.seed, layout)
         untrained = evaluate_on(
             trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
         ).summary.to_dict()
@@ -263,13 +269,12 @@ def run_trial(
     result = {
         "evaluation": evaluation.summary.to_dict(),
         "untrained": untrained,
-        "training_loss": last_loss(trained.losses),
+        "training_loss": loss,
         "parameters": declared.count(),
         "train_flops": train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         "run": {
             "seconds": time.perf_counter() - started,
-            "train_seconds": trained.seconds,
-            "compile_seconds": trained.compile_seconds,
+            **seconds,
             "machine": describe_machine(jax.devices()),
             "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
         },
