@@ -182,10 +182,16 @@ def _root(vocab: int | None, factors: int, where: str) -> int:
 
 
 def read_masking(config: Mapping[str, Any]) -> MaskingConfig:
-    """How the release would go on training."""
+    """How the release would go on training. Raises ConfigError where it would train nothing."""
     full = {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
     fields = {field: full[official] for official, field in MASKING_FIELDS.items()}
-    fields["setting"] = "full" if full["jointly_predict_actions"] else "forward"
+    states, actions = (bool(full[f"jointly_predict_{what}"]) for what in ("states", "actions"))
+    require(
+        states or actions,
+        "jointly_predict_states and jointly_predict_actions are both false, so the model predicts nothing; one must be "
+        "true",
+    )
+    fields["setting"] = ("full" if states else "policy") if actions else "forward"
     if is_continuous(config):
         fields |= {"mask_angle_min": full["dataloader_mask_ratio_min"], "mask_unit": "cell"}
     else:
@@ -226,6 +232,7 @@ def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingCon
         "use_mup": model.mup.enabled,
         "action_network": next(k for k, v in NETWORKS.items() if v == model.conditioning),
         "jointly_predict_actions": masking.predicts_actions,
+        "jointly_predict_states": masking.predicts_frames,
         "init_actions": True,
         "action_domains": list(table.names),
         "d_actions": table.chunks.tolist(),

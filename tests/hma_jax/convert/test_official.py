@@ -99,6 +99,15 @@ def test_a_trained_run_keeps_fields_we_have_no_use_for_and_says_what_changed(tmp
     assert after == before | {"non_mlm_ratio": 0.5, "factored_vocab_size": 8}
 
 
+@pytest.mark.parametrize("setting", ["forward", "full", "policy"])
+def test_what_a_model_predicts_goes_there_and_back(setting, tmp_path):
+    """A model of actions only must not come back as one that can be asked for frames."""
+    run = read_official(make_checkpoint(tmp_path / "a", DISCRETE, ONE))
+    trained = replace(run, step=1, train=replace(run.train, masking=replace(run.train.masking, setting=setting)))
+    write_official(trained, tmp_path / "b")
+    assert read_official(tmp_path / "b").train.masking.setting == setting
+
+
 def test_weights_that_were_changed_in_another_format_do_not_count_as_they_came(tmp_path):
     """`_without_constants` is for what this project made: here of a value that never varies."""
     config = official_config(DISCRETE, ONE)
@@ -163,6 +172,7 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"d_actions": ["2"]}, "d_actions must list one value per robot"),
         ({"S": None}, "S must be a positive integer, got None"),
         ({"num_prompt_frames": 0}, "prompt_frames must be at least 1"),
+        ({"jointly_predict_states": False}, "jointly_predict_states and jointly_predict_actions are both false"),
     ],
 )
 def test_a_configuration_that_cannot_work_is_refused_by_name(changes, message, tmp_path):
