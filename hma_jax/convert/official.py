@@ -169,7 +169,7 @@ def official_config(run: Run) -> dict[str, Any]:
     Raises ConfigError if the release could not compute the model.
     """
     form = _exportable(run)
-    source = run.provenance.get("official", {})
+    source = _imported(run)
     original = source.get("config", {})
     fields = write_config(form, run.table, run.train.masking)
     if original and source["table"] == stable_hash(run.table):
@@ -198,6 +198,15 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
             tensors[name] = np.asarray(values, np.float32)
     halves = run.provenance.get("official", {}).get("halves", {})
     return {name: _narrow(x, halves.get(name)) for name, x in tensors.items()}, remarks
+
+
+def _imported(run: Run) -> dict[str, Any]:
+    """What `read_official` noted of the checkpoint that the run was made from, or that it was trained on from; {} if
+    there is none."""
+    provenance = run.provenance
+    while provenance and "official" not in provenance:
+        provenance = provenance.get("origin", {}).get("provenance", {})
+    return provenance.get("official", {})
 
 
 def _exportable(run: Run) -> ModelConfig:
