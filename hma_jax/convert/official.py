@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -183,14 +184,15 @@ def official_config(run: Run) -> dict[str, Any]:
 def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     """(name -> array, remarks for the user). Raises ConfigError as `official_config` does."""
     form, remarks = _exportable(run), []
-    leaves = declare_model(form, run.table).leaves()
-    arrays = flat(run.params)
+    declared = declare_model(form, run.table)
+    leaves = declared.leaves()
+    arrays = folded(flat(run.params), leaves, run.model, form)
     if not run.model.action_heads:
-        arrays |= {path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays}
-        remarks.append("the release's models have action heads, this model has none: they are written as zeros")
+        heads = nested({path: spec for path, spec in leaves.items() if path not in arrays})
+        arrays |= flat(replace(declared, specs=heads).init(0))
+        remarks.append("the release's models have action heads, this model has none: they are written untrained")
     if not _unchanged_since_import(run):
         arrays |= _without_constant_actions(arrays, run.table)
-    arrays = folded(arrays, leaves, run.model, form)
     remarks += _remarks(run.model, form)
     tensors = to_official(nested(arrays), official_parts(form, run.table, leaves))
     for entry in run.table.entries:

@@ -76,11 +76,11 @@ def same_numbers(config, params, back: Run) -> None:
 
 
 def test_a_discrete_model_keeps_mup_at_the_base_width_of_the_release(tmp_path):
-    """Another muP base width, no action heads: read-outs are rescaled, heads are zero."""
+    """Another muP base width, no action heads: read-outs are rescaled, heads are untrained."""
     config = model_config(action_heads=False, frames=3)
     _, params = lively_params(config)
     back, official, remarks = written(config, params, tmp_path / "a")
-    assert any("0.125" in remark for remark in remarks) and any("zeros" in remark for remark in remarks)
+    assert any("0.125" in remark for remark in remarks) and any("untrained" in remark for remark in remarks)
     assert official["use_mup"] and back.model.mup.base_width == 256 and loads_in_release(official)
     same_numbers(config, params, back)
 
@@ -144,6 +144,16 @@ def test_what_came_with_mup_that_the_release_refuses_loses_it_once_it_is_trained
     before, after = (json.loads((tmp_path / x / "config.json").read_text()) for x in "ab")
     assert after == before | {"use_mup": False, "factored_vocab_size": 64}
     assert not loads_in_release(before) and loads_in_release(after)
+
+
+def test_action_heads_that_a_model_lacks_can_be_trained_by_the_release():
+    """Of a head that is all zeros, gains included, no gradient leaves zero."""
+    config = model_config(diffusion=RELEASED, frames=3, action_heads=False)
+    run = Run(config, train_config(), TABLE, declare_model(config, TABLE).init(0), 7, {})
+    tensors, _ = official_tensors(run)
+    head = "action_diff_losses.arm.net."
+    assert (tensors[head + "res_blocks.0.in_ln.weight"] == 1).all()
+    assert all(tensors[head + f"{layer}.weight"].any() for layer in ("input_proj", "cond_embed", "time_embed.mlp.0"))
 
 
 @pytest.mark.parametrize("changes", [{}, {"diffusion": RELEASED}], ids=["discrete", "continuous"])
