@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli.command_line import Commands
 from experiments.presets import get_preset
-from experiments.progress import console, say
+from experiments.progress import say
 from experiments.wrote import wrote
 from hma_jax.config import DecodeConfig, SamplerConfig, Weights
 from hma_jax.config.evaluation import SamplerKind
@@ -54,19 +54,14 @@ def from_official(checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOIN
         out: Directory of the run to write. Its rates.toml has the registry entries of its robots, as far as the
             registry knows them, with the frame rates that the model was trained at.
     """
-    from hma_jax.convert import read_official, require_free, write_run
+    from hma_jax.convert import import_remarks, read_official, require_free, write_run
 
     require_free(out)
     run = read_official(checkpoint)
     rates, without = _rates(run)
     write_run(run, out, {RATES: rates})
-    for note in without:
+    for note in (*without, *(f"note: {remark}" for remark in import_remarks(run))):
         say(note)
-    if run.model.conditioning == "cross_attention":
-        console.print(
-            "note: cross-attention is computed as the paper describes it; the release computes it differently",
-            soft_wrap=True,
-        )
     _describe(run)
     study = _study_of(run, out / RATES)
     wrote(

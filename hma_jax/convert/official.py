@@ -23,6 +23,7 @@ from hma_jax.config.json import stable_hash
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.convert.official_config import (
+    BASE_WIDTH,
     CONTINUOUS_DEFAULTS,
     DISCRETE_DEFAULTS,
     is_continuous,
@@ -103,6 +104,28 @@ def read_official(directory: Path) -> Run:
         }
     }
     return Run(model, TrainConfig(masking=masking), table, params, 0, provenance)
+
+
+def import_remarks(run: Run) -> list[str]:
+    """What a user must know of a run that `read_official` made and nobody trained since: where it computes otherwise
+    than the release, or may compute otherwise than what was trained."""
+    remarks = []
+    if run.model.conditioning == "cross_attention":
+        remarks.append("cross-attention is computed as the paper describes it; the release computes it differently")
+    if run.train.masking.predicts_actions:
+        remarks.append(
+            "the actions that it predicts are wrong, here as in the release, which trains action heads on raw actions "
+            "and un-normalises what they give (docs/reference.md, section 9.1); its frames are not affected. To "
+            "predict actions, train it further here (hma train --from): here targets are normalised"
+        )
+    if run.model.diffusion and run.model.mup.enabled and run.model.width != BASE_WIDTH:
+        remarks.append(
+            f"use_mup is true and the width is {run.model.width}: the release can neither train nor load such a "
+            f"continuous model, since its muP supports width {BASE_WIDTH} only, so nothing says how the program that "
+            "trained it scales the condition of the diffusion heads. It is multiplied by 1 here; if frames come out "
+            f"wrong, it may have to be {BASE_WIDTH / run.model.width:g} ({BASE_WIDTH} / width)"
+        )
+    return remarks
 
 
 @contextmanager

@@ -91,6 +91,7 @@ def test_a_run_comes_to_its_place_with_its_rates(tmp_path, monkeypatch):
 def test_what_the_release_does_not_load_is_not_said_to_load(base, loads, tmp_path, capsys):
     start, run, back = make_checkpoint(tmp_path / "a", base, [("push", 2, 1)]), tmp_path / "run", tmp_path / "back"
     assert main(["convert", "from-official", str(start), "--out", str(run)]) == 0
+    assert ("note: use_mup is true and the width is 16" in capsys.readouterr().out) != loads
     assert main(["convert", "to-official", str(run), "--out", str(back)]) == 0
     said = capsys.readouterr().out.replace("\n", "")
     assert ("the official release loads it with STMaskGIT.from_pretrained" in said) == loads

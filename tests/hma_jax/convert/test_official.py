@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.convert import (
+    import_remarks,
     loads_in_release,
     official_shapes,
     read_neutral,
@@ -108,6 +110,24 @@ def test_what_a_model_predicts_goes_there_and_back(setting, tmp_path):
     trained = replace(run, step=1, train=replace(run.train, masking=replace(run.train.masking, setting=setting)))
     write_official(trained, tmp_path / "b")
     assert read_official(tmp_path / "b").train.masking.setting == setting
+
+
+@pytest.mark.parametrize(
+    ("base", "changes", "said"),
+    [
+        (DISCRETE, {}, None),
+        (DISCRETE, {"action_network": "cross_attention"}, "cross-attention is computed as the paper"),
+        (DISCRETE, {"jointly_predict_actions": True}, "actions that it predicts are wrong"),
+        (CONTINUOUS, {"use_mup": False}, None),
+        (CONTINUOUS, {"use_mup": False, "jointly_predict_actions": True}, "actions that it predicts are wrong"),
+        (CONTINUOUS, {}, "width is 16.* multiplied by 1 here"),
+        (CONTINUOUS, {"d_model": 256}, None),
+    ],
+    ids=str,
+)
+def test_what_an_imported_model_may_compute_otherwise_is_said(base, changes, said, tmp_path):
+    remarks = import_remarks(read_official(make_checkpoint(tmp_path / "a", base, ONE, **changes)))
+    assert len(remarks) == (said is not None) and (said is None or re.search(said, remarks[0]))
 
 
 def test_weights_that_were_changed_in_another_format_do_not_count_as_they_came(tmp_path):
