@@ -32,6 +32,11 @@ Directory = Annotated[Path, arg(metavar="DIR")]
 
 RATES = "rates.toml"
 
+THINNED = ("epic_kitchen",)
+"""Datasets of which `hma data convert` keeps fewer frames than the release, whose strides so count other frames."""
+
+SWAPPED = ("ego4d",)
+"""Datasets whose images the release trained on with red and blue swapped (reference section 5.5)."""
 
 PLAIN = DecodeConfig(sampler=SamplerConfig(temperature=0.0))
 """How exported programs fill frames where decode.json does not say it: as models are judged, without noise."""
@@ -195,24 +200,34 @@ def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> Decode
 
 
 def _rates(run: Run) -> tuple[str, list[str]]:
-    """Registry entries of the run's robots, at the rates that give their strides; notes on robots that have none."""
+    """Registry entries of the run's robots, at the rates that give their strides; notes on robots that have none, or
+    need more than a rate."""
     from data_pipelines.registry import find_spec
     from data_pipelines.registry.toml_file import to_toml
 
-    entries, unknown, other = [], [], []
+    entries, unknown, other, thinned = [], [], [], []
     for robot in run.table.entries:
         spec = find_spec(robot.name)
         if spec is None:
             unknown.append(robot.name)
         elif spec.action_dim != robot.action_dim:
             other.append(f"{robot.name} ({robot.action_dim} values, {spec.action_dim} here)")
+        elif robot.name in THINNED:
+            thinned.append(robot.name)
         else:
             entries.append(to_toml(replace(spec, rate=spec.rate_for(robot.stride))))
-    return "\n".join(entries), [
+    swapped = [
+        f"note: {name}: the release trained on images with red and blue swapped; for the same, add image_corrections = "
+        f'["swap_red_blue"] to its entry in {RATES}'
+        for name in run.table.names
+        if name in SWAPPED
+    ]
+    return "\n".join(entries), swapped + [
         f"note: not in {RATES}: {', '.join(names)}, {why}; to use one, write its entry (docs/own_data.md)"
         for names, why in (
             (unknown, "which the registry does not know"),
             (other, "whose actions differ from the registry's"),
+            (thinned, "of whose frames `hma data convert` keeps fewer than the release, so that no rate gives its stride"),
         )
         if names
     ]

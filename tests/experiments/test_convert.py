@@ -73,6 +73,17 @@ def test_a_released_model_comes_with_the_rates_that_give_its_strides_and_the_com
     assert str(run / "rates.toml") in first and "model.frames=3" in first and "eval.prompt_frames=1" in first
 
 
+def test_robots_whose_frames_are_others_here_get_no_rate_and_swapped_colours_are_said(tmp_path, capsys):
+    """Of EPIC-KITCHENS every 15th of 50 or 60 frames a second is 0.3 s; of the ten that are kept here it would be 1.5."""
+    robots = [("epic_kitchen", 4, 15), ("ego4d", 4, 1)]
+    start, run = make_checkpoint(tmp_path / "a", DISCRETE, robots), tmp_path / "run"
+    assert main(["convert", "from-official", str(start), "--out", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert [entry.name for entry in load_entries(run / "rates.toml")] == ["ego4d"]
+    assert "note: not in rates.toml: epic_kitchen, of whose frames" in said
+    assert 'note: ego4d: the release trained on images with red and blue swapped' in said
+
+
 def test_a_run_comes_to_its_place_with_its_rates(tmp_path, monkeypatch):
     """A kill after the run is there leaves nothing out: all of it is renamed at once."""
     start, run = make_checkpoint(tmp_path / "a", DISCRETE, [("bridge_dataset", 7, 2)]), tmp_path / "run"
