@@ -6,6 +6,7 @@ from one command to the next. What holds for one command only (--workers, --repl
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -192,8 +193,15 @@ def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
     if unused and own:
         say(
             f"note: {short(registry)} has no entry called {few(own)}: the project's own is used. "
-            f"Its entries that nothing here uses: {few(unused)}"
+            f"Its entries that nothing here uses: {few(unused)}. {under_another_name(own)}"
         )
+
+
+def under_another_name(names: Sequence[str]) -> str:
+    """Advice where datasets are called `names` in their own files and the robot of one may be meant that is called
+    something else."""
+    joins = json.dumps(list(names[:1]))
+    return f"If {names[0]} is one of these robots, add joins = {joins} to its entry in the file of --registry"
 
 
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:

@@ -31,6 +31,11 @@ RunDirectory = Annotated[Positional[Path], arg(metavar="RUN")]
 Directory = Annotated[Path, arg(metavar="DIR")]
 
 RATES = "rates.toml"
+NAMES_IN_RATES = """\
+# Each entry is a robot of the model, under the name that its dataset has in its own files. For a dataset of that robot with
+# another name, add to the entry: joins = ["DATASET"]
+
+"""
 
 THINNED = ("epic_kitchen",)
 """Datasets of which `hma data convert` keeps fewer frames than the release, whose strides so count other frames."""
@@ -222,12 +227,15 @@ def _rates(run: Run) -> tuple[str, list[str]]:
         for name in run.table.names
         if name in SWAPPED
     ]
-    return "\n".join(entries), swapped + [
+    return NAMES_IN_RATES + "\n".join(entries), swapped + [
         f"note: not in {RATES}: {', '.join(names)}, {why}; to use one, write its entry (docs/own_data.md)"
         for names, why in (
             (unknown, "which the registry does not know"),
             (other, "whose actions differ from the registry's"),
-            (thinned, "of whose frames `hma data convert` keeps fewer than the release, so that no rate gives its stride"),
+            (
+                thinned,
+                "of whose frames `hma data convert` keeps fewer than the release, so that no rate gives its stride",
+            ),
         )
         if names
     ]

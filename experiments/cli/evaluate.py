@@ -15,7 +15,7 @@ from experiments.evaluated import STAMP, describe_evaluation, require_same_evalu
 from experiments.progress import TidyTable, console, step, tidy_table
 from experiments.running.attempts import JOB
 from experiments.running.sealed import SAMPLES
-from experiments.setting import UNSET, Setting, make_setting, require_local, short
+from experiments.setting import UNSET, Setting, make_setting, require_local, short, under_another_name
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
@@ -88,6 +88,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
 
+    _require_known_data(setting, trained)
     require_prepared(setting)
     prepared = open_prepared_data(setting.workspace)
     check_fits(trained, prepared)
@@ -214,6 +215,15 @@ def require_prepared(setting: Setting) -> None:
     workspace = setting.workspace
     missing = [str(p) for p in (workspace.store, workspace.tokenizer, workspace.manifest) if not p.exists()]
     require(not missing, f"{', '.join(missing)}: not made yet; run `{setting.command('tokenize')}`")
+
+
+def _require_known_data(setting: Setting, trained: Run) -> None:
+    """Raises ConfigError where tokens are still to be made, of datasets of which the model knows none."""
+    known, given = trained.table.names, setting.study.dataset_names()
+    require(
+        not setting.data or setting.workspace.manifest.exists() or bool(set(known) & set(given)),
+        f"the model knows {few(known)}, but --data has {few(given)}. {under_another_name(given)}",
+    )
 
 
 def check_fits(trained: Run, prepared: PreparedData) -> None:

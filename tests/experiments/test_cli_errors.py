@@ -470,6 +470,16 @@ def test_evaluation_of_a_converted_model_on_what_does_not_fit_it(changes, robot,
     assert why in message and f"; prepare a study with {advice}" in message and "trained in" not in message
 
 
+def test_data_of_no_robot_of_the_model_is_refused_before_it_is_made_into_tokens(study, tmp_path, refused):
+    smoke = {"d_model": 8, "T": 4, "S": 16, "image_vocab_size": 256}
+    robots = [("push2", ARM.action_dim, ARM.stride)]
+    write_run(read_official(make_checkpoint(tmp_path / "a", DISCRETE | smoke, robots)), tmp_path / "run")
+    _, arm, _ = study[1]
+    message = refused(2, "evaluate", tmp_path / "run", *SMOKE, "--out", tmp_path / "new", "--data", arm)
+    assert f"the model knows push2, but --data has {ARM.name}" in message
+    assert f'add joins = ["{ARM.name}"] to its entry' in message
+
+
 @pytest.mark.slow
 def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tmp_path, capsys):
     option, arm, base = study[1]

@@ -65,6 +65,7 @@ def test_a_released_model_comes_with_the_rates_that_give_its_strides_and_the_com
     said = capsys.readouterr().out
     (entry,) = load_entries(run / "rates.toml")
     assert entry.name == "bridge_dataset" and entry.rate == 2.5 and entry.stride == 2 != get_spec(entry.name).stride
+    assert 'joins = ["DATASET"]' in (run / "rates.toml").read_text()
     assert "note: not in rates.toml: push, which the registry does not know" in said
     assert "fractal20220817_data (3 values, 10 here), whose actions differ from the registry's" in said
     command = said.split("next: ")[1].split("\nor: ")[0].replace("\\\n", "")
@@ -74,14 +75,14 @@ def test_a_released_model_comes_with_the_rates_that_give_its_strides_and_the_com
 
 
 def test_robots_whose_frames_are_others_here_get_no_rate_and_swapped_colours_are_said(tmp_path, capsys):
-    """Of EPIC-KITCHENS every 15th of 50 or 60 frames a second is 0.3 s; of the ten that are kept here it would be 1.5."""
+    """Of EPIC-KITCHENS the 15th of 50 or 60 frames a second is 0.3 s later; of the ten kept here it would be 1.5."""
     robots = [("epic_kitchen", 4, 15), ("ego4d", 4, 1)]
     start, run = make_checkpoint(tmp_path / "a", DISCRETE, robots), tmp_path / "run"
     assert main(["convert", "from-official", str(start), "--out", str(run)]) == 0
     said = capsys.readouterr().out
     assert [entry.name for entry in load_entries(run / "rates.toml")] == ["ego4d"]
     assert "note: not in rates.toml: epic_kitchen, of whose frames" in said
-    assert 'note: ego4d: the release trained on images with red and blue swapped' in said
+    assert "note: ego4d: the release trained on images with red and blue swapped" in said
 
 
 def test_a_run_comes_to_its_place_with_its_rates(tmp_path, monkeypatch):

@@ -277,7 +277,9 @@ def test_a_misspelt_heading_of_a_known_dataset_is_told(tmp_path, capsys):
         assert main(["data", "inspect", *arguments, "--registry", str(file)]) == 0
         assert (told.format(file) + "bridge_datset" in capsys.readouterr().out) == noted
         make_setting(StudyArguments("smoke", tmp_path, (str(REAL_DATA),), file))
-        assert (told.format(file) + "bridge_datset" in capsys.readouterr().out) == noted
+        said = capsys.readouterr().out
+        assert (told.format(file) + "bridge_datset" in said) == noted
+        assert ('add joins = ["bridge_dataset"] to its entry' in said) == noted
 
 
 def test_mixture_names_the_datasets_of_a_study(tmp_path, capsys):

@@ -97,7 +97,9 @@ def test_a_trained_run_keeps_fields_we_have_no_use_for_and_says_what_changed(tmp
     run = read_official(start)
     trained = replace(run, train=replace(run.train, masking=replace(run.train.masking, non_mlm_ratio=0.5)))
     for _ in range(2):  # what `hma train --from` and `hma adapt` leave of a provenance
-        trained = replace(trained, step=5, provenance={"store": "s", "origin": {"step": 0, "provenance": trained.provenance}})
+        trained = replace(
+            trained, step=5, provenance={"store": "s", "origin": {"step": 0, "provenance": trained.provenance}}
+        )
     write_official(trained, tmp_path / "b")
     before, after = (json.loads((tmp_path / x / "config.json").read_text()) for x in "ab")
     assert after == before | {"non_mlm_ratio": 0.5, "factored_vocab_size": 8}
