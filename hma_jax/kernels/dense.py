@@ -174,15 +174,16 @@ CHUNK = 32
 def from_actions(x: jax.Array, w: jax.Array) -> jax.Array:
     """x [..., U] times w [U, out] -> [..., out]; padding both with zeros does not change a bit of the result.
 
-    Chunks of a fixed size are summed one after the other, so that padding adds zeros to a finished sum. One
-    product over all of U would not do: kernels split a sum by its length.
+    Chunks of a fixed size are summed one after the other, in float32 at least, so that padding adds zeros to a
+    finished sum. One product over all of U would not do: kernels split a sum by its length.
     """
     chunks = jnp.moveaxis(_in_chunks(x, x.ndim - 1), -2, 0), _in_chunks(w, 0)
 
     def add(y: jax.Array, chunk: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        return y + jnp.matmul(*chunk), None
+        return y + jnp.matmul(*chunk, preferred_element_type=y.dtype), None
 
-    return jax.lax.scan(add, jnp.zeros((*x.shape[:-1], w.shape[-1]), x.dtype), chunks)[0]
+    zero = jnp.zeros((*x.shape[:-1], w.shape[-1]), jnp.promote_types(x.dtype, jnp.float32))
+    return jax.lax.scan(add, zero, chunks)[0].astype(x.dtype)
 
 
 def to_actions(x: jax.Array, w: jax.Array) -> jax.Array:

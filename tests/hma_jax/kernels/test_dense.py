@@ -82,6 +82,14 @@ def test_padding_the_action_axis_changes_no_bit(rows: tuple, out: int):
             np.testing.assert_array_equal(np.asarray(back(features, others))[..., :width], columns)
 
 
+def test_in_bfloat16_many_action_values_are_summed_as_in_one_product():
+    """The sum of eleven chunks was rounded after each."""
+    x, w = drawn(0, 64, 350, dtype="bfloat16"), drawn(1, 350, 64, dtype="bfloat16")
+    exact = np.asarray(x, np.float64) @ np.asarray(w, np.float64)
+    chunked, whole = (np.linalg.norm(np.asarray(f(x, w), np.float64) - exact) for f in (from_actions, jnp.matmul))
+    assert from_actions(x, w).dtype == jnp.bfloat16 and chunked < 1.1 * whole
+
+
 @pytest.mark.parametrize("entries", [5, 3000], ids=["multiplied", "scattered"])
 def test_looking_up_has_the_gradient_of_a_take(entries: int):
     ids = np.random.default_rng(0).integers(0, entries, (3, 4))
