@@ -112,11 +112,21 @@ def ones(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 
 def uniform(rng: np.random.Generator, shape: tuple[int, ...], bound: float | np.ndarray) -> np.ndarray:
     """Uniform in +-bound, which may vary over the array."""
-    return ((2 * rng.random(shape, np.float32) - 1) * bound).astype(np.float32)
+    # In place: every process draws each array whole, and a copy of the largest takes gigabytes.
+    x = rng.random(shape, np.float32)
+    x *= 2
+    x -= 1
+    x *= bound
+    return x
 
 
 def normal(std: float) -> Initializer:
-    return lambda rng, shape: np.float32(std) * rng.standard_normal(shape, np.float32)
+    def draw(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        x = rng.standard_normal(shape, np.float32)
+        x *= np.float32(std)
+        return x
+
+    return draw
 
 
 def xavier_uniform(fan_in: float, fan_out: float, gain: float = 1.0) -> Initializer:

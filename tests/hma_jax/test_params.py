@@ -1,3 +1,5 @@
+import tracemalloc
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from jax.sharding import AbstractMesh, AxisType
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import declare, normal, param, stack, zeros
+from hma_jax.model.params import Initializer, declare, normal, param, stack, xavier_uniform, zeros
 from hma_jax.runtime.sharding import MESH_AXES, find_layouts
 from tests.tiny import TABLE, model_config
 
@@ -85,3 +87,16 @@ def test_initial_arrays_follow_the_requested_sharding():
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     params = declared.init(0, {"first": device})
     assert params["first"].sharding == device
+
+
+@pytest.mark.parametrize("init", [normal(0.5), xavier_uniform(3, 4)], ids=["normal", "uniform"])
+def test_an_initial_array_is_drawn_without_a_second_one_in_memory(init: Initializer):
+    """Every process draws every array whole: of the largest, a copy is gigabytes."""
+    rng = np.random.default_rng(0)
+    tracemalloc.start()
+    try:
+        drawn = init(rng, (512, 512))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert drawn.dtype == np.float32 and peak < 1.1 * drawn.nbytes
