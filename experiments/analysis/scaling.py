@@ -9,7 +9,7 @@ fit, and over parameters and training FLOPs, for the best size of a budget.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -83,9 +83,10 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> Curve | None:
     if not both:
         return None
     group = max(both, key=len)
+    runs = _runs_of([((t.model.width, t.train.steps), t) for t in group.values()])
     positions = tuple(
         Position(id, run, t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
-        for (id, t), run in zip(group.items(), _runs_of(group.values()), strict=True)
+        for (id, t), run in zip(group.items(), runs, strict=True)
     )
     return Curve("joint", (TRUNK, WINDOWS), positions)
 
@@ -142,7 +143,7 @@ def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Prove
         return Position(trial_id(p.trial, provenance), run, p.trial.train.seed, (x,), p.scope or sweep.scope)
 
     name = "-".join(filter(None, (sweep.name, series)))
-    positions = tuple(map(position, points, _runs_of([p.trial for p in points])))
+    positions = tuple(map(position, points, _runs_of([(p.x, p.trial) for p in points])))
     return Curve(name, (TRUNK if wider else sweep.axis,), positions)
 
 
@@ -160,24 +161,13 @@ def _seen(trial: Trial) -> float:
     return float(trial.train.steps * trial.train.batch)
 
 
-def _runs_of(trials: Iterable[Trial]) -> list[str]:
-    """Equal for trials that differ in steps and seed alone, and in what follows from the seed: the branches of one run,
-    for each of its seeds. Every seed may have robots of its own."""
-    trials = list(trials)
-    names: dict[str, str] = {}  # of the first seed's trial: bootstraps draw runs in the order of their names
-    for trial in sorted(trials, key=lambda t: t.train.seed):
-        names.setdefault(_of_any_seed(trial), stable_hash(_without_steps(trial)))
-    return [names[_of_any_seed(trial)] for trial in trials]
-
-
-def _of_any_seed(trial: Trial) -> str:
-    """The same for each seed: robots are only counted, of the source of an adapted model too."""
-    values = level = _without_steps(trial)
-    while level:
-        level |= {robots: len(level[robots]) for robots in ("datasets", "evaluated", "capped")}
-        level["train"].pop("seed", None)
-        level = level["source"]
-    return stable_hash(values)
+def _runs_of(points: Sequence[tuple[Hashable, Trial]]) -> list[str]:
+    """The run of each (position, trial). Trials of one position are seeds of one run, though every seed may have robots
+    of its own; positions are its branches where the trials of their lowest seed differ in steps alone."""
+    lowest: dict[Hashable, Trial] = {}
+    for position, trial in sorted(points, key=lambda point: point[1].train.seed):
+        lowest.setdefault(position, trial)
+    return [stable_hash(_without_steps(lowest[position])) for position, _ in points]
 
 
 def _all_but_size(trial: Trial) -> str:

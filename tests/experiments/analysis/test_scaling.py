@@ -102,6 +102,19 @@ def test_bootstraps_draw_among_the_seeds_of_a_position(sweep):
             assert len({p.seed for p in here}) == 3 and len({p.run for p in here}) == 1, (curve.name, x)
 
 
+def test_independent_trainings_are_no_branches_of_one_run():
+    """The same judged robots, with one other that differs between positions: as many robots, but not the same run."""
+    judged, others = ROBOTS[:1], ROBOTS[1:]
+    points = tuple(
+        Point(x, replace(reference_trial(WIDE, seed), datasets=(*judged, other), evaluated=judged))
+        for x, other in enumerate(others, 1)
+        for seed in range(3)
+    )
+    (curve,) = curves_of([Sweep("company", "company", judged, points)], PROVENANCE)
+    assert len({p.run for p in curve.positions}) == len(others) > 1
+    assert len({(p.run, p.x) for p in curve.positions}) == len(others)
+
+
 def robots_of_their_own():
     """(the curve of `dilution`, windows of all its trials): three seeds, each of which judges other robots."""
     (curve,) = curves_of(plan_sweeps(CPU_FULL, ("dilution",)), PROVENANCE)
