@@ -4,13 +4,16 @@ the data."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from experiments.cost import count_parameters
-from experiments.presets import ON_ACCELERATORS
+from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.progress import say
 from experiments.running.trial import Trial
 from experiments.setting import Setting
-from experiments.study import Study
+from experiments.study import Study, most_trajectories
+from experiments.sweeps.episodes import count_episodes
+from experiments.sweeps.sweep import Sweep
 from experiments.words import counted, few, in_thousands
 
 
@@ -34,12 +37,48 @@ def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
     )
 
 
+def say_points(setting: Setting, sweeps: Sequence[Sweep]) -> None:
+    """A line on the axis trajectories where it has fewer points on the user's datasets than in the preset, and on the
+    axis datasets where it has only one; none where the user chose them."""
+    study, planned = setting.study, {sweep.name for sweep in sweeps}
+    chosen = {one.partition("=")[0].strip() for one in setting.arguments.set}
+    caps, names, most = study.trajectory_counts, study.dataset_names(), most_trajectories(study.dataset_names())
+    dropped = [cap for cap in get_preset(setting.arguments.preset).trajectory_counts if cap not in caps]
+    if "trajectories" in planned and "trajectory_counts" not in chosen and dropped and most:
+        others = f"; for other points: --set trajectory_counts={_parts(most)}" if most > 1 else ""
+        say(
+            f"note: by the registry no dataset has more than {most:,} trajectories, so the axis trajectories has "
+            f"{_listed(caps)}, without {_listed(dropped)}, which would train on the same{others}"
+        )
+    if "datasets" in planned and "dataset_counts" not in chosen and len(study.dataset_counts) == 1 and len(names) > 1:
+        points = _parts(len(names))
+        fewest = counted(int(points.partition(",")[0]), "dataset")
+        say(
+            f"note: the axis datasets has one point, with all {len(names)} datasets; for more, all judged on {fewest}: "
+            f"--set dataset_counts={points}"
+        )
+
+
+def _parts(whole: int) -> str:
+    """A quarter, half and all of it, as --set takes a list."""
+    return ",".join(map(str, sorted({max(round(part * whole), 1) for part in (0.25, 0.5, 1)})))
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    *first, last = (f"{n:,}" for n in numbers)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def say_unused(study: Study) -> None:
-    """A line on datasets that have more trajectories than a trial takes, as far as the registry says how many."""
+    """A line on datasets that have more trajectories to train on than a trial takes, as far as the registry says how
+    many."""
     from data_pipelines.registry import get_spec
 
-    counts = study.trajectory_counts
-    larger = {n: have for n in study.dataset_names() if (have := get_spec(n).episodes) > counts[-1]}
+    def trained_on(name: str, have: int) -> int:
+        return count_episodes(replace(study, datasets=(name,), unseen=(), trajectory_counts=(have,)), None)
+
+    counts, declared = study.trajectory_counts, {name: get_spec(name).episodes for name in study.dataset_names()}
+    larger = {name: have for name, have in declared.items() if have and trained_on(name, have) > counts[-1]}
     if larger:
         having = few([f"{name} has {have:,}" for name, have in larger.items()])
         every = ",".join(map(str, (*counts, max(larger.values()))))

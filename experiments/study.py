@@ -267,9 +267,21 @@ class Study:
 
 
 def on_user_data(study: Study, names: Sequence[str]) -> Study:
-    """The same study on the user's datasets: counts beyond what there is are cut to it."""
+    """The same study on the user's datasets: numbers of datasets beyond what there is are cut to it. Of numbers of
+    trajectories that no dataset has, only the last is left: with the others a trial would be trained on the same."""
     counts = tuple(sorted({min(c, len(names)) for c in study.dataset_counts} | {len(names)}))
-    return replace(study, datasets=tuple(names), dataset_counts=counts, unseen=())
+    *caps, last = study.trajectory_counts
+    if most := most_trajectories(names):
+        caps = [cap for cap in caps if cap < most]
+    return replace(study, datasets=tuple(names), dataset_counts=counts, trajectory_counts=(*caps, last), unseen=())
+
+
+def most_trajectories(names: Sequence[str]) -> int | None:
+    """Trajectories of the largest of these datasets, as the registry says; None where it does not say it of all."""
+    from data_pipelines.registry import find_spec
+
+    counts = [spec.episodes if (spec := find_spec(name)) else 0 for name in names]
+    return max(counts) if all(counts) else None
 
 
 def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:

@@ -79,7 +79,7 @@ def _run(
     if running.dry_run:
         from experiments.done import find_done
         from experiments.plan_table import Devices, plan_table
-        from experiments.scale import say_scale, say_unused
+        from experiments.scale import say_points, say_scale, say_unused
         from experiments.trainable import check_launched
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
@@ -89,6 +89,7 @@ def _run(
         if given:
             say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
             say_unused(setting.study)
+            say_points(setting, sweeps)
         return
     from experiments.run_study import run_study
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
@@ -48,7 +49,7 @@ def notes(capsys) -> list[str]:
 
 def test_a_dry_run_says_what_the_default_preset_is_made_for(data, capsys, tmp_path):
     out = ["--out", str(tmp_path)]
-    first, second = said_by(capsys, "study", "--dry-run", *data, *out)
+    first, second, _ = said_by(capsys, "study", "--dry-run", *data, *out)
     assert re.fullmatch(
         r"note: preset cpu trains models of up to [\d.]+ [kM] parameters on images of 32 x 32 pixels, for 2,500 steps of "
         r"4 windows, with at most 500 trajectories of each dataset\. It is made for a processor: on a GPU or TPU take "
@@ -68,9 +69,34 @@ def test_a_dry_run_says_what_the_default_preset_is_made_for(data, capsys, tmp_pa
     assert "with at most 7 trajectories" in model
 
 
+def test_held_out_trajectories_are_not_called_unused(data, capsys, tmp_path):
+    """Of the 95,000 that the entry declares, 200 are held out."""
+    words = ("sweep", "width", "--dry-run", *data, "--out", str(tmp_path), "--set")
+    assert len(said_by(capsys, *words, "trajectory_counts=94800")) == 1
+    assert len(said_by(capsys, *words, "trajectory_counts=94799")) == 2
+
+
+def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):
+    """A curve that is flat because its points have the same data, or of one point, is no result."""
+    data = [str(write_rlds(tmp_path, get_spec(n), [30] * 8)) for n in ("droid_sample", "unitree_g1_sample")]
+    words = ("study", "--dry-run", "--data", *data, "--out", str(tmp_path / "out"))
+    caps, counts = said_by(capsys, *words)[1:]
+    assert caps == (
+        "note: by the registry no dataset has more than 8 trajectories, so the axis trajectories has 4 and 500, without "
+        "32, which would train on the same; for other points: --set trajectory_counts=2,4,8"
+    )
+    assert counts == (
+        "note: the axis datasets has one point, with all 2 datasets; for more, all judged on 1 dataset: --set "
+        "dataset_counts=1,2"
+    )
+    assert len(said_by(capsys, *words, "--set", "axes=width")) == 1
+    assert len(said_by(capsys, *words, "--set", "trajectory_counts=2,4,8", "--set", "dataset_counts=1,2")) == 1
+    assert len(said_by(capsys, *words, "--set", "trajectory_counts=4,32,500", "--set", "dataset_counts=2")) == 1
+
+
 def test_what_is_made_for_an_accelerator_names_no_other(data, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("experiments.plan_table.plan_table", lambda *_, **__: "")
-    first, _ = said_by(capsys, "study", "--dry-run", "--preset", "accelerator", *data, "--out", str(tmp_path))
+    first, *_ = said_by(capsys, "study", "--dry-run", "--preset", "accelerator", *data, "--out", str(tmp_path))
     assert "for 20,000 steps of 64 windows, with at most 1,000 trajectories" in first and first.endswith("each dataset")
 
 
@@ -78,7 +104,7 @@ def test_the_simulated_suite_needs_no_such_note(capsys, tmp_path):
     assert said_by(capsys, "train", "--preset", "smoke", "--dry-run", "--out", str(tmp_path)) == []
 
 
-@pytest.mark.parametrize(("command", "lines"), [("study", 2), ("sweep width", 2), ("train", 1), ("tokenize", 1)])
+@pytest.mark.parametrize(("command", "lines"), [("study", 3), ("sweep width", 2), ("train", 1), ("tokenize", 1)])
 def test_it_is_said_before_anything_is_made(command, lines, data, capsys, tmp_path, monkeypatch):
     def stop(*_, **__):
         raise ConfigError("stop here")

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.override import override
-from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
+from experiments.presets import ACCELERATOR, CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.setting import Preset
@@ -78,6 +78,16 @@ def test_user_data_cuts_the_counts():
     study = on_user_data(CPU, ["bridge_dataset"])
     assert study.dataset_names() == ("bridge_dataset",) and study.dataset_counts == (1,)
     assert on_user_data(CPU, list("abcdefg")).dataset_counts == (5, 7)
+
+
+def test_caps_that_would_train_on_the_same_data_are_no_points_of_their_own():
+    """The last one stays what it is: every trial is trained with it, and an entry's count may be too small."""
+    study = on_user_data(ACCELERATOR, ["bridge_dataset", "droid_sample"])  # 25 and 7
+    assert study.trajectory_counts == (10, 1000)
+    assert reference_trial(study, 0).max_trajectories == 1000
+    assert on_user_data(ACCELERATOR, ["droid_sample"]).trajectory_counts == (1000,)
+    for name in ("droid", "bridge_data_v2"):  # many, and an unknown number
+        assert on_user_data(ACCELERATOR, ["droid_sample", name]).trajectory_counts == ACCELERATOR.trajectory_counts
 
 
 def test_the_widths_of_a_sweep_do_not_bound_a_single_model():
