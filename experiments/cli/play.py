@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.applications import DRIVEN
 from experiments.progress import console, say
@@ -26,6 +26,7 @@ def play(
     run: Annotated[Positional[Path], arg(metavar="RUN")] = DRIVEN,
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
     port: int = 8765,
+    public_name: Annotated[UseAppendAction[tuple[str, ...]], arg(name="public-name", metavar="NAME"), UNSET] = (),
     visitors: int = 4,
     window: Annotated[Literal["exact", "streaming"] | None, arg(metavar="{exact,streaming}"), UNSET] = None,
     unmask_steps: Annotated[int | None, arg(name="unmask-steps", metavar="M"), UNSET] = None,
@@ -41,6 +42,9 @@ def play(
         run: Directory of a training run.
         host: Address to listen on. 127.0.0.1: for this computer only; 0.0.0.0: for everybody who can reach it.
         port: Port to listen on; 0 takes a free one.
+        public_name: A name, without port, by which browsers reach this server through a proxy, a tunnel or a network;
+            repeat the option for further ones. At names but these, localhost and --host it refuses to answer; at IP
+            addresses it always does.
         visitors: How many people can drive at the same time, in one batch.
         window: How to continue when the episode is longer than the model's window: exact computes the window again for
             every frame; streaming is faster, but may stop following commands (docs/endurance_small.md). Default: as
@@ -72,6 +76,8 @@ def play(
         "`hma train --preset play --out runs/play` and serve it with `hma play runs/play/model`",
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
+    for name in public_name:
+        require(not set(name) & set(":/"), f"--public-name takes a name without scheme and port, got {name!r}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
     given_decode = {"slide": window, "unmask_steps": unmask_steps, "temperature": temperature}
     decode = replace(find_decode(run), **{name: x for name, x in given_decode.items() if x is not None})
@@ -95,7 +101,7 @@ def play(
         # What draws a physics simulator belongs to one thread; turns are taken in several.
         return true_simulator(simulator, [robot]) if in_suite(robot) else None
 
-    app, ended = make_app(simulator, truth, max_acting=1), threading.Event()
+    app, ended = make_app(simulator, truth, max_acting=1, public_names=(host, *public_name)), threading.Event()
 
     def reached(together: int) -> None:
         app[SESSIONS].max_acting = together

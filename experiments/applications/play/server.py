@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import json
 import logging
-from collections.abc import AsyncIterator, Callable
+import re
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from importlib.resources import files
 
 from aiohttp import WSMsgType, web
@@ -35,8 +37,8 @@ EXTRA_CONNECTIONS = 32
 
 SESSIONS = web.AppKey("sessions", SessionManager)
 SOCKETS = web.AppKey("sockets", set)
-REFUSED = web.AppKey("refused", asyncio.Event)
-"""Set once the refusal of another server's page was logged: strangers cannot fill the log."""
+REFUSED = web.AppKey("refused", set)
+"""Reasons of refusals that were logged: strangers cannot fill the log."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -44,11 +46,14 @@ HEADERS = {
 }
 
 
-def make_app(simulator: Simulator, truth: Truth, max_acting: int | None = None) -> web.Application:
+def make_app(
+    simulator: Simulator, truth: Truth, max_acting: int | None = None, public_names: Collection[str] = ()
+) -> web.Application:
     """The application; it serves as many visitors at once as the simulator has episodes. Of those, `max_acting`
-    (default: all) act at once, until `SESSIONS` is told that more can."""
-    app = web.Application(client_max_size=LARGEST_MESSAGE)
-    app[SOCKETS], app[REFUSED] = set(), asyncio.Event()
+    (default: all) act at once, until `SESSIONS` is told that more can. It answers at localhost, at IP addresses and at
+    `public_names`."""
+    app = web.Application(client_max_size=LARGEST_MESSAGE, middlewares=[_refuse_other_names(public_names)])
+    app[SOCKETS], app[REFUSED] = set(), set()
     app.cleanup_ctx.append(lambda app: _manage_sessions(app, simulator, truth, max_acting))
     about = json.dumps(describe(simulator, truth))
     page = files("experiments.applications.play").joinpath("page.html").read_text()
@@ -110,27 +115,66 @@ def describe(simulator: Simulator, truth: Truth) -> list[dict]:
     return described
 
 
+def _refuse_other_names(public_names: Collection[str]) -> Callable[..., Awaitable[web.StreamResponse]]:
+    """A middleware that answers 403 to requests whose Host header has a name that is not this server's.
+
+    Such a name may be that of a hostile page, made to resolve to this server's address: to the browser both are then of
+    one origin, and the page could drive and read what only this computer can reach (DNS rebinding).
+    """
+    names = {"localhost", *(name.lower() for name in public_names)}
+
+    @web.middleware
+    async def refuse(request: web.Request, handler: Callable[..., Awaitable[web.StreamResponse]]) -> web.StreamResponse:
+        host = request.headers.get("Host", "")
+        if not (_name_of(host) in names or _is_address(_name_of(host))):
+            _log_once(
+                request,
+                "refused a request to %.80r. If that is a name of this server, start it with --public-name and the name "
+                "(docs/simulator.md)",
+                host,
+            )
+            raise web.HTTPForbidden(text="this server does not answer at this name; see --public-name of `hma play`")
+        return await handler(request)
+
+    return refuse
+
+
+def _name_of(host: str) -> str:
+    """The name or the IP address of a Host header, without its port."""
+    name = re.sub(r":\d*$", "", host)
+    return name.lower().removesuffix(".")
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name[1:-1] if name.startswith("[") and name.endswith("]") else name)
+    except ValueError:
+        return False
+    return True
+
+
 def _same_origin(request: web.Request) -> bool:
     """Whether the page that connects came from here: others must not drive what a visitor's browser can reach."""
     origin = request.headers.get("Origin")
     return origin is None or origin.partition("://")[2] == request.host  # any text may be sent as one
 
 
-def _log_refusal(request: web.Request) -> None:
-    if not request.app[REFUSED].is_set():
-        request.app[REFUSED].set()
-        log.warning(
-            "refused a page of %.80r, which connects to %.80r; further refusals are not logged. If the page is this "
-            "server's own, behind a proxy, the proxy must pass the Host header (docs/simulator.md)",
-            request.headers["Origin"],
-            request.host,
-        )
+def _log_once(request: web.Request, reason: str, *values: object) -> None:
+    if reason not in request.app[REFUSED]:
+        request.app[REFUSED].add(reason)
+        log.warning(f"{reason}. Further refusals are not logged", *values)
 
 
 async def _drive(request: web.Request) -> web.StreamResponse:
     sessions, sockets = request.app[SESSIONS], request.app[SOCKETS]
     if not _same_origin(request):
-        _log_refusal(request)
+        _log_once(
+            request,
+            "refused a page of %.80r, which connects to %.80r. If the page is this server's own, behind a proxy, the "
+            "proxy must pass the Host header (docs/simulator.md)",
+            request.headers["Origin"],
+            request.host,
+        )
         raise web.HTTPForbidden(text="this page is served elsewhere")
     if len(sockets) >= len(sessions.simulator) + EXTRA_CONNECTIONS:
         raise web.HTTPServiceUnavailable(text="too many connections")

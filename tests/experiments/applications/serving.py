@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any
 
 from aiohttp import ClientWebSocketResponse, TCPConnector, WSMsgType
@@ -29,6 +29,7 @@ def serving(
     visitors: int = 2,
     truth: Truth = no_truth,
     max_acting: int | None = None,
+    public_names: Sequence[str] = (),
     run: Callable[[Coroutine[Any, Any, None]], None] = asyncio.run,
 ) -> None:
     """Runs `test` with a client of a server for so many visitors, `max_acting` of whom act at once, by `run`."""
@@ -37,7 +38,8 @@ def serving(
     sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
 
     async def main() -> None:
-        async with TestClient(TestServer(make_app(sim, truth, max_acting)), connector=TCPConnector(limit=0)) as client:
+        app = make_app(sim, truth, max_acting, public_names)
+        async with TestClient(TestServer(app), connector=TCPConnector(limit=0)) as client:
             await asyncio.wait_for(test(client), 4 * SECONDS)
 
     run(main())

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
-from aiohttp.test_utils import TestServer
+from aiohttp.test_utils import TestClient, TestServer
 
 from experiments.applications.play import server
 from experiments.cli.main import main
@@ -53,6 +53,25 @@ def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp
     monkeypatch.setattr(server, "serve", serve)
     play(tmp_path, visitors=2)
     assert first == [1]
+
+
+def test_the_command_answers_at_its_host_and_at_the_public_names_that_it_is_given(monkeypatch, tmp_path, capsys):
+    from experiments.applications import simulators
+
+    answers = {}
+
+    async def serve(app, host, port, ready):
+        async with TestClient(TestServer(app)) as client:
+            for name in ("robots.lan:80", "robots.example", "others.example"):
+                answers[name] = (await client.get("/robots", headers={"Host": name})).status
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    command = ["play", str(tmp_path), "--visitors", "1", "--host", "robots.lan", "--public-name"]
+    assert main([*command, "robots.example", "--public-name", "third.example"]) == 0
+    assert answers == {"robots.lan:80": 200, "robots.example": 200, "others.example": 403}
+    assert main([*command, "robots.example:80"]) == 2
+    assert "a name without scheme and port, got 'robots.example:80'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, capsys):

@@ -402,3 +402,36 @@ def test_a_page_from_elsewhere_cannot_connect_and_the_log_says_so_once(caplog):
         assert "://elsewhere.example'" in said and f"'127.0.0.1:{client.port}'" in said
 
     serving(test)
+
+
+def test_a_page_whose_name_was_rebound_to_this_server_reaches_nothing(caplog):
+    """Its server's name resolves to this one's address: for the browser it is of the same origin."""
+
+    async def test(client):
+        for path in ("/", "/robots", "/drive", "/recording/token/mp4", "/nothing"):
+            for host in ("rebound.example:8765", "127.0.0.1.example", "localhost.example", "[::1].example", "", "a b"):
+                answer = await client.get(path, headers={"Host": host, "Origin": "http" + f"://{host}"})
+                text = await answer.text()
+                assert answer.status == 403 and "--public-name" in text, (path, host, text)
+        [said] = [record.getMessage() for record in caplog.records if "refused" in record.message]
+        assert "'rebound.example:8765'" in said and "--public-name" in said
+
+    serving(test)
+
+
+def test_addresses_this_computer_and_names_that_were_given_are_answered():
+    hosts = [
+        "localhost",
+        "LOCALHOST:8765",
+        "127.0.0.1:1",
+        "[::1]:8765",
+        "10.0.0.7",
+        "Robots.example",
+        "robots.example.:1",
+    ]
+
+    async def test(client):
+        answers = [await client.get("/robots", headers={"Host": host}) for host in hosts]
+        assert [a.status for a in answers] == [200] * len(hosts)
+
+    serving(test, public_names=("robots.EXAMPLE",))
