@@ -26,13 +26,13 @@ def require_free(directory: Path) -> None:
 
 @contextmanager
 def atomic_directory(directory: Path) -> Iterator[Path]:
-    """A temporary directory to write into, renamed to `directory` when the block succeeds. One that a killed process
-    left behind is removed.
+    """A temporary directory to write into, renamed to `directory`, or to what that is a link to, when the block
+    succeeds. One that a killed process left behind is removed.
 
     Raises ConfigError if something is there already, if nothing can be written there, or while another process writes
     there.
     """
-    directory = Path(directory).absolute()
+    directory = Path(directory).resolve()
     temporary, lock = (directory.with_name(f".{directory.name}.{kind}") for kind in ("tmp", "lock"))
     with ExitStack() as stack:
         try:

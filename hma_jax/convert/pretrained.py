@@ -18,7 +18,7 @@ import numpy as np
 
 from hma_jax.config import Dtype, ImageSize, Magvit2Config, require
 from hma_jax.config.json import from_dict
-from hma_jax.convert.official import read_config
+from hma_jax.convert.official import CONFIG, read_config
 from hma_jax.convert.table import check_names, nested
 from hma_jax.convert.tensors import Stored, read_finite, read_safetensors
 from hma_jax.convert.torch_file import read_torch
@@ -150,7 +150,7 @@ def read_magvit2(path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtyp
         bits = official.get("z_channels")
         if isinstance(bits, int) and bits % Magvit2Config.factors:
             given["factors"] = 1
-        config = MAGVIT2.config(official, str(path / "config.json"), **given)
+        config = MAGVIT2.config(official, str(path / CONFIG), **given)
     else:
         config = Magvit2Config(**given)
     tensors = read_tensors(path)
@@ -169,7 +169,7 @@ def read_svd_vae(
     directory = Path(directory)
     config = SVD_VAE.config(
         read_config(directory),
-        str(directory / "config.json"),
+        str(directory / CONFIG),
         image_size=image_size,
         patch=patch,
         compute_dtype=compute_dtype,
@@ -199,13 +199,18 @@ def find_reader(path: Path) -> Callable[..., BaseTokenizer]:
     path = Path(path)
     if not path.is_dir():
         return read_magvit2
+    require(
+        (path / CONFIG).is_file(),
+        f"no {path / CONFIG}; of the MAGVIT2 tokenizer give the file itself, magvit2.ckpt, and of the VAE its directory, "
+        f"with {CONFIG} and {FILES[0]}",
+    )
     config = read_config(path)
     name = config.get("_class_name")
     if name == "AutoencoderKLTemporalDecoder":
         return read_svd_vae
     require(
         name is None and "ch_mult" in config,
-        f"{path / 'config.json'} describes {name or 'no tokenizer'}, which is not supported; supported are the "
+        f"{path / CONFIG} describes {name or 'no tokenizer'}, which is not supported; supported are the "
         "AutoencoderKLTemporalDecoder of diffusers and the MAGVIT2 tokenizer (ch_mult, z_channels, ...)",
     )
     return read_magvit2

@@ -23,6 +23,18 @@ def test_a_directory_appears_whole_or_not_at_all(tmp_path):
         pass
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_to_an_empty_directory_or_to_none_is_followed(there, tmp_path):
+    """As of a disk that is linked to; the link itself cannot be replaced by a directory."""
+    (tmp_path / "disk").mkdir()
+    if there:
+        (tmp_path / "disk" / "out").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "out")
+    with atomic_directory(tmp_path / "link") as temporary:
+        (temporary / "a").touch()
+    assert (tmp_path / "link").is_symlink() and [p.name for p in (tmp_path / "disk").rglob("*")] == ["out", "a"]
+
+
 def test_all_of_it_is_on_the_disk_before_it_is_seen(tmp_path, monkeypatch):
     """A loss of power left a directory of empty files."""
     with atomic_directory(tmp_path / "out") as temporary:

@@ -174,6 +174,12 @@ def test_other_architectures_are_refused_by_the_field(kind, changes, message, tm
         small(write_published(tmp_path / "a", kind, **changes))
 
 
+def test_a_directory_of_the_published_file_alone_says_to_give_the_file(tmp_path):
+    (tmp_path / "magvit2.ckpt").touch()
+    with pytest.raises(ConfigError, match=r"no .*config.json.*MAGVIT2 tokenizer give the file itself, magvit2.ckpt"):
+        find_reader(tmp_path)
+
+
 def test_a_directory_of_something_else(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ConfigError, match="describes no tokenizer"):
