@@ -17,6 +17,9 @@ from typing import Any, Literal
 
 from hma_jax.config.base import require, require_choice
 
+INFINITE = ("Infinity", "-Infinity")
+"""Numbers that `to_plain_json` writes as strings."""
+
 
 def to_dict(config: Any) -> Any:
     """Plain JSON types from a config (dataclasses, tuples and scalars, nested)."""
@@ -75,6 +78,8 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         require(len(value) == len(args), f"{where}: expected {len(args)} values, got {value!r}")
         return tuple(_decode(a, v, where) for a, v in zip(args, value, strict=True))
     if hint in (bool, int, float, str):
+        if hint is float and value in INFINITE:
+            return float(value)
         kinds = (int, float) if hint is float else hint
         fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
         require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
@@ -104,6 +109,12 @@ def to_json(config: Any) -> str:
 def to_strict_json(values: Any) -> str:
     """For any program: null for the numbers that are not finite, which JSON does not have."""
     return json.dumps(json.loads(json.dumps(values), parse_constant=lambda _: None), indent=1)
+
+
+def to_plain_json(values: Any) -> str:
+    """For any program, and for `from_dict` to read back: numbers that are not finite, which JSON does not have, are
+    strings, of which "Infinity" and "-Infinity" are read as numbers."""
+    return json.dumps(json.loads(json.dumps(values), parse_constant=str), indent=1)
 
 
 def stable_hash(config: Any) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
-from hma_jax.config.json import from_dict
+from hma_jax.config.json import from_dict, to_plain_json
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.table import check_names, flat, nested
 from hma_jax.convert.tensors import read_finite, read_safetensors, write_safetensors
@@ -45,7 +45,7 @@ def write_neutral(run: Run, directory: Path) -> None:
         "tensors": describe_tensors(declare_model(run.model, run.table).leaves()),
     }
     with atomic_directory(directory) as temporary:
-        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=1))
+        (temporary / DESCRIPTION).write_text(to_plain_json(description))
         write_safetensors(temporary / WEIGHTS, arrays)
 
 

@@ -8,7 +8,6 @@ model.json          every input and output, in the order of the program's argume
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 from jax import export
 
 from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, ModelConfig, Setting, require
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import to_dict, to_plain_json
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.neutral import describe_tensors
 from hma_jax.convert.table import flat, nested
@@ -111,7 +110,7 @@ def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
         (temporary / PROGRAM).write_bytes(exported.serialize())
         write_safetensors(temporary / WEIGHTS, {path: np.asarray(x) for path, x in flat(run.params).items()})
         description = _describe(run, config, inputs, exported)
-        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=1))
+        (temporary / DESCRIPTION).write_text(to_plain_json(description))
 
 
 MEANINGS = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -83,6 +84,16 @@ def test_safetensors_bring_everything_back(changes, tmp_path):
     stored = read_safetensors(tmp_path / "out" / "model.safetensors")
     assert {name: tuple(t["shape"]) for name, t in described.items()} == {n: t.shape for n, t in stored.items()}
     assert described["stem/into/kernel"] == {"shape": [3, 14, 32], "axes": ["E", "U", "D"], "role": "input"}
+
+
+def test_settings_that_are_infinite_are_written_as_json_has_it_and_read_back(tmp_path):
+    run = small_run(diffusion=replace(DIFFUSION, clip=math.inf))
+    run = replace(run, train=replace(run.train, optimizer=replace(run.train.optimizer, clip_norm=math.inf)))
+    write_neutral(run, tmp_path / "out")
+    text = (tmp_path / "out" / "model.json").read_text()
+    described = json.loads(text, parse_constant=lambda number: pytest.fail(f"{number} is no JSON"))
+    assert described["model"]["diffusion"]["clip"] == "Infinity"
+    same(read_neutral(tmp_path / "out"), run)
 
 
 def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
