@@ -3,7 +3,8 @@
 model.stablehlo     `jax.export` bytes; jax.export.deserialize(bytes).call(weights, prompt, actions,
                     embodiment, key) -> new frames
 model.safetensors   the weights, name -> array
-model.json          every input and output, in the order of the program's arguments
+model.json          every input and output, in the order of the program's arguments; and of which model, with its
+                    provenance
 """
 
 from __future__ import annotations
@@ -143,6 +144,10 @@ def _describe(
         "call": "jax.export.deserialize(bytes).call(weights, prompt, actions, embodiment, key)",
         "calling_convention_version": exported.calling_convention_version,
         "jax": jax.__version__,
+        "step": run.step,
+        "weights": run.weights,
+        "setting": run.train.masking.setting,
+        "provenance": run.provenance,  # the tokenizer, where it is known
         "program": to_dict(config),
         "model": to_dict(run.model),
         "table": to_dict(run.table),

@@ -192,6 +192,10 @@ def test_the_program_generates_the_same_frames_where_this_project_is_not_install
     np.savez(out / "inputs.npz", **given)
     done = subprocess.run([sys.executable, "-I", "-c", SCRIPT, str(out)], capture_output=True, text=True, cwd="/")
     assert done.returncode == 0, done.stderr
+    about = json.loads((out / "model.json").read_text())
+    assert [about[name] for name in ("step", "weights", "setting", "provenance")] == [
+        3, "last", "forward", {"data": "random"},
+    ]  # fmt: skip
 
     declared = lively_params(run.model)[0]
     keys = jnp.stack([jax.random.fold_in(jax.random.wrap_key_data(key), row) for row in range(2)])
