@@ -178,7 +178,9 @@ def end(error: BaseException | None = None, code: int = 0, show: bool = False) -
         if show:
             traceback.print_exception(error)
         watchdog.stop(
-            " ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=_may_be_due_to_others(error)
+            " ".join(str(error).split())[:500] or type(error).__name__,
+            code,
+            perhaps_lost=_may_be_due_to_others(error),
         )
         sys.stdout.flush()
         sys.stderr.flush()

@@ -5,6 +5,7 @@ heartbeat to the coordinator (process 0) once a second, over a connection of its
 of the others. A process whose heartbeat has not changed for `lost_after` seconds is lost; so is the coordinator if it
 has not answered for as long, or refuses connections, which only one that has ended does. A process that finds another
 one lost prints which and exits with Exit.LOST: nothing computed since the last checkpoint could be saved without it.
+One that failed in a way in which it would fail again (REPEATED) is followed by the others with its own code.
 
 A cut of the network that is shorter than `lost_after` does nothing: connections go on when it is over. (JAX's own
 heartbeats name nobody, and its service closes connections that are silent in the middle of an answer for 20
@@ -33,9 +34,10 @@ GRACE = 2.0  # seconds: all may fail in the same way, and then each reports its 
 EXCHANGE_TIMEOUT = 3.0  # seconds for one exchange of heartbeats
 MAX_BYTES = 2**12  # of a heartbeat
 DONE, FAILED = "done", "failed"
+REPEATED = (Exit.REFUSED, Exit.DIVERGED)  # what must not be started again, whichever process a scheduler asks
 
 Heartbeat = list[Any]
-"""[count], [DONE] or [FAILED, message]."""
+"""[count], [DONE] or [FAILED, message, exit code]."""
 
 
 @dataclass
@@ -69,13 +71,19 @@ class Heartbeats:
         self.answered += seconds
         self.last = {p: (heartbeat, when + seconds) for p, (heartbeat, when) in self.last.items()}
 
-    def failure(self) -> str | None:
-        """Why this process must end; None: it need not."""
+    def failure(self) -> tuple[str, int] | None:
+        """Why this process must end, and with which exit code; None: it need not."""
+        for p, (heartbeat, when) in self.last.items():
+            if p != self.process and heartbeat[:1] == [FAILED] and self.clock() - when > GRACE:
+                _, message, code = heartbeat
+                return f"{self._name_of(p)} ended with an error: {message}", code if code in REPEATED else Exit.LOST
+        lost = self._lost()
+        return None if lost is None else (lost, Exit.LOST)
+
+    def _lost(self) -> str | None:
+        """Which process is lost, if one is."""
         now, others = self.clock(), {p: x for p, x in self.last.items() if p != self.process}
         again = "start all processes again: they continue from the last checkpoint"
-        for p, (heartbeat, when) in others.items():
-            if heartbeat[:1] == [FAILED] and now - when > GRACE:
-                return f"{self._name_of(p)} ended with an error: {heartbeat[1]}"
         silent = now - self.answered
         if self.process and self.last[0][0] != [DONE] and (self.refused or silent > self.lost_after):
             why = "has ended" if self.refused else f"has not answered for {silent:.0f} s"
@@ -144,7 +152,7 @@ class Watchdog:
         self,
         heartbeats: Heartbeats,
         exchange: Callable[[int, Heartbeat], dict[int, Heartbeat]],
-        on_failure: Callable[[str], None],
+        on_failure: Callable[[str, int], None],
     ):
         """`exchange(process, heartbeat)` is `HeartbeatServer.exchange` or `send_heartbeat`; `on_failure` is called with
         `Heartbeats.failure`, if there is one."""
@@ -181,18 +189,18 @@ class Watchdog:
                 self.heartbeats.extend_deadlines(slept)
             failure = self.heartbeats.failure()
             if failure is not None and not self._ended.is_set():
-                self._on_failure(failure)
+                self._on_failure(*failure)
 
 
 def start(heartbeats: Heartbeats, exchange: Callable[[int, Heartbeat], dict[int, Heartbeat]]) -> None:
-    """From now on this process ends with Exit.LOST when another one is lost."""
+    """From now on this process ends when another one is lost or failed (`Heartbeats.failure`)."""
     global _watchdog
     _delay_aborts()
-    _watchdog = Watchdog(heartbeats, exchange, _exit_lost)
+    _watchdog = Watchdog(heartbeats, exchange, _exit_now)
 
 
-def stop(error: str | None = None, *, perhaps_lost: bool = False) -> None:
-    """At the end of this process: tells the others that it is done, or why it failed.
+def stop(error: str | None = None, code: int = Exit.DONE, *, perhaps_lost: bool = False) -> None:
+    """At the end of this process: tells the others that it is done, or why it failed and with which exit code.
 
     `perhaps_lost`: the error may be due to the loss of another process; the watchdog then gets the time to find which.
     """
@@ -205,16 +213,16 @@ def stop(error: str | None = None, *, perhaps_lost: bool = False) -> None:
         return
     if perhaps_lost:
         time.sleep(watchdog.heartbeats.lost_after + GRACE + INTERVAL)
-    watchdog.end([FAILED, error[: MAX_BYTES // 8]])
+    watchdog.end([FAILED, error[: MAX_BYTES // 8], code])
     time.sleep(GRACE + 2 * INTERVAL)  # the others read it before the coordinator may be gone
 
 
 _watchdog: Watchdog | None = None
 
 
-def _exit_lost(failure: str) -> None:
-    print(f"error: {failure} (exit code {Exit.LOST})", file=sys.stderr, flush=True)
-    os._exit(Exit.LOST)  # threads that wait in collectives would keep a normal exit waiting
+def _exit_now(failure: str, code: int) -> None:
+    print(f"error: {failure} (exit code {int(code)})", file=sys.stderr, flush=True)
+    os._exit(code)  # threads that wait in collectives would keep a normal exit waiting
 
 
 def _delay_aborts() -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import threading
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime import processes
-from hma_jax.runtime.exits import sigterm_as_interrupt
+from hma_jax.runtime.exits import Exit, sigterm_as_interrupt
 from hma_jax.runtime.processes import Processes
 from hma_jax.runtime.watchdog import DONE, FAILED, Heartbeats, HeartbeatServer, Watchdog, send_heartbeat
 from tests.multihost.processes import by_address, by_slurm, run
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("said", [by_address, pytest.param(by_slurm, marks=pytest.mark.slow)])
@@ -95,7 +98,9 @@ class World:
         self.now += seconds
         if heard is not None:
             self.heartbeats.receive(heard)
-        return self.heartbeats.failure()
+        failure = self.heartbeats.failure()
+        self.code = failure and failure[1]
+        return failure and failure[0]
 
 
 def test_a_silent_process_is_lost_by_name_when_its_time_is_over():
@@ -148,9 +153,30 @@ def test_whoever_is_done_is_not_missed():
 
 def test_an_error_elsewhere_is_told_unless_this_process_has_it_too():
     world = World(1)
-    assert world.after(1, {0: [1], 1: [1], 2: [FAILED, "disk full"]}) is None  # it may be about to say so itself
+    assert world.after(1, {0: [1], 1: [1], 2: [FAILED, "disk full", 1]}) is None  # it may be about to say so itself
     assert world.after(3, {0: [4]}) == "process 2 of 3 on host c ended with an error: disk full"
-    assert World(2).after(9, {2: [FAILED, "disk full"], 0: [1], 1: [1]}) is None
+    assert World(2).after(9, {2: [FAILED, "disk full", 1], 0: [1], 1: [1]}) is None
+
+
+@pytest.mark.parametrize(("code", "own"), [(1, 75), (2, 2), (3, 3), (130, 75)])
+def test_what_would_fail_again_has_the_same_code_everywhere(code, own):
+    """A scheduler that sees one code of many must not start it again for ever."""
+    world = World(1)
+    world.after(1, {0: [FAILED, "why", code], 1: [1], 2: [1]})
+    assert world.after(3, {2: [4]}) and world.code == own
+
+
+@pytest.mark.parametrize("code", [0, 1, 2, 3, 75, 130, 134, 137, 139, 143, 253])
+def test_the_slurm_script_of_the_page_puts_lost_jobs_back_into_the_queue(code):
+    page = (ROOT / "docs" / "hosts.md").read_text()
+    script = page[page.index("    srun --kill-on-bad-exit") :].split("\n\n")[0]
+    slurm = f"srun() {{ return {code}; }}; scontrol() {{ echo $1 $2; }}; SLURM_JOB_ID=7"
+    start = lambda count: subprocess.run(
+        ["sh", "-c", f"{slurm}; SLURM_RESTART_COUNT={count}\n{script}"], capture_output=True, text=True
+    )
+    again = code in (75, 134, 137, 139, 253)
+    assert start("").stdout == start(3).stdout == ("requeue 7\n" if again else "") and start("").stderr == ""
+    assert start(20).stdout == ""
 
 
 def test_heartbeats_are_sent_to_the_server_and_those_of_all_come_back():
@@ -172,7 +198,8 @@ def test_a_watchdog_ends_its_process_with_the_failure_and_not_after_its_own_end(
     heard, left = {1: [1]}, threading.Event()
     verdicts: list[str] = []
 
-    def leave(verdict: str) -> None:
+    def leave(verdict: str, code: int) -> None:
+        assert code == Exit.LOST
         verdicts.append(verdict)
         left.set()
 
