@@ -240,6 +240,27 @@ def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path, capsys
     assert "this replaced the file's entry of my_robot (old -> new): hz: 4.0 -> 5.0\n" in capsys.readouterr().out
 
 
+def test_a_guess_that_takes_the_place_of_the_project_s_entry_is_told(tmp_path, capsys):
+    """The suggestion knows less than the entry: of which arm the angles are, or that the gripper is absolute."""
+    own = get_spec("droid_sample")
+    data, file = write_rlds(tmp_path, own, [30] * 3), tmp_path / "my.toml"
+    words = ["data", "inspect", str(data), "--hz", "5", "--out", str(tmp_path / "sheet")]
+    assert main([*words, "--entry", str(file)]) == 0
+    (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert note.startswith(
+        f"note: this takes the place of the project's entry of droid_sample, in commands with --registry {file} (there "
+        "-> here): "
+    )
+    assert "angles: [3, 5] -> []" in note and "episodes" not in note and "note: " not in note[6:]
+    assert note.endswith(f"; to keep that, remove it from {file}")
+    file.write_text(to_toml(own))
+    assert main([*words, "--registry", str(file), "--entry", str(file)]) == 0
+    said = capsys.readouterr().out
+    assert "this replaced the file's entry of droid_sample" in said and "project's entry" in said
+    assert main([*words]) == 0
+    assert "note: " not in capsys.readouterr().out
+
+
 def test_entries_written_at_the_same_moment_are_both_kept(tmp_path, monkeypatch):
     """Each was put into the text as it was before the other."""
     put, names = toml_file.put_entry, ("one", "other")

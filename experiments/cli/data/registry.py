@@ -143,6 +143,7 @@ def data_inspect(
     """
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry
+    from data_pipelines.registry import all_specs
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_reader
 
@@ -150,6 +151,7 @@ def data_inspect(
     stride_of(hz or 1)  # raises before the dataset is read
     require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
     require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
+    own = {spec.name: spec for spec in all_specs()}  # the project's, before the user's take their places
     use_entries(registry)
     sheets = Path("runs") / "inspect"
     make_directory(out or sheets)
@@ -178,6 +180,7 @@ def data_inspect(
         wrote(json)
     if entry is not None:
         _write_entry(entry, suggestion)
+        _say_displaced(own.get(facts.name), suggestion.spec(), entry)
     if known is not None or entry is not None:
         _say_next(facts, windows, entry or registry, other_rate(facts, rate, registry) if taken else None)
 
@@ -316,6 +319,15 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
     if lines := [line for entry in old for line in diff(entry, spec)]:
         text = f"note: this replaced the file's entry of {spec.name} (old -> new): {'; '.join(lines)}"
         say(text)
+
+
+def _say_displaced(own: DatasetSpec | None, spec: DatasetSpec, path: Path) -> None:
+    """Says how the data are read otherwise by the entry `spec`, which is in a file now, than by the project's `own`."""
+    if own is not None and (lines := diff(own.facts(), spec.facts())):
+        say(
+            f"note: this takes the place of the project's entry of {own.name}, in commands with --registry {path} (there "
+            f"-> here): {'; '.join(lines)}; to keep that, remove it from {path}"
+        )
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, first: str | None) -> None:
