@@ -67,8 +67,9 @@ def write_dataset(
     root = Path(store_root)
     final = root / plan.spec.name
     try:
+        others = _find_others(root, plan, parts)
         if overwrite:
-            _remove_others(root, plan, parts)
+            _remove_others(final, plan, others)
         maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(skipped), max_skipped)
         pauses = backoff()
         while True:
@@ -211,8 +212,8 @@ def _changes(existing: Manifest, plan: Manifest) -> list[str]:
     return [line for name in inputs for line in diff(getattr(existing, name), getattr(plan, name), name)]
 
 
-def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
-    """A dataset of this name that was made otherwise, and what unfinished jobs left of it.
+def _find_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> list[Path]:
+    """Work directories that jobs with other plans left of a dataset of this name.
 
     Raises Held if a living process is making one.
     """
@@ -227,6 +228,11 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
                 "it",
                 held.holder,
             )
+    return others
+
+
+def _remove_others(final: Path, plan: Manifest, others: Sequence[Path]) -> None:
+    """A dataset of this name that was made otherwise, and what unfinished jobs left of it."""
     if final.exists():
         try:
             outdated = bool(_changes(load_manifest(final / FILE), plan))

@@ -208,6 +208,15 @@ def test_jobs_of_different_settings_do_not_mix(rlds, tmp_path):
         run(rlds, tmp_path, keep_frames="all")
 
 
+def test_a_dataset_that_is_being_made_with_other_settings_is_refused_before_anything_is_made(rlds, tmp_path):
+    """It took hours until the one that finished second was refused."""
+    work = begin(rlds, tmp_path, keep_frames="all")
+    with lock_output(locks_of(work) / "00007"):  # by a process that is alive
+        with pytest.raises(ConfigError, match="toy: process .* is making this dataset with other settings"):
+            run(rlds, tmp_path)
+    assert set(tmp_path.glob(".toy.*")) == {work, locks_of(work)}
+
+
 def test_overwriting_removes_what_was_made_otherwise(rlds, undisturbed, tmp_path):
     work = begin(rlds, tmp_path, keep_frames="none")
     run(rlds, tmp_path, keep_frames="all")
