@@ -13,7 +13,9 @@ MAX_LISTED = 6
 """Cases that a message lists one by one; of the others it gives the number. Of a dataset that was fetched in part,
 every shard may be damaged."""
 
-ADVICE = re.compile(r"[.;] (?:Download|Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
+ADVICE = re.compile(
+    r"[.;] (?:Download|Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip'|store\.corrupt=skip)[^.;]*\.?$"
+)
 """The end of a message that says how to skip damaged data."""
 
 

@@ -41,8 +41,7 @@ class LeRobotSource:
         settings.check()
         self.root, self.short_side = Path(root), settings.short_side
         self.meta = read_meta(self.root)
-        numbered = self.meta.episodes[-1].index < self.meta.stated  # else nobody knows which ones are lost
-        if self.meta.lost_why and not (may_lose and numbered):
+        if self.meta.lost_why and not (may_lose and self.meta.may_lose):
             raise DataError(self.meta.lost_why)
         features = self.meta.features
         _check_names(features, self.root / "meta" / "info.json")

@@ -27,6 +27,10 @@ VERSIONS = ("v2.0", "v2.1", "v3.0")
 MAX_COUNT = 10**9
 """Largest accepted episode index, episode length, chunk or task index, and number of values of a feature."""
 
+MAX_LOST = 10**6
+"""How many episodes may be missing from the list: each is named, in 8 bytes, so that the others stay where they are in
+the hold-out."""
+
 
 @dataclass(frozen=True)
 class EpisodeEntry:
@@ -44,6 +48,7 @@ class LeRobotMeta:
     """`features` as info.json has them; `tasks` by task_index.
 
     `stated`: how many episodes there are by info.json. Where fewer are listed, `lost_why` is a message on it, else "".
+    `may_lose`: whether the numbers of those listed say which ones are lost, of at most MAX_LOST.
     """
 
     version: str
@@ -53,6 +58,7 @@ class LeRobotMeta:
     tasks: dict[int, str]
     stated: int
     lost_why: str
+    may_lose: bool
 
 
 def read_meta(root: Path) -> LeRobotMeta:
@@ -84,15 +90,17 @@ def read_meta(root: Path) -> LeRobotMeta:
                 "one of the two lines, or download the dataset again."
             )
     stated, lost_why = info.get("total_episodes") or 0, ""
+    may_lose = episodes[-1].index < stated <= len(episodes) + MAX_LOST
     if len(episodes) < stated:
         absent = next((n for n, e in enumerate(episodes) if e.index != n), len(episodes))
         lost_why = (
             f"{root / 'meta'}: it lists {len(episodes)} episodes, without episode {absent}, but total_episodes in "
-            f"info.json is {stated}. Download the meta folder again; if episodes were removed on purpose, write "
-            f"{len(episodes)} there."
+            f"info.json is {stated}. Download the meta folder again"
+            + (", or leave them out with --set store.corrupt=skip (`hma data convert`: --skip-damaged)" * may_lose)
+            + f", or write {len(episodes)} there if they were removed on purpose, which changes what is held out."
         )
     tasks = _tasks(root, version)
-    return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), tasks, stated, lost_why)
+    return LeRobotMeta(version, float(info["fps"]), features, tuple(episodes), tasks, stated, lost_why, may_lose)
 
 
 def hash_meta(root: Path) -> hashlib._Hash:

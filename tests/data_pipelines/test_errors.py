@@ -20,6 +20,8 @@ ADVISED = [
     "out with corrupt='skip'.",
     "toy, episode 3 (a.tfrecord, byte 0): it has no frames in 'image'; leave it out with corrupt='skip'",
     "toy.hdf5: data/demo_1: the camera has 3 frames; leave it out with corrupt='skip'.",
+    "arm/meta: total_episodes is 3. Download the meta folder again, or leave them out with --set store.corrupt=skip "
+    "(`hma data convert`: --skip-damaged), or write 2 there.",
 ]
 """As the readers of every format say it."""
 

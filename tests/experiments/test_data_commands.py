@@ -62,6 +62,20 @@ def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):
     RldsDataset(tmp_path / "my_robot").check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 
 
+def test_episodes_that_the_meta_folder_has_lost_are_left_out_on_request(tmp_path, capsys):
+    root = write_lerobot(tmp_path / "arm", "v2.1", lengths=(12, 9, 7))
+    path = root / "meta" / "episodes.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[::2]))
+    command = ["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]
+    assert main(command) == 1
+    error = capsys.readouterr().err
+    assert "store.corrupt=skip (`hma data convert`: --skip-damaged)" in error and "what is held out" in error
+    assert main([*command, "--skip-damaged"]) == 0
+    out = said(capsys)
+    assert "2 episodes at 10 Hz" in out and "left out 1 x: " in out and "total_episodes in info.json is 3." in out
+    assert "--skip-damaged" not in out
+
+
 def test_what_is_left_out_is_told(tmp_path, capsys):
     hands = [hand(0, 0.2, 0.5), hand(1, 0.7, 0.5)]
     frames, detections = write_epic(tmp_path, "P01_01", [hands] * 31 + [[]] * 12 + [hands] * 12)

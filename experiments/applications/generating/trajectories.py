@@ -84,9 +84,11 @@ class Trajectories(ABC):
 class RldsTrajectories(Trajectories):
     """Of a dataset in any format that is read where it lies."""
 
-    def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int):
-        """Raises ConfigError for a dataset whose actions are not this robot's."""
-        self._source, self.spec, self._robot, self._size = open_source(directory, split), spec, robot, size
+    def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int, max_lost: int = 0):
+        """`max_lost`: how many episodes may be missing. Raises ConfigError for a dataset whose actions are not this
+        robot's, DataError for more damage."""
+        self._source = open_source(directory, split, corrupt="skip" if max_lost else "raise", max_skipped=max_lost)
+        self.spec, self._robot, self._size = spec, robot, size
         self.name, self.split, self.fingerprint = spec.name, split, self._source.fingerprint()
         self.drawn_as = self._source.name if spec.joins else spec.name
         _require_fit(spec, robot)
@@ -177,7 +179,8 @@ def open_trajectories(
 
     `place` is a dataset's directory, one of a token store (`STORE/NAME`), or the name of a dataset in the token store
     `stores`. Raises ConfigError for what is none of them, or of no known robot, and for an entry that corrects images
-    otherwise than that store was made; DataError for damage.
+    otherwise than that store was made; DataError for damage, but for as many episodes as were left out of the tokens of
+    the same dataset in `stores`.
     """
     path = Path(place)
     if not path.exists() and stores.is_dir() and "/" not in place:
@@ -201,7 +204,9 @@ def open_trajectories(
         return StoredTrajectories(TokenStore(path.parent), name, split, tokenizer, chosen), chosen
     if name == chosen.name:
         _require_corrections(get_spec(name), stores / name)
-    return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size), chosen
+    learnt_from = stores / name / MANIFEST
+    max_lost = load_manifest(learnt_from).skipped_count if learnt_from.is_file() else 0
+    return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size, max_lost), chosen
 
 
 def describe_reconstruction(recorded: Trajectories) -> str:

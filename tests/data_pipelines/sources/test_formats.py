@@ -121,6 +121,14 @@ def test_an_episode_of_lerobot_keeps_its_name_when_others_are_gone(tmp_path):
     assert open_source(root).ids.tolist() == [ids[0], ids[2]]
 
 
+def test_more_lost_episodes_than_can_be_named_are_damage_whatever_is_allowed(tmp_path):
+    """Each is named, in 8 bytes: `hma data inspect` allows any number, and ended for want of memory."""
+    info = write_lerobot(tmp_path / "toy-arm", "v2.1") / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"total_episodes": 10**9}))
+    with pytest.raises(DataError, match="total_episodes in info.json is 1000000000. .*write 2 there"):
+        open_source(tmp_path / "toy-arm", corrupt="skip", max_skipped=10**10)
+
+
 def test_a_draw_of_images_reads_its_own_rows_alone(tmp_path):
     """What is damaged elsewhere in the file, other columns and other episodes, is not met."""
     root = write_lerobot(tmp_path / "toy-arm", "v3.0", camera="image")

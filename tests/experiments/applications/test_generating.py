@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.convert import write as convert_module
+from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.generate import generate_suite
@@ -156,6 +157,24 @@ def test_frames_that_are_corrected_otherwise_than_those_a_model_learnt_from_are_
     assert len(opened(rotated)[0]) == 2
     with pytest.raises(ConfigError, match=r"\(there -> asked for\): rotate_180 -> none\. "):
         opened(spec)
+
+
+def test_recordings_may_lack_as_many_episodes_as_were_left_out_of_their_tokens(tmp_path):
+    """The model was trained without them; `hma generate` and `hma judge` have no option of their own for it."""
+    spec = get_spec("berkeley_gnm_cory_hall")
+    entry = Embodiment(spec.name, 2, 2, (0.0,) * 2, (1.0,) * 2, layout=spec.action_layout())
+    simulator = load_simulator(make_run(tmp_path / "study", table=EmbodimentTable((*TABLE.entries, entry))))
+    rlds, tokens = write_rlds(tmp_path, spec, [9] * 6, shards=3), tmp_path / "tokens"
+    sorted(rlds.glob("*tfrecord*"))[1].unlink()
+
+    def opened():
+        return open_trajectories(str(rlds), "train", simulator.robot(spec.name), {}, simulator.tokenizer, tokens)[0]
+
+    with pytest.raises(DataError, match="00001-of-00003"):
+        opened()
+    tokenize_dataset(spec, rlds, simulator.tokenizer, tokens, min_val=1, corrupt="skip")
+    recorded = opened()
+    assert len(recorded) == len(set(recorded.ids().tolist())) == 4
 
 
 def episode_seed(i: int) -> int:
