@@ -18,8 +18,8 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError, without_advice
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from data_pipelines.sources.rlds.images import decode_image
-from data_pipelines.sources.rlds.schema import FlatFeature, closest, field_slice, listing, step_key
-from hma_jax.config import ConfigError, require
+from data_pipelines.sources.rlds.schema import FlatFeature, check_fields, field_slice
+from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -194,38 +194,7 @@ class EpisodeSource(ABC):
 
     def check_keys(self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None) -> None:
         """Raises ConfigError unless the camera and the action fields exist, with these sizes."""
-        cameras = [k for k, f in self.features.items() if f.image]
-        numbers = [k for k, f in self.features.items() if f.size and "action" in k]
-        if step_key(image_key) not in self.features:
-            raise ConfigError(
-                f"{self.name}: no image {image_key!r} in {self.schema}; "
-                f"images there: {listing(cameras)}{closest(image_key, cameras)}. Correct image_key."
-            )
-        require(
-            self.features[step_key(image_key)].image,
-            f"{self.name}: {image_key!r} is not an image; images: {listing(cameras)}. Correct image_key.",
-        )
-        for n, key in enumerate(action_keys):
-            field, part = field_slice(key)
-            feature = self.features.get(step_key(field))
-            if feature is not None and feature.encoding:
-                raise ConfigError(
-                    f"{self.name}: {field!r} in {self.schema} is stored as bytes (encoding {feature.encoding!r}), "
-                    "which cannot be read; write the dataset again with encoding 'none' for it, or use another "
-                    "field."
-                )
-            if feature is None or not feature.size:
-                raise ConfigError(
-                    f"{self.name}: no numeric field {field!r} in {self.schema}; "
-                    f"action fields there: {listing(numbers)}{closest(field, numbers)}. Correct action_keys."
-                )
-            size = len(range(feature.size)[part])
-            if action_dims is not None and size != action_dims[n]:
-                raise ConfigError(
-                    f"{self.name}: field {key!r} has {size} values per step in "
-                    f"{self.schema}, but {action_dims[n]} were expected. "
-                    "Correct action_dims, or read the version of the dataset it was written for."
-                )
+        check_fields(self.name, self.schema, self.features, image_key, action_keys, action_dims)
 
     def without_location(self, reason: str) -> str:
         """The message without the dataset's location, so that what is made of it does not depend on where it lies."""

@@ -79,10 +79,13 @@ def _run(
     if running.dry_run:
         from experiments.done import find_done
         from experiments.plan_table import Devices, plan_table
+        from experiments.preparing.sources import check_entries
         from experiments.scale import say_points, say_scale, say_unused
         from experiments.trainable import check_launched
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
+        if given:
+            check_entries(setting.study, setting.data)
         devices = Devices(check_launched(setting.study, sweeps, launcher_options), launcher_options.at_once)
         done = find_done(setting, sweeps, running.retry_failed, running.accept_code)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))

@@ -71,7 +71,11 @@ def train(
         require_known(initial, trained, setting)
         require_other_directory(initial, run)
     if dry_run:
+        from experiments.preparing.sources import check_entries
+
         _check(setting, run, model.trajectories, options, trained)
+        if setting.data:
+            check_entries(setting.study, setting.data)
         _print_cost(setting, _single_trial(setting, model.trajectories), run, hosts.count())
         if trained is None:
             _say_scale(setting, model.trajectories)

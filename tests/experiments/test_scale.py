@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
@@ -69,6 +68,38 @@ def test_a_dry_run_says_what_the_default_preset_is_made_for(data, capsys, tmp_pa
     assert "with at most 7 trajectories" in model
 
 
+@pytest.mark.parametrize("command", ["study", "sweep width", "train"])
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"image_key": "observation/image_9"}, "no image 'observation/image_9'"),
+        ({"action_dims": (3,)}, "has 2 values per step"),
+        ({"split": "test"}, "no split 'test'"),
+    ],
+)
+def test_a_dry_run_refuses_an_entry_that_cannot_read_the_data(command, wrong, message, capsys, tmp_path, monkeypatch):
+    """Without finding its records, which takes long the first time."""
+
+    def read(*_, **__):
+        raise AssertionError("a record was looked for")
+
+    monkeypatch.setattr("data_pipelines.sources.rlds.dataset.load_index", read)
+    spec, file = make_spec("mine", (2,)), tmp_path / "my.toml"
+    data = [
+        "--data",
+        str(write_rlds(tmp_path, spec, [30] * 4)),
+        "--registry",
+        str(file),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    file.write_text(to_toml(spec))
+    assert main([*command.split(), "--dry-run", *data]) == 0
+    file.write_text(to_toml(replace(spec, **wrong)))
+    assert main([*command.split(), "--dry-run", *data]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_held_out_trajectories_are_not_called_unused(data, capsys, tmp_path):
     """Of the 95,000 that the entry declares, 200 are held out."""
     words = ("sweep", "width", "--dry-run", *data, "--out", str(tmp_path), "--set")
@@ -78,8 +109,18 @@ def test_held_out_trajectories_are_not_called_unused(data, capsys, tmp_path):
 
 def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):
     """A curve that is flat because its points have the same data, or of one point, is no result."""
-    data = [str(write_rlds(tmp_path, get_spec(n), [30] * 8)) for n in ("droid_sample", "unitree_g1_sample")]
-    words = ("study", "--dry-run", "--data", *data, "--out", str(tmp_path / "out"))
+    specs, file = (
+        [replace(make_spec(name), episodes=n) for name, n in (("mine", 8), ("yours", 5))],
+        tmp_path / "my.toml",
+    )
+    file.write_text("".join(map(to_toml, specs)))
+    data = [
+        "--data",
+        *(str(write_rlds(tmp_path, spec, [30] * spec.episodes)) for spec in specs),
+        "--registry",
+        str(file),
+    ]
+    words = ("study", "--dry-run", *data, "--out", str(tmp_path / "out"))
     caps, counts = said_by(capsys, *words)[1:]
     assert caps == (
         "note: by the registry no dataset has more than 8 trajectories, so the axis trajectories has 4 and 500, without "

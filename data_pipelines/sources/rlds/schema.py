@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from data_pipelines.json_file import read_object
 from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
 from data_pipelines.sources.rlds.location import exists, locate, retry
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -220,6 +220,50 @@ def field_slice(key: str) -> tuple[str, slice]:
 def step_key(key: str) -> str:
     """The flat record key of a field of a step."""
     return key if key.startswith("steps/") else f"steps/{key}"
+
+
+def check_fields(
+    name: str,
+    schema: Location,
+    features: Mapping[str, FlatFeature],
+    image_key: str,
+    action_keys: Sequence[str],
+    action_dims: Sequence[int] | None = None,
+) -> None:
+    """Raises ConfigError unless the camera and the action fields are among the `features` of a step of the dataset
+    `name`, as the file `schema` says them, with these sizes."""
+    cameras = [k for k, f in features.items() if f.image]
+    numbers = [k for k, f in features.items() if f.size and "action" in k]
+    if step_key(image_key) not in features:
+        raise ConfigError(
+            f"{name}: no image {image_key!r} in {schema}; "
+            f"images there: {listing(cameras)}{closest(image_key, cameras)}. Correct image_key."
+        )
+    require(
+        features[step_key(image_key)].image,
+        f"{name}: {image_key!r} is not an image; images: {listing(cameras)}. Correct image_key.",
+    )
+    for n, key in enumerate(action_keys):
+        field, part = field_slice(key)
+        feature = features.get(step_key(field))
+        if feature is not None and feature.encoding:
+            raise ConfigError(
+                f"{name}: {field!r} in {schema} is stored as bytes (encoding {feature.encoding!r}), "
+                "which cannot be read; write the dataset again with encoding 'none' for it, or use another "
+                "field."
+            )
+        if feature is None or not feature.size:
+            raise ConfigError(
+                f"{name}: no numeric field {field!r} in {schema}; "
+                f"action fields there: {listing(numbers)}{closest(field, numbers)}. Correct action_keys."
+            )
+        size = len(range(feature.size)[part])
+        if action_dims is not None and size != action_dims[n]:
+            raise ConfigError(
+                f"{name}: field {key!r} has {size} values per step in "
+                f"{schema}, but {action_dims[n]} were expected. "
+                "Correct action_dims, or read the version of the dataset it was written for."
+            )
 
 
 def listing(names: Sequence[str]) -> str:
