@@ -70,6 +70,14 @@ def browsing(chromium):
     return run
 
 
+def edit_page(monkeypatch, old: str, new: str) -> None:
+    """Servers that begin from now on serve the page with `new` in place of `old`."""
+    page = files("experiments.applications.play").joinpath("page.html").read_text()
+    assert old in page
+    edited = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda: page.replace(old, new)))
+    monkeypatch.setattr(server, "files", lambda _: edited)
+
+
 async def opened(browser, address: str, **how):
     """The page in a new context (a person), an episode under way. Waiting for an expression needs `bypass_csp`."""
     context = await browser.new_context(**{"bypass_csp": True, **how})
@@ -145,7 +153,7 @@ def test_a_gamepad_drives_by_axes_that_are_known_and_neither_it_nor_a_held_key_e
         assert await page.inner_text("#run") == "Resume"
         await page.keyboard.up("ArrowRight")
         await page.evaluate("pad.axes = [0, 0, 0, 0]")
-        await page.wait_for_function("!state.directed")
+        await page.wait_for_function("!state.sticks[0]")
         await page.evaluate("pad.axes = [1, 0, 0, 0]")
         await page.wait_for_function("state.running")
         assert not page.faults
@@ -356,9 +364,7 @@ def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robo
 
 def test_a_model_that_takes_longer_than_the_page_waits_for_a_word_is_slow_and_not_lost(browsing, monkeypatch):
     monkeypatch.setattr(sessions, "PROGRESS_SECONDS", 0.2)
-    hasty = files("experiments.applications.play").joinpath("page.html").read_text().replace("Y = 10e3", "Y = 1e3")
-    whole = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda: hasty))
-    monkeypatch.setattr(server, "files", lambda _: whole)
+    edit_page(monkeypatch, "PATIENCE = 10e3", "PATIENCE = 1e3")
 
     async def test(browser, address, client):
         page = await opened(browser, address)
