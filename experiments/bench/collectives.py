@@ -12,6 +12,7 @@ import numpy as np
 
 from hma_jax.kernels.dense import FROM_EXAMPLES, TO_EXAMPLES
 from hma_jax.runtime.sharding import GATHER, SCATTER
+from hma_jax.training.optimizer import ORTHOGONALISE
 
 KINDS = ("all-gather", "all-reduce", "reduce-scatter", "all-to-all", "collective-permute")
 LINE = re.compile(rf"= (?P<result>\(.*?\)|\S+) (?P<kind>{'|'.join(KINDS)})(?P<start>-start)?\(")
@@ -44,13 +45,15 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
     for line in text.splitlines():
         if (match := LINE.search(line)) is None:
             continue
-        # TPU programs write one gather several times: with every computation during which it goes on.
-        if channel := re.search(r"channel_id=(\d+)", line):
-            if (match["kind"], channel[1]) in channels:
-                continue
-            channels.add((match["kind"], channel[1]))
         label = re.search(r'op_name="([^"]*)"', line)
         name, kind = label[1] if label else "", match["kind"]
+        # TPU programs write one gather several times: with every computation during which it goes on. What `shard_map`
+        # sends has one channel throughout.
+        channel = re.search(r"channel_id=(\d+)", line)
+        if channel and ORTHOGONALISE not in name:
+            if (kind, channel[1]) in channels:
+                continue
+            channels.add((kind, channel[1]))
         arrays, over = count_bytes(match["result"]), find_axes(line, mesh)
         # What starts a gather or a permutation holds what is sent beside what is received.
         size = max(arrays) if match["start"] and kind in ("all-gather", "collective-permute") else sum(arrays)
@@ -78,6 +81,7 @@ def explain(kind: str, name: str, over: str, size: int) -> str:
         (SCATTER, "gradients, from compute to storage"),
         (TO_EXAMPLES, "robots' parameters, to their examples"),
         (FROM_EXAMPLES, "robots' gradients, from their examples"),
+        (ORTHOGONALISE, "Muon's matrices, to one device each and back"),
     ):
         if scope in name:
             return purpose

@@ -15,9 +15,11 @@ import jax
 import jax.numpy as jnp
 import optax
 import optax.contrib
+from jax.sharding import PartitionSpec
 
-from hma_jax.config import ModelConfig, OptimizerConfig, require
-from hma_jax.model.params import Params, ParamSpec, Use, is_spec
+from hma_jax.config import MeshConfig, ModelConfig, OptimizerConfig, require
+from hma_jax.model.params import MatrixAxes, Params, ParamSpec, Use, is_spec
+from hma_jax.runtime.sharding import STORAGE, is_split, mesh_axes, partition
 from hma_jax.training import robots
 from hma_jax.training.robots import Active
 
@@ -122,19 +124,77 @@ MUON_GAIN = 0.2
 both take the same rate."""
 
 
-def muon_direction(momentum: jax.Array, spec: ParamSpec, multiplier: float) -> jax.Array:
+ORTHOGONALISE = "orthogonalise_matrices"
+"""Scope of Muon's communication in compiled programs."""
+
+
+def muon_direction(
+    momentum: jax.Array, spec: ParamSpec, multiplier: float, min_shard_size: int = MeshConfig.min_shard_size
+) -> jax.Array:
     """What a `hidden` parameter is moved along, in units of the rate at the base width: each of its matrices made
-    orthogonal, so that all its singular values are about 1.
+    orthogonal, so that all its singular values are about 1. `momentum` may have fewer robots than the declaration.
 
     muP wants the spectral norm of an update to stay as it is at the base width (Yang et al. 2023): its root mean square
-    falls as 1 / sqrt(m) of itself, so of `multiplier`, 1 / m, only the root is left to apply to the size.
+    falls as 1 / sqrt(m) of itself, so of `multiplier`, 1 / m, only the root is left to apply to the size. On a mesh the
+    matrices of a parameter of `min_shard_size` numbers or more are shared out among the devices.
     """
-    axes = [tuple(len(spec.shape) + axis for axis in side) for side in spec.matrix]
-    numbers = optax.contrib.MuonDimensionNumbers(*axes)
-    orthogonalise = optax.contrib.scale_by_muon(beta=0.0, nesterov=False, weight_dimension_numbers=numbers)
-    orthogonal, _ = orthogonalise.update(momentum, orthogonalise.init(momentum))
+    rows, columns = (tuple(len(spec.shape) + axis for axis in side) for side in spec.matrix)
+    axes = rows, columns
+    if is_split() and spec.size >= min_shard_size:
+        storage = partition(spec.axes, momentum.shape, jax.sharding.get_abstract_mesh(), STORAGE)
+        orthogonal = _shared_out(momentum, axes, storage)
+    else:
+        orthogonal = _orthogonalised(momentum, axes)
     longest = max(math.prod(spec.shape[axis] for axis in side) for side in axes)
     return MUON_GAIN * math.sqrt(longest * multiplier) * orthogonal
+
+
+def _orthogonalised(x: jax.Array, axes: MatrixAxes) -> jax.Array:
+    """x with each matrix along `axes`, counted from the first, made orthogonal."""
+    numbers = optax.contrib.MuonDimensionNumbers(*axes)
+    muon = optax.contrib.scale_by_muon(beta=0.0, nesterov=False, weight_dimension_numbers=numbers)
+    return muon.update(x, muon.init(x))[0]
+
+
+def _shared_out(x: jax.Array, axes: MatrixAxes, storage: PartitionSpec) -> jax.Array:
+    """`_orthogonalised` on a mesh, of x stored by `storage`: each device makes some whole matrices orthogonal.
+
+    Matrices that are stored in parts are sent to one device each, and back. Otherwise each of the fifteen products
+    would gather all matrices on every device, and what several devices store, each of them would compute.
+    """
+    sizes = jax.sharding.get_abstract_mesh().shape
+    batch = tuple(axis for axis in range(x.ndim) if axis not in axes[0] + axes[1])
+    order = (*batch, *axes[0], *axes[1])
+    split = {name: axis for axis, part in enumerate(storage) for name in mesh_axes(part)}
+    # Mesh axes that the matrices are yet to be split along, and which side of a matrix each splits in storage.
+    sides = {
+        name: next((side for side in (1, 2) if split.get(name) in axes[side - 1]), None)
+        for name, size in sizes.items()
+        if size > 1 and split.get(name) not in batch
+    }
+
+    def on_each(own: jax.Array) -> jax.Array:
+        turned = own.transpose(order)
+        m = turned.reshape([math.prod(own.shape[axis] for axis in group) for group in (batch, *axes)])
+        count = len(m)
+        m = jnp.pad(m, ((0, -count % math.prod(sizes[name] for name in sides)), (0, 0), (0, 0)))
+        # Rows and columns may come together in any order: they go apart again as they came.
+        for name, side in sides.items():
+            if side is None:
+                part = len(m) // sizes[name]
+                m = jax.lax.dynamic_slice_in_dim(m, part * jax.lax.axis_index(name), part)
+            else:
+                m = jax.lax.all_to_all(m, name, split_axis=0, concat_axis=side, tiled=True)
+        m = _orthogonalised(m, ((1,), (2,)))
+        for name, side in reversed(sides.items()):
+            if side is None:
+                m = jax.lax.all_gather(m, name, tiled=True)
+            else:
+                m = jax.lax.all_to_all(m, name, split_axis=side, concat_axis=0, tiled=True)
+        return m[:count].reshape(turned.shape).transpose([order.index(axis) for axis in range(own.ndim)])
+
+    with jax.named_scope(ORTHOGONALISE):
+        return jax.shard_map(on_each, in_specs=storage, out_specs=storage, check_vma=False)(x)
 
 
 def apply_update(
@@ -146,8 +206,9 @@ def apply_update(
     presence: Presence,
     learning_rate: jax.Array,
     config: OptimizerConfig,
+    min_shard_size: int = MeshConfig.min_shard_size,
 ) -> tuple[Params, AdamState]:
-    """New parameters and state after one step.
+    """New parameters and state after one step. On a mesh, parameters of fewer than `min_shard_size` numbers are whole.
 
     p <- p - rate * (multiplier * adam + weight_decay * p), the second term only where the declaration says so. With
     `config.matrices` muon, matrices between two widths take `muon_direction` in place of the first and have no second
@@ -164,7 +225,7 @@ def apply_update(
         if config.matrices == "muon" and spec.role == "hidden":
             mu = MUON_MOMENTUM
             new_m, new_v = mu * m + (1 - mu) * g, v
-            move = muon_direction(mu * new_m + (1 - mu) * g, spec, multiplier)
+            move = muon_direction(mu * new_m + (1 - mu) * g, spec, multiplier, min_shard_size)
         else:
             new_m = b1 * m + (1 - b1) * g
             new_v = b2 * v + (1 - b2) * jnp.square(g)

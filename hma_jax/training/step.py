@@ -115,8 +115,9 @@ def make_train_step(
         presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT, leak)
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
         new, adam = apply_update(
-            grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer
-        )
+            grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer,
+            declared.min_shard_size,
+        )  # fmt: skip
         params = robots.put(state.params, new, specs, active)
         opt_state = put_adam(state.opt_state, adam, specs, active)
         ema = None

@@ -63,6 +63,8 @@ TEXT = """
   %m = f32[8]{0} reduce-scatter(%x), replica_groups=mesh['axis_0'=4,'axis_1'=2] {'axis_0'}, metadata={op_name="jit(step)/z"}
   %p = (bf16[4]{0}, bf16[4]{0}, u32[], u32[]) collective-permute-start(%x), source_target_pairs={{0,2},{2,0}}, metadata={op_name="jit(step)/transpose(jvp())/dot_general"}
   %q = f32[8,4096]{1,0} all-to-all(%x), replica_groups=[4,2]<=[2,2,2]T(0,2,1), metadata={op_name="jit(step)/robots_to_examples/y"}
+  %s = f32[4]{0} all-to-all(%x), channel_id=1, replica_groups={{0,1},{2,3}}, metadata={op_name="jit(step)/orthogonalise_matrices/shard_map/all_to_all"}
+  %t = f32[4]{0} all-to-all(%y), channel_id=1, replica_groups={{0,1},{2,3}}, metadata={op_name="jit(step)/orthogonalise_matrices/shard_map/all_to_all"}
   ROOT %d = f32[8]{0} add(f32[8]{0} %a, f32[8]{0} %a)
 """  # noqa: E501
 
@@ -73,12 +75,14 @@ def test_collectives_are_counted_once_with_what_is_sent_over_which_axes():
         "all-gather": 1,
         "all-reduce": 1,
         "reduce-scatter": 1,
-        "all-to-all": 1,
+        "all-to-all": 3,
         "collective-permute": 1,
     }
     assert found[Collective("all-to-all", "fsdp", False, "robots' parameters, to their examples")] == Sent(
         1, 8 * 4096 * 4
     )
+    shared_out = Collective("all-to-all", "tensor", False, "Muon's matrices, to one device each and back")
+    assert found[shared_out] == Sent(2, 2 * 4 * 4)
     gathered = Collective("all-gather", "fsdp+tensor", True, "parameters, from storage to compute")
     assert found[gathered] == Sent(1, 2 * 128)
     by_axes = {c.kind: c.over for c in found}

@@ -1,39 +1,63 @@
-"""What devices send each other for the gradient of one product's weight; prints a JSON line.
+"""What eight devices send each other for the gradient of one product's weight, or for Muon; prints a JSON line.
 
-It says how often each kind of communication stands in the program, and how many bytes of a device it needs for
-temporary arrays.
+The argument is "product" or "muon". The line says how often each kind of communication stands in the program, and of
+one device the FLOPs and the bytes of temporary arrays; of Muon also by how much its result is off that of one device.
 """
 
 import json
+import sys
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import NamedSharding, PartitionSpec
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from experiments.bench.collectives import count_kinds, find_collectives
 from hma_jax.config import MeshConfig
 from hma_jax.kernels.dense import contract
+from hma_jax.model.params import ParamSpec, zeros
 from hma_jax.runtime.mesh import make_mesh
+from hma_jax.training.optimizer import muon_direction
 
-BATCH, ROWS, WIDTH, HEADS, HEAD = 4, 120, 64, 8, 8
+WIDTH, HEADS, HEAD = 64, 8, 8
+SPEC = ParamSpec((4, 6, WIDTH, 2 * WIDTH), ("N", "E", "D", "D_out"), "hidden", True, zeros)
 
 
-def compile_product(mesh: jax.sharding.Mesh) -> jax.stages.Compiled:
+def of_product() -> dict[str, Any]:
     """Of the gradient of the weight of queries, keys and values, whose heads are split."""
-    rows, heads = NamedSharding(mesh, PartitionSpec("data")), NamedSharding(mesh, PartitionSpec(None, None, "tensor"))
-    x = jax.ShapeDtypeStruct((BATCH, ROWS, WIDTH), jnp.float32, sharding=rows)
-    w = jax.ShapeDtypeStruct((WIDTH, 3, HEADS, HEAD), jnp.float32, sharding=heads)
-    gradient = jax.jit(jax.grad(lambda w, x: jnp.sum(contract(x, w) ** 2)), out_shardings=heads)
-    return gradient.lower(w, x).compile()
-
-
-def main() -> None:
     mesh = make_mesh(MeshConfig(2, 1, 4))
+    rows, heads = NamedSharding(mesh, PartitionSpec("data")), NamedSharding(mesh, PartitionSpec(None, None, "tensor"))
+    x = jax.ShapeDtypeStruct((4, 120, WIDTH), jnp.float32, sharding=rows)
+    w = jax.ShapeDtypeStruct((WIDTH, 3, HEADS, HEAD), jnp.float32, sharding=heads)
     with jax.set_mesh(mesh):
-        compiled = compile_product(mesh)
-    kinds = count_kinds(find_collectives(compiled.as_text(), mesh.shape))
-    print(json.dumps({"kinds": kinds, "temporary": compiled.memory_analysis().temp_size_in_bytes}))
+        gradient = jax.jit(jax.grad(lambda w, x: jnp.sum(contract(x, w) ** 2)), out_shardings=heads)
+        return describe(gradient.lower(w, x).compile(), mesh)
 
+
+def of_muon() -> dict[str, Any]:
+    """Of a parameter of 24 matrices that every axis of the mesh could split."""
+    mesh = make_mesh(MeshConfig(2, 2, 2))
+    momentum = np.random.default_rng(0).normal(size=SPEC.shape).astype(np.float32)
+    layout = NamedSharding(mesh, PartitionSpec(None, None, "fsdp", "tensor"))
+    one = jax.jit(lambda x: muon_direction(x, SPEC, 1.0))(momentum)
+    with jax.set_mesh(mesh):
+        stored = jax.device_put(momentum, layout)
+        compiled = jax.jit(lambda x: muon_direction(x, SPEC, 1.0), out_shardings=layout).lower(stored).compile()
+        off = np.abs(np.asarray(compiled(stored)) - np.asarray(one)).max()
+        return describe(compiled, mesh) | {"off": float(off)}
+
+
+def describe(compiled: jax.stages.Compiled, mesh: Mesh) -> dict[str, Any]:
+    return {
+        "kinds": count_kinds(find_collectives(compiled.as_text(), mesh.shape)),
+        "temporary": compiled.memory_analysis().temp_size_in_bytes,
+        "flops": compiled.cost_analysis()["flops"],
+    }
+
+
+PROGRAMS: dict[str, Callable[[], dict[str, Any]]] = {"product": of_product, "muon": of_muon}
 
 if __name__ == "__main__":
-    main()
+    print(json.dumps(PROGRAMS[sys.argv[1]]()))

@@ -34,9 +34,19 @@ def run_on(devices: int, program: str, *arguments: str) -> Any:
 
 def test_a_weight_whose_heads_are_split_gets_its_gradient_where_they_are():
     """Each device computed that of all heads, from the activations of all devices."""
-    found = run_on(8, "communicated")
+    found = run_on(8, "communicated", "product")
     assert found["kinds"] == {"all-reduce": 1}
     assert found["temporary"] < 2**17
+
+
+def test_each_device_makes_its_share_of_muon_s_matrices_orthogonal():
+    """Products of matrices in parts gathered all matrices on every device, fifteen times."""
+    found = run_on(8, "communicated", "muon")
+    assert found["kinds"] == {"all-to-all": 4, "all-gather": 1}  # there and back along fsdp and tensor; back along data
+    matrices = 4 * 6 * 64 * 128
+    assert found["temporary"] < 4 * matrices / 3  # bytes: three matrices of 24, a few times
+    assert found["flops"] < 1.1 * 5 * (4 * 64 * 64 * 128 + 2 * 64**3) * 24 / 8
+    assert found["off"] < 1e-6
 
 
 def check_forty_robots(kind: str, steps: int, meshes: tuple[str, ...], robots: int = 40) -> dict[str, Any]:
