@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import MAX_LISTED, DataError, EpisodeError
+from data_pipelines.errors import MAX_LISTED, DataError, EpisodeError, without_advice
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
 from data_pipelines.inspection.sample import ExampleEpisode, shrink
@@ -168,9 +168,12 @@ def inspect_dataset(
         if stopped := log.bytes_read > max_bytes:
             break
         log.read(int(i))
+    damaged = Counter[str]()
+    for reason, count in source.skipped.items():
+        damaged[without_advice(reason)] += count
     if not log.steps:
-        reasons = "; ".join(list(source.skipped)[:MAX_LISTED]) or "it is empty"
-        more = f"; {len(source.skipped) - MAX_LISTED:,} more" if len(source.skipped) > MAX_LISTED else ""
+        reasons = "; ".join(list(damaged)[:MAX_LISTED]) or "it is empty"
+        more = f"; {len(damaged) - MAX_LISTED:,} more" if len(damaged) > MAX_LISTED else ""
         raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}{more}")
     facts = Facts(
         name=source.name,
@@ -186,7 +189,7 @@ def inspect_dataset(
         lengths=_lengths(log.steps),
         cameras=tuple(camera.facts() for camera in log.cameras.values()),
         actions=tuple(ActionFacts(key, dimension_facts(rows)) for key, rows in log.actions.items()),
-        damaged=dict(source.skipped),
+        damaged=dict(damaged),
         hz=source.hz,
         stopped=stopped,
     )
@@ -318,12 +321,16 @@ def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence
         if len(values) and isinstance(values, np.ndarray) != (key in numbers):
             raise ValueError(f"its {key} holds {'bytes' if key in numbers else 'numbers'}")
     counts = {key: len(record[step_key(key)]) for key in cameras}
+    frames, other_widths = max(counts.values(), default=0), {}
     for key in numbers:
-        counts[key] = len(record[step_key(key)]) / source.features[step_key(key)].size
+        values, size = len(record[step_key(key)]), source.features[step_key(key)].size
+        counts[key] = values / size
+        if frames and values and values != frames * size and not values % frames:
+            other_widths[key] = f" of {size} values, or {frames} of {values // frames}"
     if not counts:
         counts["is_first"] = len(record.get("steps/is_first", ()))
     if len(set(counts.values())) != 1 or not max(counts.values()):
-        found = ", ".join(f"{key} {n:g}" for key, n in counts.items())
+        found = ", ".join(f"{key} {n:g}{other_widths.get(key, '')}" for key, n in counts.items())
         raise ValueError(f"its fields differ in length, or it has no step ({found})")
     return int(max(counts.values()))
 
@@ -367,7 +374,7 @@ class _CameraLog:
     def fail(self, error: EpisodeError) -> None:
         """Notes an episode in which a frame cannot be decoded."""
         self.undecodable += 1
-        self.reason = self.reason or str(error)
+        self.reason = self.reason or without_advice(str(error))
 
     @staticmethod
     def _decode(frame: SourceFrame, where: str) -> np.ndarray:

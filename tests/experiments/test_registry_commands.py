@@ -125,6 +125,19 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
     assert main([*tokenise, *small]) == 0
 
 
+@pytest.mark.parametrize("damaged, limit", [(1, ""), (17, " --set store.max_skipped=17")])
+def test_inspection_of_damaged_data_ends_with_a_command_that_leaves_the_damage_out(damaged, limit, tmp_path, capsys):
+    def change(episode, features):
+        if episode < damaged:
+            features["steps/action"] = features["steps/action"][:-1]
+
+    data = write_rlds(tmp_path, make_spec("my_robot"), [12] * (damaged + 3), change=change)
+    words = ["--hz", "4", "--entry", f"{tmp_path}/my.toml", "--out", f"{tmp_path}/sheet"]
+    assert main(["data", "inspect", str(data), *words]) == 0
+    for line in capsys.readouterr().out.splitlines()[-2:]:
+        assert "hma tokenize" in line and line.endswith(f" --set store.corrupt=skip{limit}")
+
+
 def test_inspection_of_episodes_without_a_window_leads_to_every_frame(robot, tmp_path, capsys):
     arguments = ["--hz", "40", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
     assert main(["data", "inspect", str(robot), *arguments]) == 0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, without_advice
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds import array_record
 from data_pipelines.sources.rlds.example import Feature, parse_record
@@ -195,7 +195,7 @@ class RldsDataset(EpisodeSource):
                 raise DataError(message)
             self.count_skipped(str(problem or message), count - shard.records)
         if not len(self):
-            why = next(iter(self.skipped), None) or self._said_empty()
+            why = without_advice(next(iter(self.skipped), "")) or self._said_empty()
             raise DataError(f"{self.directory}: split {self.split!r} has no readable episode: {why}")
 
     def _said_empty(self) -> str:

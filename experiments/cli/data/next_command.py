@@ -31,19 +31,19 @@ def say_next(
         return
     default = StudyArguments.preset
     for preset, when in ((default, "next"), (ON_ACCELERATORS[default], "or, on a GPU or TPU")):
-        words = tokenize_command(preset, [facts.directory for facts in datasets], frames, registry, longest, rate)
+        words = tokenize_command(preset, datasets, frames, registry, longest, rate)
         console.print(Text(f"{when}: {words}"), soft_wrap=True)
 
 
 def tokenize_command(
     preset_name: Preset,
-    directories: Sequence[str],
+    datasets: Sequence[Facts],
     frames: int,
     registry: Path | None,
     longest: int,
     rate: float | None,
 ) -> str:
-    """The command that tokenises datasets for windows of `frames`.
+    """The command that tokenises datasets for windows of `frames`, without the episodes that cannot be read.
 
     `longest`: frames of the longest episode at that rate; the prompt leaves one of them to judge. `rate`: of
     frames in Hz, if it is not the preset's.
@@ -58,8 +58,14 @@ def tokenize_command(
         changes["eval.prompt_frames"] = prompt
     if rate is not None:
         changes["rate"] = f"{rate:g}"
+    if damaged := max(sum(facts.damaged.values()) for facts in datasets):
+        changes["store.corrupt"] = "skip"
+        if damaged > preset.store.max_skipped:
+            changes["store.max_skipped"] = damaged
     settings = tuple(f"{name}={value}" for name, value in changes.items())
-    arguments = StudyArguments(preset_name, data=tuple(directories), registry=registry, set=settings).anywhere()
+    arguments = StudyArguments(
+        preset_name, data=tuple(facts.directory for facts in datasets), registry=registry, set=settings
+    ).anywhere()
     return command("tokenize", *arguments.words())
 
 

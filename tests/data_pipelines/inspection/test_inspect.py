@@ -143,6 +143,33 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
     )
 
 
+def test_actions_of_another_width_than_declared_are_told_by_their_width(tmp_path):
+    """Four values at each of 5 steps were "action 6.66667"."""
+
+    def change(episode, features):
+        if episode == 1:
+            features["steps/action"] = np.zeros(20, np.float32)
+
+    facts = inspect_dataset(write_rlds(tmp_path, make_spec(), [5, 5, 5], change=change)).facts
+    (reason,) = facts.damaged
+    assert reason.endswith("(observation/image 5, action 6.66667 of 3 values, or 5 of 4)")
+
+
+def test_damage_is_told_without_advice_for_other_commands(tmp_path):
+    """A way to leave it out is advised where it is read for a study; here it is left out already."""
+    directory = write_rlds(tmp_path, make_spec(), [5] * 3)
+    shard = directory / "toy-train.tfrecord-00000-of-00001"
+    content = bytearray(shard.read_bytes())
+    content[300] ^= 1
+    shard.write_bytes(content)
+    (reason,) = inspect_dataset(directory).facts.damaged
+    assert reason.endswith("the checksum of the record's data does not match.")
+    shard.write_bytes(content[: len(content) // 3 - 9])
+    with pytest.raises(DataError, match="no readable episode") as raised:
+        inspect_dataset(directory)
+    assert "skip" not in str(raised.value)
+
+
 @pytest.mark.parametrize("spoilt", [{2}, set(range(4))])
 def test_a_camera_that_cannot_be_decoded_costs_no_episode(tmp_path, spoilt):
     """The whole episode was called damaged, and a dataset with one such camera unreadable; a study takes one camera."""
