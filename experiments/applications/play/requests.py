@@ -156,15 +156,17 @@ HANDLERS = {"start": _start, "rewind": _rewind, "record": _record, "truth": _tru
 
 
 def frame_of(simulator: Simulator, session: Session, request: Request) -> Message:
-    """The visitor's present frame, and where it stands."""
+    """The present frame of a visitor whose episode has begun, and where it stands."""
     image = simulator.images[session.episode]
     message: Message = {
         "type": "frame",
         "after": request.kind,
+        "robot": session.robot.name,
+        "start": session.start,
         "image": picture(image),
         "count": simulator.counts[session.episode],
         "window": simulator.model.config.frames,
-        "reach": simulator.max_rewind(session.episode) if session.robot else 0,
+        "reach": simulator.max_rewind(session.episode),
         "clipped": list(simulator.clipped[session.episode]) if request.kind == "act" else [],
         "recorded": len(session.recording) if session.recording is not None else 0,
         "recording": session.recorded,

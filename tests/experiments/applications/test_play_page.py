@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+import threading
 import time
 from dataclasses import replace
 from importlib.resources import files
@@ -23,7 +24,7 @@ from PIL import Image  # noqa: E402
 
 from experiments.applications.play import server, sessions  # noqa: E402
 from experiments.applications.play.server import SESSIONS  # noqa: E402
-from tests.experiments.applications.serving import serving, until  # noqa: E402
+from tests.experiments.applications.serving import SECONDS, serving, until  # noqa: E402
 from tests.experiments.applications.test_play_server import FakeTruth  # noqa: E402
 
 CHROMIUM = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -266,6 +267,24 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
         assert not page.faults
 
     browsing(test, visitors=1)
+
+
+def test_a_page_that_is_loaded_again_while_a_robot_begins_shows_that_robot(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        simulator, asked, go_on = client.server.app[SESSIONS].simulator, threading.Event(), threading.Event()
+        reset = simulator.reset
+        simulator.reset = lambda *what, **how: (asked.set(), go_on.wait(SECONDS), reset(*what, **how))[-1]
+        await page.click("#robots button[data-name=arm]")
+        await until(asked.is_set)
+        await page.reload()
+        await page.wait_for_function("state.robot?.name == 'pusher' && state.pending.length")  # what the greeting says
+        go_on.set()
+        await page.wait_for_function("document.querySelectorAll('.slider').length == 7")
+        await frames(page, 3)
+        assert await page.inner_text("#name") == "arm" and await page.inner_text("#said") == "" and not page.faults
+
+    browsing(test)
 
 
 def test_a_browser_that_keeps_nothing_drives_and_finds_the_episode_again(browsing):
