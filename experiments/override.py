@@ -18,6 +18,12 @@ from experiments.study import Study
 from hma_jax.config import ConfigError, ModelConfig, require
 from hma_jax.config.json import from_dict, to_dict
 
+ABBREVIATED = {"lr": "learning_rate", "batch_size": "batch", "num_steps": "steps"}
+"""Names of other projects for the same."""
+
+OF_A_TRIAL = "train.seed"
+"""What a trial takes from the study's `seeds`: `Study` refuses any other value."""
+
 
 def override(study: Study, settings: Sequence[str], model: ModelConfig | None = None) -> Study:
     """`study`, of another `model` where one is given, with fields changed by 'path=value' strings, such as
@@ -45,7 +51,7 @@ def _show(values: dict[str, Any], group: str) -> None:
     found = [
         one
         for one in describe_settings(from_dict(Study, values))
-        if not group or one.path == group or one.path.startswith(f"{group}.")
+        if one.path != OF_A_TRIAL and (not group or one.path == group or one.path.startswith(f"{group}."))
     ]
     if not found:
         raise ConfigError(f"--set {group}.help: {_instead(values, group, _leaves(values))}")
@@ -86,7 +92,9 @@ def _instead(values: dict[str, Any], path: str, known: Collection[str]) -> str:
 
 def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Collection[str]) -> list[str]:
     """Settings probably meant by the rest of a path below `group`, by the first rule that finds any."""
-    last, leaves = rest[-1], {k.split(".")[-1] for k in known}
+    last = ABBREVIATED.get(rest[-1], rest[-1])
+    known = [k for k in known if k != OF_A_TRIAL]
+    leaves = {k.split(".")[-1] for k in known}
 
     def in_group(cutoff: float) -> list[str]:
         near = difflib.get_close_matches(last, node, n=3, cutoff=cutoff) if len(rest) == 1 else []
@@ -131,6 +139,8 @@ def _parse(path: str, text: str, old: Any) -> Any:
         fits = isinstance(value, (int, float)) if number else isinstance(value, type(old))
         if isinstance(old, int) and isinstance(value, float) or isinstance(value, bool) and number:
             fits = False
+            whole = number and isinstance(value, float) and value.is_integer()
+            require(not whole, f"--set {path}={text}: expected a whole number, written {value:.0f}")
         require(fits, f"--set {path}={text}: expected a value like {json.dumps(old)}")
     return value
 

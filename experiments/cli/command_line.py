@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import itertools
 import re
 import shutil
 import sys
@@ -29,6 +30,9 @@ BORDER = "│╭╰"
 
 BREAK = "\x00"
 
+REPEATED = ("--set", "--launcher-set")
+"""Options that take one 'path=value' each time."""
+
 STYLE = re.compile("\x1b\\[[0-9;]*m")
 """What a terminal takes for colours."""
 
@@ -40,7 +44,12 @@ class Commands(SubcommandApp):
         """Runs the command that the arguments name. Exits with a message where they are wrong, and after a help."""
         shown = _wrapped() if {"-h", "--help"} & set(arguments) else nullcontext()
         with _values(), shown:
-            self._run(prog, list(arguments), description)
+            try:
+                self._run(prog, list(arguments), description)
+            except SystemExit as end:
+                if end.code and (advice := repeat_option(arguments)):
+                    print(f"error: {advice}", file=sys.stderr)
+                raise
 
     def _run(self, prog: str, arguments: list[str], description: str | None) -> None:
         found = self._subcommands.get(arguments[0]) if arguments else None
@@ -61,6 +70,23 @@ class Commands(SubcommandApp):
                 found.target._join_lines()
             else:
                 _join_lines(found.target)
+
+
+def repeat_option(arguments: Sequence[str]) -> str:
+    """What to write where an option of `REPEATED` was given once for several settings, or with a space for the '=';
+    '' where neither is so."""
+    for n, option in enumerate(arguments):
+        if option not in REPEATED:
+            continue
+        given = [*itertools.takewhile(lambda word: not word.startswith("-"), arguments[n + 1 :])]
+        settings = [word for word in given if re.match(r"[\w.]+=", word)]
+        if len(given) > 1 and "=" not in given[0]:
+            settings = [f"{given[0]}={given[1]}"]
+        elif len(settings) < 2:
+            continue
+        words = " ".join(f"{option} {one}" for one in settings)
+        return f"{option} takes one setting and is repeated for others: {words}"
+    return ""
 
 
 def joined(doc: str) -> str:

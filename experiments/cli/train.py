@@ -37,6 +37,10 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 
+SWEPT = ("seeds", "ablation_seeds", "axes", "widths", "trajectory_counts", "transfer", "designs", "judged")
+"""Settings of a study that a single model does not have; of `seeds` it has the first."""
+
+
 def train(
     arguments: StudyOptions,
     model: ModelOptions,
@@ -67,6 +71,7 @@ def train(
     run = model.directory() or arguments.anywhere().out / "model"
     trained = None if initial is None else _load_initial(initial, run)
     setting = make_setting(arguments) if trained is None else setting_of(initial, trained, arguments)
+    _say_swept(setting)
     if trained is not None:
         require_known(initial, trained, setting)
         require_other_directory(initial, run)
@@ -327,6 +332,16 @@ def _require_no_tokenizer_training(setting: Setting, replace: Step | None) -> No
         f"several processes do not train a tokenizer: first run `{first}` in one process, then this command"
         f"{' with --replace tokens' if again else ''}; or give a tokenizer with --tokenizer",
     )
+
+
+def _say_swept(setting: Setting) -> None:
+    """Names the settings that were given and only sweeps have."""
+    paths = dict.fromkeys(one.partition("=")[0].strip() for one in setting.arguments.set)
+    first, *more = setting.study.seeds
+    names = {path: "seeds beyond the first" if path == "seeds" and more else path for path in paths}
+    without = [name for path, name in names.items() if name != "seeds" and path.split(".")[0] in SWEPT]
+    if without:
+        say(f"note: one model is trained, of seed {first}; without effect: {', '.join(without)}")
 
 
 def _say_scale(setting: Setting, trajectories: int | None) -> None:

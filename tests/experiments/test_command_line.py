@@ -109,3 +109,26 @@ def test_a_mistyped_option_is_answered_by_its_own_command(columns, monkeypatch, 
     assert "--steps" in text and "hma tokenize --help" in text
     assert len(lines) < 12 and "hma convert" not in text and max(map(len, lines)) <= columns
     assert "--registry FILE" in "\n".join(said_by(capsys, "data", "inspect", "x", "--registri", "y"))
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (
+            "train --set train.steps=10 train.batch=8 tau=1 --dry-run",
+            "--set train.steps=10 --set train.batch=8 --set tau=1",
+        ),
+        ("sweep --set train.steps=10 train.batch=8 width", "--set train.steps=10 --set train.batch=8"),
+        ("train --set train.steps 10", "--set train.steps=10"),
+        ("study --launcher-set gpus=8 cpus=64", "--launcher-set gpus=8 --launcher-set cpus=64"),
+        ("sweep width --set tau=1 wide", None),
+        ("train --preset cpu --out DIR more=1", None),
+    ],
+)
+def test_a_setting_that_is_not_preceded_by_its_option_is_told_how(typed, meant, capsys):
+    last = said_by(capsys, *typed.split())[-1]
+    if meant is None:
+        assert "takes one" not in last
+    else:
+        option = meant.split()[0]
+        assert last == f"error: {option} takes one setting and is repeated for others: {meant}"

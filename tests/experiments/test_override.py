@@ -42,6 +42,7 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("model.frames", "path=value"),
         ("model.frames=many", "not a number"),
         ("model.frames=2.5", "expected a value like"),
+        ("train.steps=1e4", "expected a whole number, written 10000"),
         ("model.mup.enabled=3", "expected a value like"),
         ("eval.prompt_frames=4", "leaves no frame to predict"),
         ("model.tokens=9", "the tokenizer makes 16"),
@@ -89,6 +90,11 @@ def test_wrong_override_names_the_field(setting, message):
         ("transfer.width", ["transfer.widths", "model.width"]),
         ("frame", ["model.frames"]),
         ("mesh.data", ["execution.mesh.data"]),
+        ("lr", ["train.optimizer.learning_rate", "tokenizer_train.learning_rate"]),
+        ("train.lr", ["train.optimizer.learning_rate"]),
+        ("batch_size", ["train.batch", "eval.batch", "tokenizer_train.batch"]),
+        ("train.num_steps", ["train.steps"]),
+        ("seed", ["seeds", "eval.seed", "tokenizer_train.seed", "suite.seed"]),
     ],
 )
 def test_unknown_setting_suggests_what_was_meant(path, meant):
@@ -96,7 +102,9 @@ def test_unknown_setting_suggests_what_was_meant(path, meant):
         override(SMOKE, [f"{path}=1"])
 
 
-@pytest.mark.parametrize(("path", "around"), [("foo", "a study has name, model.*,"), ("train.lr", "train has steps,")])
+@pytest.mark.parametrize(
+    ("path", "around"), [("foo", "a study has name, model.*,"), ("train.epochs", "train has steps,")]
+)
 def test_unknown_setting_like_no_other_lists_those_around_it_only(path, around):
     with pytest.raises(ConfigError) as refusal:
         override(CPU, [f"{path}=1"])

@@ -56,6 +56,13 @@ def test_the_settings_of_a_group_are_shown_as_those_before_change_them(capsys):
     assert line[1] == "3"
 
 
+def test_a_setting_that_every_value_is_refused_of_is_not_offered(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--set", "help"])
+    said = capsys.readouterr().out
+    assert "eval.seed" in said and not re.search(r" train\.seed", said)
+
+
 def test_a_group_that_there_is_not_is_an_error(capsys):
     assert main(["study", "--preset", "smoke", "--set", "modle.help"]) == 2
     assert "--set modle.help: no such setting; a study has name, model.*" in capsys.readouterr().err

@@ -97,6 +97,15 @@ def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch,
     assert not list(tmp_path.iterdir())
 
 
+def test_settings_that_one_model_does_not_have_are_told(tmp_path, capsys):
+    dry = ["train", "--preset", "smoke", "--dry-run", "--out", str(tmp_path), "--set", "train.steps=5"]
+    assert main([*dry, "--set", "seeds=1"]) == 0 and "note: " not in capsys.readouterr().out
+    assert main([*dry, *"--set seeds=1,2 --set widths=8 --set designs.judged=1 --set axes=width".split()]) == 0
+    assert (
+        "note: one model is trained, of seed 1; without effect: seeds beyond the first, widths, designs.judged, axes\n"
+    ) in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("command", "gpus"), [("train", ()), ("adapt", ()), ("sweep", ("0",)), ("sweep", ())], ids=lambda x: x or "cpu"
 )
