@@ -52,6 +52,9 @@ FEW, MOST, CONTROL, ALL, PASSIVE = 0, 3, 4, 5, 6
 """Indices in `CONDITIONS` of those that shares of the gap are computed from."""
 
 
+UNKNOWN = Interval(math.nan, math.nan, math.nan, math.nan)
+
+
 def tried_conditions(trials: Trials) -> list[int]:
     """Indices of the conditions that were tried: all, or all but PASSIVE."""
     return [i for i in range(len(CONDITIONS)) if i != PASSIVE or any(place == PASSIVE for place, _ in trials)]
@@ -70,25 +73,25 @@ def share_closed(panel: Panel, at: int) -> Interval:
 
     The interval is Fieller's (1954, JRSS B 16): the shares r for which `at` - few - r (all - few), a mean with the
     interval of `bootstrap_intervals`, does not differ from zero. That is no interval, and (nan, nan), unless the gap
-    itself differs from zero; with three seeds a percentile interval of the ratio would cover it 75 times in 100.
+    itself differs from zero; with three seeds a percentile interval of the ratio would cover it 75 times in 100. Nor is
+    there one where nothing scatters, nor a share where no seed has all three conditions: a run may be under way.
     """
-
-    def minus(i: int, j: int) -> Panel:
-        return replace(panel, points=(panel.points[i],), seeds=(panel.seeds[i],)).minus(
-            replace(panel, points=(panel.points[j],), seeds=(panel.seeds[j],))
-        )
-
-    closed, gap = minus(at, FEW), minus(ALL, FEW)
+    seeds = tuple(s for s in panel.seeds[FEW] if s in panel.seeds[at] and s in panel.seeds[ALL])
+    if not seeds:
+        return UNKNOWN
+    few, some, every = (panel.points[i][[panel.seeds[i].index(s) for s in seeds]] for i in (FEW, at, ALL))
+    closed, gap = some - few, every - few
     r = np.array([-1.0, 0.0, 1.0])
-    apart = tuple(closed.points[0] - share * gap.points[0] for share in r)
-    intervals = bootstrap_intervals(replace(closed, points=apart, seeds=closed.seeds * len(r)), 2000)
+    apart = tuple(closed - share * gap for share in r)
+    intervals = bootstrap_intervals(replace(panel, points=apart, seeds=(seeds,) * len(r)), 2000)
     # The squared half-width is a quadratic in r, which three shares determine; so is the squared mean.
     half = np.polyfit(r, [((i.high - i.low) / 2) ** 2 for i in intervals], 2)
-    whole, part = float(gap.points[0].mean()), float(closed.points[0].mean())
+    whole, part = float(gap.mean()), float(closed.mean())
     quadratic = np.array([whole**2, -2 * whole * part, part**2]) - half
     if abs(whole) < 1e-9:  # there is no gap
-        return Interval(math.nan, math.nan, math.nan, math.nan)
-    low, high = np.sort(np.roots(quadratic)) if quadratic[0] > 0 else (math.nan, math.nan)
+        return UNKNOWN
+    bounded = quadratic[0] > 0 and np.polyval(half, part / whole) > 1e-12
+    low, high = np.sort(np.roots(quadratic)) if bounded else (math.nan, math.nan)
     return Interval(part / whole, math.nan, float(low), float(high))
 
 

@@ -101,6 +101,26 @@ def test_the_share_of_the_gap_is_that_of_the_means():
     assert np.isfinite(alike.mean) and np.isnan([alike.low, alike.high]).all()
 
 
+def test_the_share_of_the_gap_is_that_of_the_seeds_that_all_have():
+    """A run may be under way, or have been continued with more seeds."""
+    rng, rates = np.random.default_rng(0), {FEW: 0.2, MOST: 0.7, ALL: 0.8}
+    trials = {(i, s): {"success": rng.random(400) < rates.get(i, 0.5)} for i in range(6) for s in range(4)}
+    some = {at: trial for at, trial in trials.items() if at not in ((MOST, 3), (ALL, 0))}
+    found, expected = (share_closed(conditions.make_panel(t, s), MOST) for t, s in ((some, range(4)), (trials, (1, 2))))
+    assert found == expected and np.isfinite([found.low, found.high]).all()
+    alone = {MOST: 3, ALL: 0}
+    none = {(i, s): trial for (i, s), trial in trials.items() if s == alone.get(i, s)}
+    assert np.isnan(share_closed(conditions.make_panel(none, tuple(range(4))), MOST).mean)
+
+
+def test_a_share_without_any_scatter_has_no_interval(recwarn):
+    """Ten recordings never succeed, nor do generated ones beside them; a hundred mostly do: no spread is known."""
+    rng = np.random.default_rng(0)
+    trials = {(i, s): {"success": rng.random(20) < 0.9 * (i == ALL)} for i in range(6) for s in range(3)}
+    share = share_closed(conditions.make_panel(trials, (0, 1, 2)), MOST)
+    assert share.mean == 0 and np.isnan([share.low, share.high]).all() and not recwarn.list
+
+
 def test_policies_that_never_succeed_are_no_certainty_and_leave_no_gap_to_close(recwarn):
     trials = {(i, s): {"success": np.full(20, i == MOST), "distance": np.zeros(20)} for i in range(6) for s in (0, 1)}
     found = conditions.summarise(trials, (0, 1))
