@@ -25,7 +25,7 @@ class JudgeConfig:
     batch: int = 50  # episodes at once
     seed: int = 0
     demonstrations: int = 3000
-    demonstration_frames: int = 12  # as many as the task has, where the goal is held for longer than these
+    demonstration_frames: int = 12  # as many as the task has, where the goal is held for more than half of these
     noise: tuple[float, ...] = (0.0, 0.1)  # of the expert that is cloned
     ladder: LadderConfig = field(default_factory=LadderConfig)
     head: HeadConfig = field(default_factory=HeadConfig)

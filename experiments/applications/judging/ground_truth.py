@@ -81,8 +81,10 @@ class SimulatedTruth:
 
     def demonstrations(self) -> Demonstrations:
         config, task = self.config, self.config.task
-        if task.hold <= config.demonstration_frames:  # none that is shorter can succeed
-            task = replace(task, frames=config.demonstration_frames)
+        frames = config.demonstration_frames
+        if task.hold > frames // 2:  # too few would be left to reach the goal in
+            frames = max(frames, task.frames)
+        task = replace(task, frames=frames)
         with self._step(f"record {config.demonstrations} demonstrations"):
             made = record(
                 task,

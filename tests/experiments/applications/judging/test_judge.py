@@ -78,9 +78,9 @@ def test_what_is_too_little_to_judge_by_is_refused_before_policies_are_trained(n
         replace(ASKED, **{name: least - 1})
 
 
-@pytest.mark.parametrize(("hold", "frames"), [(4, 4), (5, 6)])
-def test_demonstrations_are_as_long_as_the_task_where_the_goal_is_held_longer_than_they_are(hold, frames):
-    task = find_task("gripper_wood", frames=6, hold=hold)
+@pytest.mark.parametrize(("hold", "lasts", "frames"), [(2, 6, 4), (3, 6, 6), (5, 6, 6), (3, 3, 4)])
+def test_demonstrations_are_as_long_as_the_task_where_little_is_left_of_them_to_reach_the_goal(hold, lasts, frames):
+    task = find_task("gripper_wood", frames=lasts, hold=hold)
     robot = SimpleNamespace(name="gripper_wood", action_dim=4, stride=1)
     learned = SimpleNamespace(tokenizer=SimpleNamespace(image_size=8))
     made = SimulatedTruth(replace(ASKED, task=task), robot, learned, step).demonstrations()
