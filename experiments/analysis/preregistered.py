@@ -19,18 +19,10 @@ from experiments.rows import OVERALL, Row, curve, difference
 from experiments.sweeps.registry import AXES
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.config import ConfigError, require
+from hma_jax.evaluation.summary import METRICS
 
 FILE = "preregistered.csv"
 """In the folder of predictions, beside the sealed ones of fits."""
-
-METRICS = (
-    "cross_entropy", "perplexity", "perplexity_corpus", "accuracy", "diffusion_loss",
-    "psnr", "psnr_last", "psnr_copy", "psnr_random", "delta_psnr", "ssim", "lpips", "lpips_copy",
-    "action_nats", "retrieval", "retrieval_rank", "retrieval_chance",
-    "counterfactual_psnr", "counterfactual_copy", "counterfactual_gain",
-    "action_error", "action_error_of_mean", "action_gain",
-)  # fmt: skip
-"""All that trials measure; which of them depends on the model, its training and the evaluation's settings."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,13 @@ from hma_jax.evaluation.statistics import (
 )
 from hma_jax.evaluation.windows import WindowTable
 
+METRICS = (
+    "cross_entropy", "perplexity", "perplexity_corpus", "accuracy", "diffusion_loss",
+    "psnr", "psnr_last", "psnr_copy", "psnr_random", "delta_psnr", "ssim", "lpips", "lpips_copy",
+    *OPTIONAL_METRICS,
+)  # fmt: skip
+"""All that an evaluation may measure; which ones depends on the model, its training and the evaluation's settings."""
+
 
 @dataclass(frozen=True)
 class Summary:

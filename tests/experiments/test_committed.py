@@ -12,7 +12,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from experiments.analysis.preregistered import METRICS
 from experiments.applications import DRIVEN
 from experiments.presets import PRESETS
 from experiments.report.draw import draw_again
@@ -20,6 +19,7 @@ from experiments.rows import TRAINING
 from experiments.running.ledger import FINISHED
 from experiments.running.sealed import read_result
 from experiments.running.workspace import Workspace
+from hma_jax.evaluation.summary import METRICS
 from hma_jax.training.runs import load_run
 from tests.experiments.committed_findings import rows_of
 
