@@ -68,16 +68,16 @@ def train_model(
     shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0)
 
     rows = len(own_rows(device_mesh, config.batch))
-    # Neither the seed nor the robots' statistics are constants of the program, so that runs of others share it. With
+    # Neither the seed nor the robots' statistics are constants of the programs, so that runs of others share them. With
     # action heads the statistics are: the loss would have other last bits if its targets came normalised.
     scale, known = (None, table) if model.action_heads else (table.scale(), table.standardised())
 
     def put(batch: Any) -> Any:
-        return put_batch(batch, device_mesh)
+        return put_batch(batch if scale is None else _normalised(batch, scale), device_mesh)
 
     def put_checked(batch: Any) -> Any:
         check_batch(batch, rows, model, table)
-        return put(batch if scale is None else _normalised(batch, scale)) | {"seed": seed}
+        return put(batch) | {"seed": seed}
 
     def modernised(described: dict[str, Any]) -> dict[str, Any]:
         today = modernise(described)
@@ -109,7 +109,7 @@ def train_model(
                 peak_flops=peak_flops(execution.dtype),
                 may_change=extendable,
             ),
-            validation=validation and make_validation_hook(validation, model, table, config.masking, execution, put),
+            validation=validation and make_validation_hook(validation, model, known, config.masking, execution, put),
             progress=progress,
         )
 

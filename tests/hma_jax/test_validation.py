@@ -12,9 +12,11 @@ import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig
 from hma_jax.model.hma import declare_model
+from hma_jax.training import validation
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
 from hma_jax.training.validation import Validation, make_sums, make_validation_hook
+from tests.hma_jax.test_training import other_statistics
 from tests.tiny import (
     DIFFUSION,
     SMALLER,
@@ -67,6 +69,30 @@ def test_the_next_run_of_a_process_is_watched_by_the_same_program(tmp_path: Path
     assert not compiled, f"{len(compiled)} programs were compiled again"
     jax.jit(lambda x: x + len(compiled))(np.float32(1))
     assert compiled, "the listener hears nothing"
+
+
+def test_runs_that_differ_in_the_statistics_of_actions_are_watched_by_the_same_program(monkeypatch):
+    """A sweep over how many trajectories there are compiled the held-out loss of every run anew."""
+    model, measured = replace(MODEL, action_heads=False), []
+
+    def measure_only(step, shapes, init, make, *, validation, **kwargs):
+        measured.append(validation.measure(init())["loss"])
+
+    monkeypatch.setattr("hma_jax.training.train.fit", measure_only)
+    tables = TABLE, other_statistics(TABLE)
+    for table in tables:
+        train_model(
+            model, table, train_config(batch=4), batches(model, 4), run_dir="never written", provenance={},
+            validation=Validation(2, held_out),
+        )  # fmt: skip
+    assert validation._jitted_sums.cache_info().misses == 1
+    for table, loss in zip(tables, measured, strict=True):
+        declared, params = declare_model(model, table), declare_model(model, table).init(0)
+        sums = jax.jit(make_sums(declared, table, model, train_config().masking))
+        found = [sums(params, batch | {"valid": np.ones(4, bool)}, np.int32(n)) for n, batch in enumerate(held_out())]
+        want = sum(float(sums.tokens) for sums, _ in found) / sum(int(counts.tokens) for _, counts in found)
+        assert loss == pytest.approx(want, rel=1e-6)
+    assert measured[0] != measured[1]
 
 
 @pytest.mark.parametrize(
