@@ -200,8 +200,8 @@ def _finished(final: Path, fingerprint: str, source: ConvertibleSource, name: st
     metadata, lengths = read_metadata(final), shard_lengths(final)
     require(
         metadata.get(FINGERPRINT) == fingerprint and bool(lengths),
-        f"{final} exists already and was made from another source or with other settings; choose another --name or "
-        "--out, or remove it",
+        f"{final} exists already and was made from another source, with other settings or by an earlier version; choose "
+        "another --name or --out, or remove it",
     )
     if (final / JOURNAL).exists():  # that run was killed in its last moment
         (final / JOURNAL).unlink(missing_ok=True)

@@ -23,6 +23,9 @@ from hma_jax.training.run_lock import CHECKPOINTS
 
 IMAGE, ACTION = "observation/image", "action"
 
+GENERATOR_VERSION = 2
+"""Raise it when other bytes are generated from the same model and recordings."""
+
 SHARD_BYTES = 2**21
 """A shard ends with the batch that reaches this size: what a killed run loses at most, some hundred frames."""
 
@@ -61,6 +64,7 @@ class GeneratedSource:
         """What made the dataset: everything that its bytes depend on."""
         return {
             "generated": True,
+            "version": GENERATOR_VERSION,
             "robot": self._robot.name,
             "range": [list(self._robot.low), list(self._robot.high)],  # actions beyond it are clipped
             "stride": self._robot.stride,

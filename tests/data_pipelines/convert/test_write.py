@@ -154,7 +154,7 @@ def test_killed_after_it_published_it_leaves_nothing_more(tmp_path, monkeypatch)
 def test_a_second_run_does_nothing_and_another_source_is_refused(tmp_path):
     first = convert(Counting(), tmp_path, "toy")
     assert convert(Counting(stop_at=0), tmp_path, "toy") == first
-    with pytest.raises(ConfigError, match="exists already and was made from another source or with other settings"):
+    with pytest.raises(ConfigError, match="exists already and was made from another source, with other settings"):
         convert(Counting(salt=1), tmp_path, "toy")
 
 

@@ -103,7 +103,19 @@ def test_what_was_made_under_other_ranges_of_actions_is_not_taken_for_the_same(r
         assert generate(run, recorded, tmp_path, "--episodes", "1") == 2
     finally:
         (run / "robots.json").unlink()
-    assert "was made from another source or with other settings" in " ".join(capsys.readouterr().err.split())
+    assert "was made from another source, with other settings or by an earlier version" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_what_a_version_of_before_began_is_not_finished_with_other_bytes(run, recorded, monkeypatch):
+    """It had no instructions, and what came after it had some."""
+    simulator = load_simulator(run)
+    driven, _ = open_trajectories(str(recorded), "val", ROBOT, {}, simulator.tokenizer, run)
+    source = source_module.GeneratedSource(simulator, ROBOT, driven, given=1, count=1, seed=0, checkpoint="")
+    now = source.identity()
+    monkeypatch.setattr(source_module, "GENERATOR_VERSION", source_module.GENERATOR_VERSION - 1)
+    assert source.identity() != now
 
 
 def test_the_rate_is_the_recordings_where_the_run_does_not_know_it(tmp_path):
