@@ -1,5 +1,5 @@
-"""What a person with data of their own should know before hours pass: how large a model is trained, and on how much of
-the data."""
+"""What a person with data of their own should know before hours pass: how large a model is trained, on how much of
+the data, and where its tokenizer is trained."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ from dataclasses import replace
 from experiments.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.progress import say
+from experiments.running.launchers.registry import LauncherOptions
+from experiments.running.slots import find_accelerators
 from experiments.running.trial import Trial
 from experiments.setting import Setting
 from experiments.study import Study, most_trajectories
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.sweep import Sweep
 from experiments.words import counted, few, in_thousands
+
+PROCESSOR = 1e12
+"""FLOP/s of one device that no processor sustains: a study with more is made for accelerators."""
 
 
 def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
@@ -35,6 +40,18 @@ def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
         f"{width} pixels, for {longest} of {counted(widest.train.batch, 'window')}, with {most} "
         f"trajectories of each dataset{advice}"
     )
+
+
+def say_prepared_here(setting: Setting, launcher_options: LauncherOptions) -> None:
+    """A line where a study for accelerators trains its tokenizer on this machine without one, while its trials run on
+    others."""
+    elsewhere = launcher_options.name != "local" and setting.study.flops_per_second >= PROCESSOR
+    made = setting.tokenizer is not None or setting.workspace.tokenizer.exists()
+    if elsewhere and not made and find_accelerators() is None:
+        say(
+            "note: the tokenizer would be trained on this machine, where no accelerator is found, for much longer than a "
+            f"dry run says. First run, on a machine that has one: {setting.command('tokenizer train')}"
+        )
 
 
 def say_points(setting: Setting, sweeps: Sequence[Sweep]) -> None:

@@ -80,7 +80,7 @@ def _run(
         from experiments.done import find_done
         from experiments.plan_table import Devices, plan_table
         from experiments.preparing.sources import check_entries
-        from experiments.scale import say_points, say_scale, say_unused
+        from experiments.scale import say_points, say_prepared_here, say_scale, say_unused
         from experiments.trainable import check_launched
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
@@ -93,6 +93,7 @@ def _run(
             say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
             say_unused(setting.study)
             say_points(setting, sweeps)
+        say_prepared_here(setting, launcher_options)
         return
     from experiments.run_study import run_study
 

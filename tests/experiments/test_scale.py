@@ -13,6 +13,7 @@ from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
 from experiments.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, PRESETS
+from experiments.running.slots import Accelerators
 from experiments.running.workspace import Workspace
 from experiments.scale import say_scale
 from experiments.setting import Setting, StudyArguments
@@ -139,6 +140,32 @@ def test_what_is_made_for_an_accelerator_names_no_other(data, capsys, tmp_path, 
     monkeypatch.setattr("experiments.plan_table.plan_table", lambda *_, **__: "")
     first, *_ = said_by(capsys, "study", "--dry-run", "--preset", "accelerator", *data, "--out", str(tmp_path))
     assert "for 20,000 steps of 64 windows, with at most 1,000 trajectories" in first and first.endswith("each dataset")
+
+
+def test_a_tokenizer_that_would_be_trained_without_the_accelerators_of_the_trials_is_told(
+    data, capsys, tmp_path, monkeypatch
+):
+    """`--launcher slurm` on a login node: the dry run prices hours of the processor as minutes of a GPU."""
+    monkeypatch.setattr("experiments.plan_table.plan_table", lambda *_, **__: "")
+    monkeypatch.setattr("experiments.scale.find_accelerators", lambda: None)
+    out = tmp_path / "out"
+
+    def told(preset: str, launcher: str) -> list[str]:
+        words = ("study", "--dry-run", "--preset", preset, *data, "--out", str(out), "--launcher", launcher)
+        return [line for line in said_by(capsys, *words) if "no accelerator" in line]
+
+    (note,) = told("accelerator", "slurm")
+    assert note.startswith(
+        "note: the tokenizer would be trained on this machine, where no accelerator is found, for much longer than a dry "
+        "run says. First run, on a machine that has one: hma tokenizer train --preset accelerator "
+    )
+    assert note.endswith(f"--registry {data[-1]}")
+    assert not told("accelerator", "local") and not told("cpu", "slurm")
+    (out / "tokenizer").mkdir(parents=True)
+    assert not told("accelerator", "slurm")
+    out = tmp_path / "other"
+    monkeypatch.setattr("experiments.scale.find_accelerators", lambda: Accelerators("gpu", ("0",)))
+    assert not told("accelerator", "slurm")
 
 
 def test_the_simulated_suite_needs_no_such_note(capsys, tmp_path):
