@@ -5,11 +5,15 @@ Owns the choice of the format. A new format is one more source and one line here
 
 from __future__ import annotations
 
+import difflib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from data_pipelines.errors import MAX_LISTED, DataError, UnreachableError
 from data_pipelines.sources.joined import JoinedSource, Parts
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
+from data_pipelines.sources.rlds.schema import resolve_version
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
 
@@ -20,16 +24,57 @@ HDF5 = (".hdf5", ".h5")
 
 
 def find_format(location: str | Location) -> str:
-    """'rlds', 'lerobot' or 'robomimic', by the files at `location`; 'rlds' if there are none."""
+    """'rlds', 'lerobot' or 'robomimic', by the files at `location`; 'rlds' for every other URL.
+
+    Raises DataError for a path on a disk that is no dataset, and says what may have been meant.
+    """
     place = locate(location)
-    if place.suffix in HDF5 and not place.is_dir():
-        found = "robomimic"
-    elif (place / "meta" / "info.json").is_file():
-        found = "lerobot"
-    else:
-        return "rlds"
-    require(not is_remote(place), f"{place}: {found} can be read only from a disk. Copy the dataset to a disk.")
+    found = _signs(place)
+    if found == "rlds" and isinstance(place, Path):
+        try:
+            resolve_version(place)
+        except UnreachableError:
+            raise
+        except DataError as error:
+            raise DataError(f"{error}{_meant(place)}") from error
+    require(
+        found == "rlds" or not is_remote(place),
+        f"{place}: {found} can be read only from a disk. Copy the dataset to a disk.",
+    )
     return found
+
+
+def _signs(place: Location) -> str:
+    """The format that the files at `place` have signs of, 'rlds' if there are none."""
+    if place.suffix in HDF5 and not place.is_dir():
+        return "robomimic"
+    return "lerobot" if (place / "meta" / "info.json").is_file() else "rlds"
+
+
+def _meant(place: Path) -> str:
+    """The end of a message about a path that is no dataset: what to give instead, or what is missing there."""
+    try:
+        if not place.is_dir():
+            close = difflib.get_close_matches(place.name, [p.name for p in place.parent.iterdir()], n=1)
+            return f" Closest: {place.parent / close[0]}" if close else ""
+        inside = sorted(place.iterdir())
+        datasets = [str(p) for p in inside if _is_dataset(p)]
+    except OSError:  # a missing parent, or one that may not be read
+        return ""
+    if len({"meta", "data", "videos"} & {p.name for p in inside}) > 1:
+        return f" If it is a LeRobot dataset that was copied in part, copy {place / 'meta' / 'info.json'} too"
+    more = f" and {len(datasets) - MAX_LISTED} more" if len(datasets) > MAX_LISTED else ""
+    return f" Datasets in it: {', '.join(datasets[:MAX_LISTED])}{more}" if datasets else ""
+
+
+def _is_dataset(place: Path) -> bool:
+    if _signs(place) != "rlds":
+        return True
+    try:
+        resolve_version(place)
+    except DataError:
+        return False
+    return True
 
 
 def open_source(

@@ -23,6 +23,7 @@ from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from data_pipelines.sources.rlds.schema import DATASETS
 from data_pipelines.tokens import tokenize_job
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
@@ -575,7 +576,7 @@ def hma(*arguments: object) -> tuple[int, str]:
 def test_the_process_says_the_same(tmp_path):
     code, said = hma("tokenize", *SMOKE, "--out", tmp_path / "out", "--data", tmp_path / "none")
     assert code == 1
-    assert said == f"error: {tmp_path / 'none'}: no such directory. Give the path of an RLDS dataset.\n"
+    assert said == f"error: {tmp_path / 'none'}: no such directory. Give {DATASETS}.\n"
 
 
 def test_background_readers_of_a_damaged_checkpoint_stay_silent(study, tmp_path):

@@ -29,6 +29,12 @@ TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 MAX_SHARDS = 2**15
 """Shards of one split."""
 
+DATASETS = (
+    "the directory of an RLDS dataset, <name> or <name>/<version> as tfds wrote it, the root of a LeRobot dataset, or a "
+    "robomimic .hdf5 file"
+)
+"""What a location may be, for messages: RLDS is what others are taken for."""
+
 ADVICE = "Restore the file as tfds wrote it."
 
 FILE_FORMATS = ("tfrecord", "array_record")
@@ -90,7 +96,7 @@ def resolve_version(directory: str | Location) -> Location:
     directory = locate(directory)
     if not exists(directory, "directory"):
         what = "it is a file, not a directory" if exists(directory, "file") else "no such directory"
-        raise DataError(f"{directory}: {what}. Give the path of an RLDS dataset.")
+        raise DataError(f"{directory}: {what}. Give {DATASETS}.")
     if _has_info(directory):
         return directory
     inside = retry(directory, lambda: list(directory.iterdir()))
@@ -99,9 +105,8 @@ def resolve_version(directory: str | Location) -> Location:
         return max(versions, key=lambda d: tuple(map(int, d.name.split("."))))
     entries = sorted(p.name for p in inside)
     raise DataError(
-        f"{directory} is not an RLDS dataset: neither it nor a version directory in it, such as 1.0.0, has a "
-        f"dataset_info.json (it holds {listing(entries[:6]) or 'nothing'}). Give the directory that tfds wrote, "
-        "<name> or <name>/<version>."
+        f"{directory} is no dataset: neither it nor a version directory in it, such as 1.0.0, has a dataset_info.json, "
+        f"and it has no meta/info.json (it holds {listing(entries[:6]) or 'nothing'}). Give {DATASETS}."
     )
 
 

@@ -402,6 +402,23 @@ def test_a_disk_that_fails_is_no_damage_of_a_video(tmp_path, monkeypatch):
     assert source.episode(0, TOP.image_key, ()).steps == 12
 
 
+def test_what_is_no_dataset_is_told_with_what_to_give_instead(tmp_path):
+    """It spoke of RLDS only, also to those who have LeRobot or robomimic data."""
+    arm = write_lerobot(tmp_path / "toy-arm", "v2.1", lengths=(5,), camera="image")
+    (tmp_path / "demos").mkdir()
+    lift = write_robomimic(tmp_path / "demos" / "lift.hdf5")
+    toy = write_rlds(tmp_path, make_spec(), [5]).parent
+    with pytest.raises(DataError, match=f"^{tmp_path}/toy-arn: no such directory.*LeRobot.* Closest: {arm}$"):
+        open_source(tmp_path / "toy-arn")
+    with pytest.raises(DataError, match=f"^{tmp_path} is no dataset.* Datasets in it: {toy}, {arm}$"):
+        open_source(tmp_path)
+    with pytest.raises(DataError, match=f"/demos is no dataset.* Datasets in it: {lift}$"):
+        open_source(tmp_path / "demos")
+    (arm / "meta" / "info.json").unlink()
+    with pytest.raises(DataError, match=f"/toy-arm is no dataset.* copy {arm}/meta/info.json too$"):
+        open_source(arm)
+
+
 def test_what_is_no_dataset_is_named(tmp_path):
     with pytest.raises(DataError, match="no such directory"):
         open_source(tmp_path / "absent")
