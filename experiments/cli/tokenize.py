@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.markup import escape
 from tyro.conf import arg
@@ -23,6 +24,9 @@ from hma_jax.config import require
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Lock
+
+if TYPE_CHECKING:
+    from experiments.preparing.sources import Source
 
 ASKED = ".asked.json"
 """What the process that holds a directory was asked to make in it."""
@@ -135,10 +139,10 @@ def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | N
     require_same_tokenizer(setting.tokenizer, study, workspace, sources)
     console.print(f"sharing the work with {busy.who}, which prepares {short(workspace.root)}", soft_wrap=True)
     make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)
-    _freeze(setting)
+    _freeze(setting, sources)
 
 
-def _freeze(setting: Setting) -> None:
+def _freeze(setting: Setting, sources: Sequence[Source]) -> None:
     """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
     from data_pipelines.publishing.output_lock import backoff
     from experiments.preparing.tokenizer import adopt_tokenizer
@@ -149,7 +153,7 @@ def _freeze(setting: Setting) -> None:
         try:
             with workspace.locked():
                 if setting.tokenizer is not None:
-                    adopt_tokenizer(setting.tokenizer, study, workspace)
+                    adopt_tokenizer(setting.tokenizer, study, workspace, sources)
                 freeze_windows(study, workspace)
             return
         except Busy as busy:

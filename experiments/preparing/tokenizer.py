@@ -164,7 +164,7 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
 
 
 def adopt_tokenizer(
-    source: Path, study: Study, workspace: Workspace, sources: Sequence[Source] = (), replace: Step | None = None
+    source: Path, study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
 ) -> None:
     """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already. A note says
     of which `sources` it may know held-out frames.
@@ -229,11 +229,11 @@ def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study, sources
             f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it "
             "may have been trained on frames that are held out here"
         )
-    shards = {name: facts.get("shards") for name, facts in inputs.get("data", {}).items()}
+    shards = {name: facts["shards"] for name, facts in inputs.get("data", {}).items() if facts.get("shards")}
     changed = [
         spec.name
         for spec, path in sources
-        if shards.get(spec.name) not in (None, open_source((spec, path), study.store).fingerprint())
+        if spec.name in shards and shards[spec.name] != open_source((spec, path), study.store).fingerprint()
     ]
     if changed:
         say(

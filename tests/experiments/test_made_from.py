@@ -21,7 +21,9 @@ from experiments.preparing.made_from import (
     may_replace,
     read_stamp,
 )
+from experiments.preparing.sources import find_sources
 from experiments.running.closure import trace
+from experiments.setting import StudyArguments, make_setting
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
@@ -197,6 +199,18 @@ def test_a_given_tokenizer_that_may_have_seen_what_is_held_out_is_told(min_val, 
     assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "new"), *data, *given]) == 0
     said = capsys.readouterr().out
     assert ("frames that are held out here" in said) == bool(told) and (told or "") in said
+
+
+def test_no_dataset_is_opened_for_a_given_tokenizer_that_knows_none_of_them(made, tmp_path, monkeypatch):
+    """Each was read whole, for a note that could not come."""
+    there, data = made
+    tokenizer = shutil.copytree(there / "tokenizer", tmp_path / "tokenizer")
+    (tokenizer / STAMP).unlink()
+    setting = make_setting(StudyArguments("smoke", tmp_path / "new", tuple(data[1:])))
+    found = find_sources(setting.study, setting.data)
+    monkeypatch.setattr(tokenizer_step, "open_source", lambda *_: pytest.fail("opened"))
+    tokenizer_step.adopt_tokenizer(tokenizer, setting.study, setting.workspace, found)
+    assert setting.workspace.tokenizer.is_dir()
 
 
 def test_the_tokenizer_that_is_there_can_be_given(hma, out):

@@ -120,7 +120,7 @@ def test_who_joins_needs_a_tokenizer_and_replaces_nothing(data, tokenizer, tmp_p
 
 
 def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli_tokenize, "_freeze", lambda _: stop())  # which would wait for the holder
+    monkeypatch.setattr(cli_tokenize, "_freeze", lambda *_: stop())  # which would wait for the holder
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path)]
     shutil.copytree(tokenizer[1], tmp_path / "tokenizer")  # trained on both datasets
     setting = make_setting(StudyArguments("smoke", tmp_path, tuple(data[1:])))
