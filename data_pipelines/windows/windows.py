@@ -103,10 +103,14 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
             f"there is no {split} episode for windows. {reasons}. Of a single episode none can be held out: add more. "
             "With several, store.val_fraction, store.min_val and store.max_val set how many are held out."
         )
-    shorter = " or a shorter prompt" if any(s.min_real > MIN_TRAIN_FRAMES for s in sets.values()) else ""
+    settings = []
+    if any(s.slicer.stride > 1 for s in sets.values()):
+        settings.append("a higher frame rate (--set rate=HZ)")
+    if any(s.min_real > MIN_TRAIN_FRAMES for s in sets.values()):
+        settings.append("a shorter prompt (--set eval.prompt_frames=N)")
+    add = f"Set {' or '.join(settings)}, or add" if settings else "Add"
     raise DataError(
-        f"no {split} episode is long enough for a window. {reasons}. Use a higher frame rate{shorter}, or datasets "
-        "with more or longer episodes."
+        f"no {split} episode is long enough for a window. {reasons}. {add} datasets with more or longer episodes."
     )
 
 

@@ -41,6 +41,7 @@ def make_store(
     made_with, settings = load_tokenizer(tokenizer or workspace.tokenizer), to_dict(study.store)
     require_same("tokens", workspace.store, _differences(study, workspace, sources, made_with), replace)
     _say_other_rates(study, sources)
+    say_unreached_rates(study, sources)
     how = {k: v for k, v in (("batch", batch), ("threads", threads)) if v is not None}
     workspace.store.mkdir(parents=True, exist_ok=True)
 
@@ -87,6 +88,14 @@ def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
                 f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "
                 "if the files are right, correct the entry"
             )
+
+
+def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
+    """Names the datasets that were recorded at a lower rate than frames are asked for at."""
+    asked = ((spec, spec.rate or study.rate) for spec, _ in sources)
+    slow = [f"{s.name} ({s.hz:g} Hz, not {rate:g})" for s, rate in asked if rate and rate > s.rate_for(1)]
+    if slow:
+        say(f"note: a rate above that of the recording is not reached, every frame is taken: {few(slow)}")
 
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:

@@ -21,11 +21,13 @@ from experiments.cli import tokenize as cli_tokenize
 from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import sources
+from experiments.preparing.store import say_unreached_rates
 from experiments.progress import Eta
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting
 from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
 from tests.data_pipelines.tokens.job_process import contents
+from tests.experiments.fakes import STUDY
 from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
 
 
@@ -183,6 +185,18 @@ def test_the_stride_that_is_told_is_the_studys(rate, stride, tmp_path, capsys):
     show_store(Workspace(tmp_path), rate)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if spec.name in line]
     assert line.split()[-2:] == ["10", stride]
+
+
+def test_a_rate_above_the_recording_s_is_told(capsys):
+    """Every frame is taken then, without a word, and the note names those of which it is true."""
+    slow, own, fast = (replace(ARM, name=n, hz=hz) for n, hz in (("slow", 10.0), ("own", 20 / 3), ("fast", 50.0)))
+    sources = [(slow, Path("none")), (replace(own, rate=6.66667), Path("none")), (fast, Path("none"))]
+    say_unreached_rates(replace(STUDY, rate=50.0), sources)
+    assert capsys.readouterr().out == (
+        "note: a rate above that of the recording is not reached, every frame is taken: slow (10 Hz, not 50)\n"
+    )
+    say_unreached_rates(replace(STUDY, rate=None), sources)
+    assert not capsys.readouterr().out
 
 
 def test_of_many_losses_some_are_named(tmp_path, capsys):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -115,6 +116,22 @@ def test_nothing_long_enough_says_what_is_needed():
     ):
         require_windows({"toy": windows})
     assert len(train_windows(OneDataset([2, 4], hz=4), "toy", 12)) == 1
+
+
+@pytest.mark.parametrize(
+    "hz, min_real, advice",
+    [
+        (4, 5, "Set a higher frame rate (--set rate=HZ) or a shorter prompt (--set eval.prompt_frames=N), or add"),
+        (4, 2, "Set a higher frame rate (--set rate=HZ), or add datasets with more or longer episodes."),
+        (2, 5, "Set a shorter prompt (--set eval.prompt_frames=N), or add datasets"),
+        (2, 2, "Add datasets with more or longer episodes."),
+    ],
+)
+def test_nothing_long_enough_names_the_settings_that_would_help(hz, min_real, advice):
+    """At stride 1 every frame is taken already, and training needs no prompt."""
+    windows = train_windows(OneDataset([1, 1], hz=hz), "toy", 12, min_real=min_real)
+    with pytest.raises(DataError, match=re.escape(f". {advice}")):
+        require_windows({"toy": windows})
 
 
 def test_a_dataset_without_episodes_is_not_a_crash():
