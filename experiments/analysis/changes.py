@@ -1,6 +1,6 @@
-"""The difference between the two ends of an axis, window by window.
+"""The difference between the two ends of an axis, or of a variant from the default, window by window.
 
-The trials at both ends were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
+Trials of both sides were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
 robots are judged that are others for every seed, each seed's difference is taken on its own robots, and the error is
 over seeds.
 """
@@ -21,6 +21,7 @@ from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.evaluation.windows import WindowTable
 
 METRICS = ("cross_entropy", "action_nats", "delta_psnr")
+OF_VARIANTS = ("cross_entropy", "diffusion_loss", "delta_psnr", "action_error")
 
 
 @dataclass(frozen=True)
@@ -53,16 +54,36 @@ def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mappi
     return found
 
 
+def find_differences(
+    sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
+) -> list[Change]:
+    """Of every variant of an axis of names, `last`, from its default, `first`. Raises NotComparable."""
+    found = []
+    for sweep in (s for s in sweeps if s.labels):
+        trials = _finished(sweep, "", provenance, windows)
+        for x in sorted(trials.keys() - {sweep.reference_x}):
+            ends = {at: trials.get(at, {}) for at in (sweep.reference_x, x)}
+            if set.intersection(*(set(side) for side in ends.values())):
+                found += [c for metric in OF_VARIANTS if (c := _change(sweep, "", ends, metric)) is not None]
+    return found
+
+
 Ends = Mapping[float, Mapping[int, tuple[Point, WindowTable]]]
 
 
-def _ends(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends | None:
-    """{x: {seed: its trial}} of the first and the last x; None without two that have a seed in common."""
+def _finished(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends:
+    """{x: {seed: its trial}} of one curve."""
     trials: dict[float, dict[int, tuple[Point, WindowTable]]] = {}
     for point in sweep.points:
         table = windows.get(trial_id(point.trial, provenance))
         if point.role == POINT and point.series == series and table is not None:
             trials.setdefault(point.x, {})[point.trial.train.seed] = point, table
+    return trials
+
+
+def _ends(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends | None:
+    """Of the first and the last x; None without two that have a seed in common."""
+    trials = _finished(sweep, series, provenance, windows)
     if len(trials) < 2:
         return None
     ends = {x: trials[x] for x in (min(trials), max(trials))}

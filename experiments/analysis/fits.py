@@ -74,12 +74,12 @@ class PowerFit:
         """FIT_LEVEL interval [m], [m] of the curve at `x` [m, K]."""
         return interval(self.all_at(x))
 
-    def formula(self) -> str:
-        """In words: 'L = 1.5 + 98 x^-0.5'."""
+    def formula(self, constant: bool = True) -> str:
+        """In words: 'L = 1.5 + 98 x^-0.5'; without E where it is no `constant` worth saying."""
         names = ("N", "D") if len(self.axes) == 2 else ("x",)
         powers = zip(NAMES, names, strict=False)
         terms = [f"{self[scale].value:.3g} {x}^-{self[exponent].value:.3g}" for (scale, exponent), x in powers]
-        return " + ".join([f"L = {self['E'].value:.3g}", *terms])
+        return "L = " + " + ".join([f"{self['E'].value:.3g}"] * constant + terms)
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -37,7 +37,7 @@ def draw(workspace: Workspace, record: Record) -> None:
 
 def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.analysis.best_steps import BestSteps, judge_at_best
-    from experiments.analysis.changes import Change, find_changes
+    from experiments.analysis.changes import Change, find_changes, find_differences
     from experiments.analysis.growth import Growth, find_growth
     from experiments.optima import Optimum, find_optima
     from experiments.report.fits import FitRow, fit_rows
@@ -81,7 +81,8 @@ def _draw(workspace: Workspace, record: Record) -> None:
             tables.append(path)
         else:
             path.unlink(missing_ok=True)  # of other trials, drawn before
-    along = AxisStatistics(changes, at_best, growth)
+    differences = find_differences(sweeps, provenance, numbers.windows)
+    along = AxisStatistics(changes, at_best, growth, differences)
     write_report(workspace, record, sweeps, rows, optima, along, states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 

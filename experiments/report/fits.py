@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 from experiments.analysis.fits import DRAWS, FIT_LEVEL, Coefficient
 from experiments.analysis.isoflop import IsoFlop
+from experiments.analysis.powerlaw import FLOOR
 from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import CurveFit
 from experiments.report.pieces import table
+from experiments.words import counted
 
 VERDICTS = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}
 
@@ -68,9 +70,11 @@ def describe_fits(fits: Sequence[CurveFit], isoflop: IsoFlop | None, outcomes: S
             lines.append([name, axes, "–", "–", "–", f"No fit: {html.escape(fit.refused)}."])
             continue
         exponents = "; ".join(_with_interval(c) for c in fit.coefficients if c.name in ("alpha", "beta"))
+        zero = 10 * FLOOR * float(fitted.measured.value.min())  # as where doubts count bootstraps
+        formula, constant = fit.formula(constant=fit["E"].value >= zero), _constant(fit["E"], zero)
         remarks = html.escape(". ".join(d[0].upper() + d[1:] for d in fit.doubts))
         lines.append([
-            name, axes, _as_html(fit.formula()), exponents, _with_interval(fit["E"]), f"{remarks}." if remarks else ""
+            name, axes, _as_html(formula), exponents, constant, f"{remarks}." if remarks else ""
         ])  # fmt: skip
     head = ["curve", "over", "L, nats per token", "exponent", "E", "remarks"]
     return (
@@ -90,6 +94,13 @@ def _as_html(formula: str) -> str:
 def _with_interval(c: Coefficient) -> str:
     name = {"alpha": "\u03b1 = ", "beta": "\u03b2 = "}.get(c.name, "")
     return f"{name}{c.value:.3g} <span class=sem>[{c.low:.3g}, {c.high:.3g}]</span>"
+
+
+def _constant(e: Coefficient, zero: float) -> str:
+    """E with its interval; what lies below `zero` is the bound of the search, and no measurement."""
+    value, low, high = ("0" if v < zero else f"{v:.3g}" for v in (e.value, e.low, e.high))
+    at_bound = " (at the bound)" * (e.value < zero)
+    return f"{value}{at_bound}" + f" <span class=sem>[{low}, {high}]</span>" * (e.high >= zero)
 
 
 def _outcomes(outcomes: Sequence[Outcome]) -> str:
@@ -121,5 +132,12 @@ def _isoflop(isoflop: IsoFlop | None) -> str:
         if a
         else f"No power law: {html.escape(isoflop.refused)}."
     )
+    best = [b for b in isoflop.budgets if b.best]
+    doubtful = sum(bool(b.doubts) for b in best)
+    if a and doubtful:
+        sentence += (
+            f" {doubtful} of its {counted(len(best), 'best size')} {'is' if doubtful == 1 else 'are'} doubtful (remarks), "
+            "which the interval does not include."
+        )
     head = ["training FLOPs", "sizes", "best trunk parameters", "remarks"]
     return f"<h3>The best size for each compute budget</h3><p>{sentence}</p>{table(head, lines, text=4)}"

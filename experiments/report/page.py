@@ -28,7 +28,7 @@ from experiments.report.pieces import card, picture, section, table
 from experiments.report.plot_style import drawn_metrics
 from experiments.report.robots import Robot, are_sorted, describe_robots, robots_of
 from experiments.report.style import CSS
-from experiments.report.sweeps import AxisStatistics, describe
+from experiments.report.sweeps import TWO_PERPLEXITIES, AxisStatistics, describe
 from experiments.report.validity import EACH, Check, check_study, draw_box
 from experiments.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
 from experiments.running.agreement import describe as describe_sources
@@ -201,16 +201,17 @@ def _curves(
         said = findings.of_axes.get(sweep.name, "")
         return describe(sweep, rows, optima, along) + describe_expected(sweep, outcomes) + said
 
+    note = TWO_PERPLEXITIES if "perplexity" in {r.metric for r in rows} else ""
     sections = []
     scaling = [s for s in sweeps if s.single_curve]
     if scaling:
         overview = picture(workspace.figures / "scaling.png", "Scaling curves")
-        sections.append(section("Scaling curves", overview, *(say(s) for s in scaling)))
+        sections.append(section("Scaling curves", overview, note, *(say(s) for s in scaling)))
     for sweep in sweeps:
         if not sweep.single_curve:
             title = sweep.title or sweep.axis.capitalize()
             figure = picture(workspace.figures / f"{sweep.name}.png", title)
-            sections.append(section(title, figure, say(sweep)))
+            sections.append(section(title, figure, "" if sections else note, say(sweep)))
     return sections
 
 

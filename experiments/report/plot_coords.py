@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.report.plot_style import MUTED, STYLE, axis_of_points, plain_log, save, show_legend
+from experiments.report.plot_style import MUTED, SHADES, STYLE, axis_of_points, plain_log, save, show_legend
 from hma_jax.diagnostics.coordinate_check import Size
 
 ROWS = {"size": "size (RMS)", "change": "change since step 0 (RMS)"}
@@ -33,7 +33,7 @@ def plot_coords(rows: Sequence[Size], path: Path) -> None:
             means = [np.mean(by_width[width]) for width in widths]
             if step or what == "size":  # at step 0 nothing has changed
                 panel.plot(
-                    widths, means, "o-", color=plt.get_cmap("viridis")(0.9 * step / max(last, 1)), markersize=3,
+                    widths, means, "o-", color=plt.get_cmap("viridis")(SHADES * step / max(last, 1)), markersize=3,
                     linewidth=1.2, label=f"step {step}",
                 )  # fmt: skip
         for panel, quantity in zip(panels[0], quantities, strict=True):

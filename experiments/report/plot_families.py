@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
@@ -10,41 +9,46 @@ from matplotlib.axes import Axes
 
 from experiments.optima import diverged, ends, lowest
 from experiments.report.plot_style import (
+    BARS,
+    EXP_OF,
     LABELS,
     MUTED,
     ON_LOG,
     axis_of_points,
+    bars_of,
     count,
+    dodge,
+    drawn_curve,
     drawn_metrics,
     name_axis,
     plain_log,
+    show_control,
     show_legend,
     show_nothing,
     show_tally,
+    style_of,
 )
-from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, Row, all_series, curve
-from experiments.sweeps.sweep import POINT, STANDARD, Sweep
+from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, Row, all_series
+from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Sweep
 
 ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}
 DRAWN = {
     TRAINING_LOSS: (TRAINING, "training loss, last tenth of steps"),
-    **{metric: (OVERALL, f"{LABELS[metric]}, held out") for metric in ON_LOG},
+    **{metric: (OVERALL, LABELS[metric]) for metric in ON_LOG},
 }
 """Metrics with their scope and label, where curves are compared by where they are lowest."""
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
-CAPTION = (
-    "bars: s.e. over seeds; star: lowest, hollow at an end of the grid\n"
-    "cross: diverged; dotted: lowest of the base curve"
-)
+PAIRED = f"{BARS}; points are paired, on the same windows"
+CAPTION = f"{PAIRED}\nstar: lowest, hollow at an end of the grid; cross: diverged; dotted: lowest of the base curve"
 
 
 def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
-    """A row of panels per role, a column per metric, a colour per series."""
+    """A row of panels per role, a column per metric, a colour and a marker per series."""
     series = all_series(rows, sweep.name)
     metrics = drawn_metrics(rows, [sweep.name])
     if sweep.base:
         measured = {r.metric for r in rows if r.sweep == sweep.name}
-        metrics = [m for m in DRAWN if m in measured] or [TRAINING_LOSS, "perplexity"]
+        metrics = [m for m in DRAWN if EXP_OF.get(m, m) in measured] or [TRAINING_LOSS, "perplexity"]
     figure, panels = plt.subplots(
         len(series), len(metrics), figsize=(4.3 * len(metrics), 0.7 + 2.9 * len(series)),
         layout="constrained", sharex=True, sharey="col", squeeze=False,
@@ -61,7 +65,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     show_tally(panels[0, -1], rows, sweep.name)
     show_legend(figure, panels.flat)
     lost = any(diverged(rows, sweep.name, role, name) for role, names in series.items() for name in names)
-    plain = "bars: s.e. over seeds" + "; cross: a seed diverged, the point is left out" * lost
+    plain = PAIRED + "\ncross: a seed diverged, the point is left out" * lost
     figure.supxlabel(CAPTION if sweep.base else plain, fontsize=8.5, color=MUTED)
     return figure
 
@@ -70,29 +74,32 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str
     scope, label = (DRAWN if sweep.base else CURVES)[metric]
     xs = sorted({r.x for r in rows if r.sweep == sweep.name})
     for i, name in enumerate(series):
-        colour = plt.cm.viridis(0.85 * i / max(len(series) - 1, 1))
+        style = style_of(i, len(series))
+        colour = style["color"]
         lost = diverged(rows, sweep.name, role, name)
         for x in lost:  # on the upper edge: beyond any loss
             panel.plot(x, 0.97 - 0.05 * i, "x", color=colour, transform=panel.get_xaxis_transform())
-        points = [p for p in curve(rows, sweep.name, metric, role, scope, name) if p.x not in lost]
+        points = [p for p in drawn_curve(rows, sweep, metric, role, scope, name) if p.x not in lost]
         best = lowest(points, lost)
         if best is None:
             continue
-        bars = [0.0 if math.isnan(p.seed_sem) else p.seed_sem for p in points]
+        aside = dict(zip((p.x for p in points), dodge([p.x for p in points], i, len(series), xs), strict=True))
         panel.errorbar(
-            [p.x for p in points], [p.mean for p in points], bars, color=colour, marker="o",
-            markersize=4, linewidth=1.6, capsize=2.5, elinewidth=1.1,
+            list(aside.values()), [p.mean for p in points], bars_of(points), **style,
+            markersize=5, linewidth=1.6, capsize=2.5, elinewidth=1.1,
             label=name + (" (base)" if name == sweep.base else ""),
         )  # fmt: skip
         if not sweep.base:
             continue
         open_ended = best.x in ends(rows, sweep.name, role, name)
         panel.plot(
-            best.x, best.mean, "*", markersize=13, color=colour, zorder=4,
+            aside[best.x], best.mean, "*", markersize=13, color=colour, zorder=4,
             markerfacecolor="white" if open_ended else colour,
         )  # fmt: skip
         if name == sweep.base:
             panel.axvline(best.x, color=MUTED, linewidth=1, linestyle=":", zorder=1)
+    if role == POINT:
+        show_control(panel, drawn_curve(rows, sweep, metric, CONTROL, scope), sweep.beside_controls)
     if not panel.containers:
         show_nothing(panel)
     axis_of_points(panel, xs, [count(x) if x >= 1 else f"{x:.2g}" for x in xs], room=1.25)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,11 +27,14 @@ from experiments.report.plot_style import (
     plain_log,
     save,
     show_legend,
+    style_of,
 )
 
 LINE, BAND = COLOURS["perplexity"], 0.16
 ABREAST = 3
 """Curves beside each other: of more, a page shows nothing that can be read."""
+DOUBTED = {False: "-", True: "--"}
+"""Lines by whether something is doubtful of them."""
 POINTS = dict(marker="o", linestyle="none", markersize=4, alpha=0.6, markeredgewidth=0)
 
 
@@ -59,6 +63,8 @@ def plot_fits(fits: Sequence[CurveFit], outcomes: Sequence[Outcome], path: Path)
 
 def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outcome]) -> None:
     above, below = panels
+    # Of each doubt what comes before its explanation, which the table has.
+    doubts = [line for d in fitted.fit.doubts for line in textwrap.wrap(d.split(":")[0], 66)]
     measured, fit = fitted.measured, fitted.fit
     x, loss = measured.x[:, 0], measured.value
     above.plot(x, loss, color=LINE, label="seeds", zorder=3, **POINTS)
@@ -66,7 +72,10 @@ def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outco
     line = np.geomspace(min(ends) / 1.15, max(ends) * 1.15, 120)[:, None]
     band = f"{FIT_LEVEL:.0%} of bootstraps"
     above.fill_between(line[:, 0], *fit.band(line), color=LINE, alpha=BAND, linewidth=0, label=band)
-    above.plot(line[:, 0], fit.at(line), color=LINE, linewidth=1.6, label="fit")
+    above.plot(
+        line[:, 0], fit.at(line), color=LINE, linewidth=1.6, linestyle=DOUBTED[bool(fit.doubts)],
+        label="fit, all points" + ", doubtful" * bool(fit.doubts),
+    )  # fmt: skip
     below.plot(x, 100 * fit.residuals, color=LINE, **POINTS)
     for outcome in outcomes:
         _draw_outcome(above, outcome)
@@ -75,7 +84,12 @@ def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outco
     plain_log(above, above.yaxis)
     plain_log(below, below.xaxis, count)
     name_axis(below, fitted.curve.axes[0])
-    above.set_title(fitted.curve.name, loc="left", fontsize=10)
+    above.set_title(fitted.curve.name, loc="left", fontsize=10, pad=7 + 9 * len(doubts))
+    for i, words in enumerate(reversed(doubts)):
+        above.annotate(
+            words, (0, 1), (0, 4 + 9 * i), xycoords="axes fraction", textcoords="offset points",
+            fontsize=7.5, color=MUTED,
+        )  # fmt: skip
     above.legend(loc="best")
 
 
@@ -97,24 +111,29 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
     with plt.rc_context(STYLE):
         figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.8), layout="constrained")
         for i, budget in enumerate(isoflop.budgets):
-            colour = plt.cm.viridis(0.85 * i / max(len(isoflop.budgets) - 1, 1))
+            style = style_of(i, len(isoflop.budgets))
+            colour, filling = style["color"], "white" if budget.doubts else style["color"]
             label = f"{count(budget.flops)} FLOPs"
-            left.plot(budget.sizes, budget.loss, "o", color=colour, markersize=4.5, label=label)
+            left.plot(budget.sizes, budget.loss, **style, linestyle="none", markersize=5, label=label)
             if budget.parabola is not None:
                 line = np.geomspace(budget.sizes[0], budget.sizes[-1], 80)
-                left.plot(line, budget.at(line), color=colour, linewidth=1.4, linestyle="--" if budget.refused else "-")
+                left.plot(line, budget.at(line), color=colour, linewidth=1.4, linestyle=DOUBTED[bool(budget.remarks)])
             if budget.best:
                 best = budget.best
-                left.plot(best.value, budget.at(np.array([best.value])), "*", color=colour, markersize=12)
+                left.plot(
+                    best.value, budget.at(np.array([best.value])), "*", color=colour, markersize=13,
+                    markerfacecolor=filling, zorder=4,
+                )  # fmt: skip
                 right.errorbar(
-                    budget.flops, best.value, [[best.value - best.low], [best.high - best.value]], fmt="o",
-                    color=colour, capsize=3,
+                    budget.flops, best.value, [[best.value - best.low], [best.high - best.value]], **style,
+                    markerfacecolor=filling, capsize=3,
                 )  # fmt: skip
         if isoflop.exponent:
             flops = np.geomspace(isoflop.budgets[0].flops, isoflop.budgets[-1].flops, 50)
             a = isoflop.exponent
             words = f"$C^{{{a.value:.2f}}}$ ({a.low:.2f} to {a.high:.2f})"
-            right.plot(flops, isoflop.scale * flops**a.value, color=MUTED, linewidth=1.4, label=words)
+            line = DOUBTED[any(b.doubts for b in isoflop.budgets)]
+            right.plot(flops, isoflop.scale * flops**a.value, color=MUTED, linewidth=1.4, linestyle=line, label=words)
             right.legend(loc="best")
         else:
             right.text(0.5, 0.5, "no power law", transform=right.transAxes, ha="center", color=MUTED)
@@ -126,5 +145,8 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
         left.set_ylabel("loss, nats per token")
         right.set_ylabel(f"best {TRUNK}")
         show_legend(figure, [left])
+        if any(b.doubts for b in isoflop.budgets):
+            words = "hollow and dashed: sizes lie off the parabola, or its minimum may lie at an end (table)"
+            figure.supxlabel(words, fontsize=8.5, color=MUTED)
         left.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
         save(figure, path)

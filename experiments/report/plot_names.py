@@ -1,4 +1,4 @@
-"""Figure of a sweep over names: a line per variant, its mean, error over seeds and every seed."""
+"""Figure of a sweep over names: a line per variant, its mean, its standard error and every seed."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from experiments.report.plot_style import (
+    BARS,
     CONTROL_LINE,
     DEFAULT,
     LABELS,
     MUTED,
     ON_LOG,
+    bars_of,
+    drawn_curve,
     drawn_metrics,
     plain_log,
     show_nothing,
     show_tally,
 )
-from experiments.rows import Row, curve
+from experiments.rows import Row
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 CAPTION = (
-    "dots: seeds; bars: mean ± s.e. over seeds, {judged}\n"
+    "dots: seeds; {bars}; variants are paired, {judged}:\n"
+    "the table has the errors of their differences\n"
     "dashed: the default trained on shuffled actions, one seed{whose}"
 )
-JUDGED = {False: "all judged on the same windows", True: "each judged on robots of its own"}
+JUDGED = {False: "all judged on the same windows", True: "each seed judged on robots of its own"}
 WHOSE = {False: "", True: " and its robots: do not compare it with the means"}
 """Both by whether judged robots are drawn anew for every seed."""
 
@@ -43,26 +47,27 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
     panels[0, 0].get_yticklabels()[int(sweep.reference_x)].set(color=DEFAULT, fontweight="bold")
     figure.supxlabel(
-        CAPTION.format(judged=JUDGED[sweep.robots_vary], whose=WHOSE[sweep.robots_vary]), fontsize=8.5, color=MUTED
-    )
+        CAPTION.format(bars=BARS, judged=JUDGED[sweep.robots_vary], whose=WHOSE[sweep.robots_vary]),
+        fontsize=8.5, color=MUTED,
+    )  # fmt: skip
     return figure
 
 
 def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
-    points = curve(rows, sweep.name, metric)
-    for p in points:
+    points = drawn_curve(rows, sweep, metric)
+    for p, bar in zip(points, bars_of(points), strict=True):
         colour = DEFAULT if p.x == sweep.reference_x else MUTED
         panel.plot(
             list(p.seeds.values()), [p.x] * len(p.seeds), "o",
             color=colour, alpha=0.45, markersize=4, markeredgewidth=0,
         )  # fmt: skip
         panel.errorbar(
-            p.mean, p.x, xerr=p.seed_sem if p.seed_sem > 0 else None, color=colour, marker="|", markersize=13,
+            p.mean, p.x, xerr=bar or None, color=colour, marker="|", markersize=13,
             markeredgewidth=2.2, capsize=3.5, elinewidth=1.5,
         )  # fmt: skip
     if not points:
         show_nothing(panel)
-    for control in curve(rows, sweep.name, metric, CONTROL):
+    for control in drawn_curve(rows, sweep, metric, CONTROL):
         panel.axvline(control.mean, **CONTROL_LINE)
     if metric in ON_LOG:
         plain_log(panel, panel.xaxis)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -14,9 +17,11 @@ import matplotlib.pyplot as plt
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 
-from experiments.rows import CurvePoint, Row, tally
+from experiments.analysis.intervals import HELD_OUT_LOSS
+from experiments.rows import OVERALL, CurvePoint, Row, curve, tally
+from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.runtime.files import write_file
 
 INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
@@ -25,7 +30,7 @@ COLOURS |= dict.fromkeys(("diffusion_loss", "action_error"), COLOURS["perplexity
 DEFAULT = "#6b3fa0"
 """Of the variant that the presets use, as in the paper's figure 5."""
 LABELS = {
-    "perplexity": "perplexity",
+    "perplexity": "perplexity: exp of the mean nats",
     "diffusion_loss": "diffusion loss",
     "delta_psnr": "ΔPSNR, last frame (dB)",
     "action_error": "squared error of actions (variances)",
@@ -34,6 +39,14 @@ LABELS = {
 USUAL = ["perplexity", "delta_psnr"]
 ON_LOG = ("perplexity", "diffusion_loss")
 """Those whose axis is logarithmic."""
+EXP_OF = {"perplexity": HELD_OUT_LOSS}
+"""{what is drawn: the metric of which it is exp of the mean}. The release's perplexity, which tables have, is a mean of
+exponentials: of a few hard robots, so that it may rank models otherwise than nats do."""
+BARS = "bars: s.e. over seeds and episodes"
+ERROR = f"mean, {BARS}"
+MARKERS = "o^DvPXs"
+SHADES = 0.55
+"""Where the colours of curves end on viridis: beyond it they are too light for white paper."""
 CONTROL_LINE = dict(color=MUTED, linewidth=1.3, linestyle=(0, (4, 2)), zorder=1)
 STYLE = {
     "font.size": 10,
@@ -60,8 +73,42 @@ def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
     """Those of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity), or the
     usual ones while none has finished. Errors of actions are drawn where no frames are predicted."""
     measured = {r.metric for r in rows if r.sweep in sweeps}
-    available = [m for m in LABELS if m in measured]
+    available = [m for m in LABELS if EXP_OF.get(m, m) in measured]
     return [m for m in available if m != "action_error"] or available or USUAL
+
+
+def drawn_curve(
+    rows: Iterable[Row], sweep: Sweep, metric: str, role: str = POINT, scope: str = OVERALL, series: str = ""
+) -> list[CurvePoint]:
+    """`curve` of a metric of LABELS, as all figures draw it: bars are `sem`."""
+    points = curve(rows, sweep.name, EXP_OF.get(metric, metric), role, scope, series, sweep.robots_vary)
+    return [_exp(p) for p in points] if metric in EXP_OF else points
+
+
+def _exp(p: CurvePoint) -> CurvePoint:
+    """Of the mean and of every seed's; errors by the delta method."""
+    mean = math.exp(p.mean)
+    seeds = {seed: math.exp(value) for seed, value in p.seeds.items()}
+    return replace(p, mean=mean, sem=mean * p.sem, seed_sem=mean * p.seed_sem, seeds=seeds)
+
+
+def bars_of(points: Iterable[CurvePoint]) -> list[float]:
+    """Standard errors, none where they are unknown."""
+    return [p.sem if p.sem > 0 else 0.0 for p in points]
+
+
+def style_of(i: int, count: int) -> dict[str, Any]:
+    """Colour and marker of one of `count` curves."""
+    return dict(color=plt.cm.viridis(SHADES * i / max(count - 1, 1)), marker=MARKERS[i % len(MARKERS)])
+
+
+def dodge(xs: Sequence[float], i: int, count: int, ends: Sequence[float]) -> list[float]:
+    """Moved a little aside, for one of `count` curves on a log axis between `ends`, so that bars do not hide each
+    other."""
+    if min(ends) <= 0:
+        return list(xs)
+    factor = (max(ends) / min(ends)) ** (0.01 * (i - (count - 1) / 2))
+    return [x * factor for x in xs]
 
 
 def save(figure: plt.Figure, path: Path) -> None:
@@ -72,24 +119,29 @@ def save(figure: plt.Figure, path: Path) -> None:
 
 
 class LogTicks(Locator):
-    """At least three ticks on a log axis: at 1, 2, 3 and 5 of each decade, or where its ends lie closer together, at
-    round numbers."""
+    """Three to nine ticks: at the fewest round numbers of each decade, or evenly spaced ones, that have one near each
+    end of the axis."""
+
+    DECADES = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 5), (1, 1.5, 2, 3, 4, 5, 7))
+    NEAR = 0.2  # of the length of the axis
 
     def __call__(self):
         return self.tick_values(*self.axis.get_view_interval())
 
     def tick_values(self, vmin: float, vmax: float):
         low, high = sorted((vmin, vmax))
-        ticks = LogLocator(subs=(1, 2, 3, 5)).tick_values(low, high)
-        if sum(low <= t <= high for t in ticks) < 3 or high < 4 * low:
-            ticks = MaxNLocator(nbins=5, steps=(1, 2, 2.5, 5, 10), min_n_ticks=3).tick_values(low, high)
-        elif high > 1000 * low:
-            ticks = LogLocator().tick_values(low, high)
-        elif high > 200 * low:
-            ticks = LogLocator(subs=(1, 3)).tick_values(low, high)
-        elif high > 20 * low:
-            ticks = LogLocator(subs=(1, 2, 5)).tick_values(low, high)
-        return [t for t in ticks if t > 0]
+        powers = [10.0**e for e in range(math.floor(math.log10(low)), math.ceil(math.log10(high)))]
+        decades = ([m * power for power in powers for m in (*subs, 10)] for subs in self.DECADES)
+        even = (MaxNLocator(nbins=n, steps=(1, 2, 2.5, 5, 10), min_n_ticks=3) for n in range(5, 9))
+        each = (sorted({*ticks}) for ticks in (*decades, *(place.tick_values(low, high) for place in even)))
+        each = ([t for t in ticks if low <= t <= high] for ticks in each)
+        each = [ticks for ticks in each if 3 <= len(ticks) <= 9]
+
+        def bare(ticks: Sequence[float]) -> float:
+            """The longer part beyond the outermost ticks, of the length of the axis."""
+            return math.log(max(ticks[0] / low, high / ticks[-1])) / math.log(high / low)
+
+        return next((ticks for ticks in each if bare(ticks) <= self.NEAR), min(each, key=bare))
 
 
 def plain_number(value: float) -> str:
@@ -123,15 +175,16 @@ def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room:
     panel.xaxis.set_minor_locator(NullLocator())
 
 
-def show_control(panel: Axes, points: list[CurvePoint]) -> None:
-    """The trials on shuffled actions, where on the axis they stand, with their standard errors. One seed of them, as
-    there mostly is, stands beside means over several, so the legend says so."""
+def show_control(panel: Axes, points: list[CurvePoint], series: str = "") -> None:
+    """The trials on shuffled actions, where on the axis they stand, with their standard errors; `series`: the curve
+    that they stand beside. One seed of them, as there mostly is, stands beside means over several, so the legend says
+    so."""
     if points:
-        alone = all(len(p.seeds) == 1 for p in points)
+        words = "shuffled actions" + ", one seed" * all(len(p.seeds) == 1 for p in points)
         panel.errorbar(
-            [p.x for p in points], [p.mean for p in points], [p.sem if p.sem > 0 else 0.0 for p in points],
+            [p.x for p in points], [p.mean for p in points], bars_of(points),
             fmt="s", color=MUTED, markersize=5, markerfacecolor="white", capsize=3, elinewidth=1.2, zorder=2,
-            label="trained on shuffled actions" + ", one seed" * alone,
+            label=f"{series}, {words}" if series else f"trained on {words}",
         )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ Curves over one number are drawn here, axes of names in `plot_names`, families o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,12 +17,15 @@ from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import (
     COLOURS,
+    ERROR,
     LABELS,
     MUTED,
     ON_LOG,
     STYLE,
     axis_of_points,
+    bars_of,
     count,
+    drawn_curve,
     drawn_metrics,
     name_axis,
     plain_log,
@@ -33,7 +35,7 @@ from experiments.report.plot_style import (
     show_nothing,
     show_tally,
 )
-from experiments.rows import UNTRAINED, CurvePoint, Row, curve, of_sweep
+from experiments.rows import UNTRAINED, CurvePoint, Row, of_sweep
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 
@@ -82,14 +84,13 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
 
 def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     """One curve with standard errors, every seed's point, and the reference lines."""
-    points = curve(rows, sweep.name, metric, robots_vary=sweep.robots_vary)
+    points = drawn_curve(rows, sweep, metric)
     colour = COLOURS[metric]
     if points:
         xs = [p.x for p in points]
-        bars = [0.0 if math.isnan(p.sem) else p.sem for p in points]
         panel.errorbar(
-            xs, [p.mean for p in points], bars, color=colour, marker="o", markersize=5.5,
-            linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3, label="mean ± s.e.",
+            xs, [p.mean for p in points], bars_of(points), color=colour, marker="o", markersize=5.5,
+            linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3, label=ERROR,
         )  # fmt: skip
         if any(len(p.seeds) > 1 for p in points):
             panel.plot(
@@ -99,10 +100,10 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
         _x_axis(panel, points, sweep)
     else:
         show_nothing(panel)
-    show_control(panel, curve(rows, sweep.name, metric, CONTROL, robots_vary=sweep.robots_vary))
+    show_control(panel, drawn_curve(rows, sweep, metric, CONTROL))
     if metric in ON_LOG:
         plain_log(panel, panel.yaxis)
-        for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve
+        for p in drawn_curve(rows, sweep, metric, UNTRAINED):  # far above: a line would flatten the curve
             value = f"{p.mean:.0f}" if metric == "perplexity" else f"{p.mean:.3g}"
             panel.set_title(f"untrained: {value}", loc="left", fontsize=8.5, color=MUTED)
     else:

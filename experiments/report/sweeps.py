@@ -11,18 +11,22 @@ from dataclasses import dataclass
 from experiments.analysis.best_steps import BestSteps
 from experiments.analysis.changes import Change
 from experiments.analysis.growth import GROWS, Growth
+from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.optima import Optimum
 from experiments.report.pieces import pm, table
 from experiments.report.plot_families import ROLES
-from experiments.report.plot_style import drawn_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.words import counted
 
 HEADINGS = {
-    "perplexity": "perplexity", "diffusion_loss": "diffusion loss", "delta_psnr": "ΔPSNR (dB)",
-    "action_error": "error of actions (variances)",
+    HELD_OUT_LOSS: "nats per token", "perplexity": "perplexity", "diffusion_loss": "diffusion loss",
+    "delta_psnr": "ΔPSNR (dB)", "action_error": "error of actions (variances)",
 }  # fmt: skip
+TWO_PERPLEXITIES = (
+    "<p>Perplexity is drawn as exp of the mean nats over robots. That of the tables is the release's, a mean of "
+    "exponentials: a few hard robots make most of it, so it may rank models otherwise than nats do.</p>"
+)
 CHANGED = {"cross_entropy": "nats per token", "action_nats": "action-nats", "delta_psnr": "ΔPSNR (dB)"}
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
@@ -34,18 +38,19 @@ class AxisStatistics:
     changes: Sequence[Change] = ()
     best: Sequence[BestSteps] = ()
     growth: Sequence[Growth] = ()
+    differences: Sequence[Change] = ()
 
 
 def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along: AxisStatistics) -> str:
     """Heading, question and numbers of a sweep of any kind."""
     if sweep.labels:
-        numbers = _names(sweep, rows)
+        numbers = _names(sweep, rows, [c for c in along.differences if c.sweep == sweep.name])
     elif sweep.base:
         numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
     elif sweep.has_series:
         names = all_series(rows, sweep.name).get(POINT, [])
         numbers = "".join(_series(sweep, rows, name, along.changes) for name in names)
-        numbers += _growth(sweep, along.growth) + _at_best(sweep, along.best)
+        numbers += _controls(sweep, rows) + _growth(sweep, along.growth) + _at_best(sweep, along.best)
     else:
         numbers = _curve(sweep, rows, along.changes) + _growth(sweep, along.growth)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.single_curve else ""
@@ -109,10 +114,11 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
     )
 
 
-def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePoint]]:
-    """{metric: {x: point}} of the metrics that there are."""
-    metrics = drawn_metrics(rows, [sweep.name])
-    return {m: {p.x: p for p in curve(rows, sweep.name, m, robots_vary=sweep.robots_vary)} for m in metrics}
+def _columns(sweep: Sweep, rows: Sequence[Row], role: str = POINT) -> dict[str, dict[float, CurvePoint]]:
+    """{metric: {x: point}} of the metrics that there are; of errors of actions where no frames are predicted."""
+    measured = {r.metric for r in rows if r.sweep == sweep.name}
+    metrics = [m for m in HEADINGS if m in measured and m != "action_error"] or ["action_error"]
+    return {m: {p.x: p for p in curve(rows, sweep.name, m, role, robots_vary=sweep.robots_vary)} for m in metrics}
 
 
 def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Change]) -> str:
@@ -122,17 +128,32 @@ def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Chan
     return f"<h4>{html.escape(name)}</h4>{_curve(sweep, own, changes, name)}" if own else ""
 
 
+def _controls(sweep: Sweep, rows: Sequence[Row]) -> str:
+    """The trials on shuffled actions, beside all curves of several."""
+    lines = _lines(sweep, rows, CONTROL)
+    heading = f"{sweep.beside_controls}, shuffled actions" if sweep.beside_controls else "Trained on shuffled actions"
+    return f"<h4>{html.escape(heading)}</h4>" + table(_head(sweep, rows), lines) if lines else ""
+
+
 def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series: str = "") -> str:
-    """A line per point, and the change from end to end."""
-    columns = _columns(sweep, rows)
-    lines = []
+    """A line per point, one per point on shuffled actions, and the change from end to end."""
+    numbers = table(_head(sweep, rows), _lines(sweep, rows) + _lines(sweep, rows, CONTROL, ", shuffled actions"))
+    return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
+
+
+def _head(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
+    return [sweep.axis, "parameters, all robots", *(HEADINGS[m] for m in _columns(sweep, rows)), "seeds"]
+
+
+def _lines(sweep: Sweep, rows: Sequence[Row], role: str = POINT, remark: str = "") -> list[list[str]]:
+    """A line of a table for each point of one curve."""
+    columns, lines = _columns(sweep, rows, role), []
     for x in sorted({x for column in columns.values() for x in column}):
         here = [column.get(x) for column in columns.values()]
         known = next(p for p in here if p)
         values = [pm(p.mean, p.sem) if p else "–" for p in here]
-        lines.append([f"{x:,}", _parameters(known), *values, str(len(known.seeds))])
-    numbers = table([sweep.axis, "parameters, all robots", *(HEADINGS[m] for m in columns), "seeds"], lines)
-    return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
+        lines.append([f"{x:,}{remark}", _parameters(known), *values, str(len(known.seeds))])
+    return lines
 
 
 def _parameters(point: CurvePoint) -> str:
@@ -164,10 +185,11 @@ def _with_interval(estimate: BestSteps | Change | Growth, sign: str = "", words:
     return f"{estimate.mean:{sign}.3g}{interval}".replace("-", "\u2212")
 
 
-def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
-    """A line per variant with its difference to the default; errors are over seeds."""
+def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> str:
+    """A line per variant with its difference to the default: not of the perplexity, which windows have none of."""
     columns = _columns(sweep, rows)
-    controls = {m: curve(rows, sweep.name, m, CONTROL) for m in columns}
+    apart = {(c.metric, c.last): c for c in differences}
+    controls = {m: list(column.values()) for m, column in _columns(sweep, rows, CONTROL).items()}
     lines = []
     for x, label in enumerate(sweep.labels):
         here = {m: column.get(x) for m, column in columns.items()}
@@ -176,24 +198,27 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
             continue
         cells = [_bold(label, x == sweep.reference_x), _parameters(known)]
         for metric, p in here.items():
-            default = columns[metric].get(sweep.reference_x)
-            cells += [pm(p.mean, p.seed_sem) if p else "–", _difference(p, default)]
+            cells.append(pm(p.mean, p.sem) if p else "–")
+            if metric != "perplexity":
+                cells.append(_difference(p, columns[metric].get(sweep.reference_x), apart.get((metric, x))))
         lines.append([*cells, str(len(known.seeds))])
     if any(controls.values()):
-        pairs = [[pm(p[0].mean, math.nan) if p else "–", ""] for p in controls.values()]
-        lines.append(["default, shuffled actions", "", *(cell for pair in pairs for cell in pair), "1"])
+        cells = []
+        for metric, points in controls.items():
+            cells += [pm(points[0].mean, points[0].sem) if points else "–", *[""] * (metric != "perplexity")]
+        lines.append(["default, shuffled actions", "", *cells, "1"])
     head = [sweep.axis, "parameters, all robots"]
     for metric in columns:
-        head += [HEADINGS[metric], "minus the default"]
-    judged, whose = "all variants are evaluated on the same windows", ""
+        head += [HEADINGS[metric], *["minus the default"] * (metric != "perplexity")]
+    over, whose = "seeds and episodes, of one seed over episodes alone", ""
     if sweep.robots_vary:
-        judged = "every seed evaluates robots of its own, all variants on the same windows"
+        over = "seeds, each of which evaluates robots of its own"
         whose = (
             " The default trained on shuffled actions has one seed and its robots: do not compare it with the means."
         )
     return table([*head, "seeds"], lines) + (
-        f"<p>Bold: the default. Differences are paired by seed, and errors are standard errors over seeds, as in the "
-        f"figure; the choice of windows adds nothing to them, since {judged}.{whose * any(controls.values())}</p>"
+        f"<p>Bold: the default. Differences are paired by seed and window. Errors are standard errors over {over}."
+        f"{whose * any(controls.values())}</p>"
     )
 
 
@@ -201,10 +226,11 @@ def _bold(text: str, wanted: bool) -> str:
     return f"<b>{html.escape(text)}</b>" if wanted else html.escape(text)
 
 
-def _difference(point: CurvePoint | None, default: CurvePoint | None) -> str:
+def _difference(point: CurvePoint | None, default: CurvePoint | None, paired: Change | None) -> str:
+    """Without an error where trials kept no numbers of their windows."""
     if point is None or default is None or point is default:
         return ""
-    mean, error = difference(point, default)
+    mean, error = (paired.mean, paired.sem) if paired else (difference(point, default)[0], math.nan)
     return ("+" if mean > 0 else "") + pm(mean, error)
 
 

@@ -63,6 +63,13 @@ class Sweep:
         return not self.labels and not self.base
 
     @property
+    def beside_controls(self) -> str:
+        """The series, of several, whose trials the controls repeat on shuffled actions; '' where it is not one."""
+        controls = [p.trial for p in self.points if p.role == CONTROL]
+        found = {p.series for p in self.points if p.role == POINT and control_of(p.trial) in controls}
+        return found.pop() if len(found) == 1 else ""
+
+    @property
     def robots_vary(self) -> bool:
         """Whether every seed is judged on robots of its own, so that their windows differ."""
         places = {(p.x, p.series, p.role) for p in self.points}

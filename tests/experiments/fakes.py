@@ -102,7 +102,8 @@ def result_of(trial: Trial, without: Sequence[str] = ()) -> dict:
         name: {m: {"mean": v + i, "sem": 0.2, "n": 10, "episodes": 4} for m, v in stats.items() if m not in without}
         for i, name in enumerate(trial.evaluated)
     }
-    first = {m: {"mean": 256.0, "sem": 0.0, "n": 2, "episodes": 2} for m in ("perplexity", "psnr") if m not in without}
+    untrained = {"perplexity": 256.0, "cross_entropy": math.log(256.0), "psnr": 256.0}
+    first = {m: {"mean": v, "sem": 0.0, "n": 2, "episodes": 2} for m, v in untrained.items() if m not in without}
     return {
         "evaluation": evaluation,
         "untrained": dict.fromkeys(trial.evaluated, first) if trial.measure_untrained else None,

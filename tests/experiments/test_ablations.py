@@ -134,7 +134,7 @@ def test_errors_are_over_seeds_and_differences_are_paired(drawn):
 def test_page_names_variants_and_marks_the_default(drawn):
     page = drawn.report.read_text()
     for text in ("passive", "<b>forward dynamics</b>", "<b>concat+modulate</b>", "causal alignment",
-                 "<td>+1", "default, shuffled actions", "Robots, the most controllable first", "1 trial has no result"):  # fmt: skip
+                 "<td>+0.", "default, shuffled actions", "Robots, the most controllable first", "1 trial has no result"):  # fmt: skip
         assert text in page, text
     assert "Scaling curves" not in page and not (drawn.figures / "scaling.png").exists()
     assert page.count("data:image/png;base64,") == 2 + 3 * 3  # two figures, three strips of three datasets

@@ -17,7 +17,7 @@ from experiments.report.findings import read_findings
 from experiments.report.numbers import Numbers
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
-from experiments.report.plot_style import LogTicks, count, save
+from experiments.report.plot_style import ERROR, LogTicks, count, drawn_curve, save
 from experiments.report.robots import describe_robots, read_data, robots_of
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.report.validity import Check, check_study
@@ -120,15 +120,15 @@ def test_curve_joins_seeds_and_windows(drawn):
 def test_errors_of_robots_drawn_for_every_seed_count_their_windows_once(drawn, tmp_path, monkeypatch):
     """What windows do to the mean of a seed is within the spread over seeds, if they are others for each."""
     rows, sweep = rows_of(drawn, [plan_width(STUDY)]), plan_width(STUDY)
-    one, several = curve(rows, "width", "perplexity", robots_vary=True)
-    assert several.sem == several.seed_sem > 0 and one.sem == curve(rows, "width", "perplexity")[0].sem > 0
+    one, several = curve(rows, "width", "cross_entropy", robots_vary=True)
+    assert several.sem == several.seed_sem > 0 and one.sem == curve(rows, "width", "cross_entropy")[0].sem > 0
     kept = []
     monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
     points = [replace(p, scope=STUDY.dataset_names()[p.trial.train.seed :]) for p in sweep.points]
     plots.plot_sweep(rows, replace(sweep, points=tuple(points)), tmp_path / "width.png")
-    bars = {c.get_label(): c for c in kept[0].axes[0].containers}["mean ± s.e."]
+    bars = {c.get_label(): c for c in kept[0].axes[0].containers}[ERROR]
     low, high = bars.lines[2][0].get_segments()[1][:, 1]
-    assert high - low == pytest.approx(2 * several.seed_sem)
+    assert high - low == pytest.approx(2 * several.seed_sem * math.exp(several.mean))
 
 
 def test_control_and_untrained_stay_off_the_curve(drawn):
@@ -176,8 +176,8 @@ def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
     panels = dict(zip(("perplexity", "delta_psnr"), figure.axes, strict=True))
     for metric, panel in panels.items():
         bars = {c.get_label(): c for c in panel.containers}
-        points = curve(rows, "width", metric)
-        shown = bars["mean ± s.e."].lines[0].get_xydata()
+        points = drawn_curve(rows, sweep, metric)
+        shown = bars[ERROR].lines[0].get_xydata()
         np.testing.assert_allclose(shown, [(p.x, p.mean) for p in points])
         assert bars["trained on shuffled actions, one seed"].lines[0].get_xdata().tolist() == [sweep.reference_x]
         low, high = sorted(panel.get_ylim())
@@ -314,7 +314,7 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
         sweep = plan(CPU_FULL)
         caption = plot_names([], sweep).get_supxlabel()
         said = describe(sweep, [], [], AxisStatistics())
-        assert ("each judged on robots of its own" in caption) == ("robots of its own, all variants" in said) == own
+        assert ("each seed judged on robots of its own" in caption) == ("evaluates robots of its own" in said) == own
         assert ("all judged on the same windows" in caption) != own
         assert ("one seed and its robots: do not compare it with the means" in caption) == own
 

@@ -1,0 +1,178 @@
+"""Figures of a report and the tables beside them say the same, with errors that count what they say they count."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from experiments.analysis.changes import find_differences
+from experiments.analysis.compare import Side, overall_difference
+from experiments.analysis.fits import Coefficient, PowerFit, fit_power
+from experiments.analysis.isoflop import Budget, IsoFlop
+from experiments.analysis.scaling import Curve, CurveFit
+from experiments.presets import CPU_FULL
+from experiments.report import plot_fits
+from experiments.report.fits import describe_fits
+from experiments.report.pieces import pm
+from experiments.report.plot_families import plot_family
+from experiments.report.plot_names import plot_names
+from experiments.report.plot_style import LogTicks, dodge, style_of
+from experiments.report.sweeps import AxisStatistics, describe
+from experiments.rows import Row, curve
+from experiments.running.trial import trial_id
+from experiments.sweeps.conditioning import plan as plan_conditioning
+from experiments.sweeps.episodes import plan as plan_episodes
+from experiments.sweeps.lr_horizon import plan as plan_lr_horizon
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep, unique_trials
+from tests.experiments.analysis.curves import measured, power, sizes
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.judged import WIDE, windows_of
+
+
+def rows_of(sweep: Sweep, metrics) -> list[Row]:
+    """Finished rows of every point; `metrics`(point) gives {metric: mean}."""
+    return [
+        Row(
+            sweep=sweep.name, x=p.x, label=sweep.label(p.x), role=p.role, series=p.series, seed=p.trial.train.seed,
+            trial=trial_id(p.trial, PROVENANCE), status="finished", scope="overall", metric=metric, mean=mean, sem=0.1,
+            n=80, episodes=40, parameters=100, train_flops=1.0, store="", manifest="", tokenizer="",
+        )  # fmt: skip
+        for p in sweep.points
+        for metric, mean in metrics(p).items()
+    ]  # fmt: skip
+
+
+def test_the_best_rate_of_the_figure_is_that_of_the_nats():
+    """It was that of the release's perplexity, which a few hard robots decide: the table beside it said another."""
+    sweep = plan_lr_horizon(CPU_FULL)
+    low, middle, _ = sorted({p.x for p in sweep.points})
+    rows = rows_of(sweep, lambda p: {"cross_entropy": 4 + (p.x != middle), "perplexity": 80 - 20 * (p.x == low)})
+    figure = plot_family(rows, sweep)
+    panel = next(a for a in figure.axes if a.get_ylabel() == "perplexity: exp of the mean nats")
+    stars = [line for line in panel.lines if line.get_marker() == "*"]
+    assert len(stars) == 2
+    for star in stars:
+        assert star.get_xdata()[0] == pytest.approx(middle, rel=0.05) and star.get_ydata()[0] == pytest.approx(
+            math.e**4
+        )
+        assert star.get_markerfacecolor() != "white"
+
+
+def test_tables_have_nats_beside_the_perplexity():
+    sweep = plan_conditioning(CPU_FULL)
+    said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.1, "perplexity": 75.0}), [], AxisStatistics())
+    assert "<th>nats per token</th><th>minus the default</th><th>perplexity</th><th>seeds</th>" in said
+
+
+def test_errors_of_variants_count_seeds_and_episodes():
+    """They were those of seeds alone, since all are judged on the same windows; but how much a variant helps differs
+    from episode to episode."""
+    sweep = plan_conditioning(replace(WIDE, ablation_seeds=(0, 1, 2)))
+    windows = {id: windows_of(trial) for id, trial in unique_trials([sweep], PROVENANCE).items()}
+    rows = rows_of(sweep, lambda p: {"delta_psnr": 0.3 + 0.01 * p.trial.train.seed})
+    differences = find_differences([sweep], PROVENANCE, windows)
+    assert {c.last for c in differences} == set(range(len(sweep.labels))) - {sweep.reference_x}
+
+    def side(x: float) -> Side:
+        own = [p.trial for p in sweep.points if p.x == x and p.role == POINT]
+        return Side("", {t.train.seed: windows[trial_id(t, PROVENANCE)] for t in own}, "")
+
+    d = overall_difference(side(0), side(sweep.reference_x), "delta_psnr", sweep.scope)
+    said = describe(sweep, rows, [], AxisStatistics(differences=differences))
+    assert f"<td>{'+' * (d.mean > 0)}{pm(d.mean, d.sem)}</td>" in said
+    [point] = [p for p in curve(rows, sweep.name, "delta_psnr") if p.x == 0]
+    assert point.sem > 5 * point.seed_sem and f"<td>{pm(point.mean, point.sem)}</td>" in said
+    assert "standard errors over seeds and episodes" in said and "adds nothing" not in said
+    figure = plot_names(rows, sweep)
+    low, high = figure.axes[0].containers[0].lines[2][0].get_segments()[0][:, 0]
+    assert high - low == pytest.approx(2 * point.sem) and "s.e. over seeds and episodes" in figure.get_supxlabel()
+
+
+def test_several_curves_are_shown_with_their_controls():
+    sweep = plan_episodes(CPU_FULL)
+    rows = rows_of(sweep, lambda p: {"cross_entropy": 5.3 if p.role == CONTROL else 4.0, "perplexity": 90.0})
+    figure = plot_family(rows, sweep)
+    label = "4,000 steps, shuffled actions, one seed"
+    [bars] = [c for c in figure.axes[0].containers if c.get_label() == label]
+    at = sorted({p.x for p in sweep.points if p.role == CONTROL})
+    assert bars.lines[0].get_xdata().tolist() == at and bars.lines[0].get_ydata() == pytest.approx([math.exp(5.3)] * 2)
+    said = describe(sweep, rows, [], AxisStatistics())
+    of_controls = said.split("<h4>4,000 steps, shuffled actions</h4>")[1]
+    assert all(f"<td class=text>{x:,}</td>" in of_controls for x in at) and pm(5.3, 0.1) in of_controls
+
+
+def test_a_curve_s_table_has_its_controls():
+    from experiments.sweeps.width import plan
+
+    sweep = plan(CPU_FULL)
+    said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.0}), [], AxisStatistics())
+    assert all(f"<td class=text>{p.x:,}, shuffled actions</td>" in said for p in sweep.points if p.role == CONTROL)
+
+
+@pytest.mark.parametrize(("low", "high"), [(27, 66), (33, 72), (26.4, 95), (1.04, 1.6), (0.011, 0.9), (2, 9)])
+def test_a_log_axis_has_a_tick_near_each_of_its_ends(low, high):
+    """The best variants stood left of the first one."""
+    ticks, near = LogTicks().tick_values(low, high), (high / low) ** 0.2
+    assert low <= ticks[0] <= low * near and high / near <= ticks[-1] <= high and 3 <= len(ticks) <= 9
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_curves_are_told_apart_without_colours_and_seen_on_white(count):
+    styles = [style_of(i, count) for i in range(count)]
+    assert len({style["marker"] for style in styles}) == count
+    for style in styles:
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in style["color"][:3]]
+        assert 1.05 / (np.dot(linear, (0.2126, 0.7152, 0.0722)) + 0.05) >= 3  # WCAG 2.1, of graphics
+    moved = [dodge([1.0, 100.0], i, count, [1.0, 100.0]) for i in range(count)]
+    assert len({x for x, _ in moved}) == count and all(0.9 < x < 1.1 for x, _ in moved)
+
+
+def curve_fit(fit: PowerFit, points) -> CurveFit:
+    return CurveFit(Curve("width", fit.axes, ()), points, fit)
+
+
+@pytest.mark.parametrize("doubts", [(), ("points lie off the curve (F = 14.9): not of this form",)])
+def test_a_fit_that_is_doubtful_is_drawn_so(doubts, tmp_path, monkeypatch):
+    points = measured(sizes(6), power(sizes(6), 2.0, (1.0, 0.5)), 1e-3, 3, np.random.default_rng(0))
+    fit, kept = replace(fit_power(points, 20), doubts=doubts), []
+    monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
+    plot_fits.plot_fits([curve_fit(fit, points)], [], tmp_path / "fits.png")
+    panel = kept[0].axes[0]
+    lines = {line.get_label(): line.get_linestyle() for line in panel.lines}
+    assert lines["fit, all points" + ", doubtful" * bool(doubts)] == ("--" if doubts else "-")
+    assert [t.get_text() for t in panel.texts] == [d.split(":")[0] for d in doubts]
+
+
+def test_a_best_size_that_is_doubtful_is_drawn_and_said_to_be(tmp_path, monkeypatch):
+    best, kept = Coefficient("N_opt", 2e4, 1.9e4, 2.1e4), []
+    budget = Budget(1e12, np.array([1e4, 2e4, 4e4]), np.array([4.0, 3.9, 4.0]), np.array([0.1, 0.0, 1.36]), 9.9, best)
+    fit = IsoFlop(
+        (budget, replace(budget, flops=2e12, misfit="sizes lie off")), Coefficient("a", 0.28, 0.22, 0.35), 1.0
+    )
+    monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
+    plot_fits.plot_isoflop(fit, tmp_path / "isoflop.png")
+    left, right = kept[0].axes
+    stars = [line.get_markerfacecolor() == "white" for line in left.lines if line.get_marker() == "*"]
+    assert stars == [False, True] and [line.get_linestyle() for line in right.lines][-1] == "--"
+    assert "1 of its 2 best sizes is doubtful" in describe_fits([], fit, [], "")
+    assert "doubtful" not in describe_fits([], replace(fit, budgets=(budget,)), [], "")
+
+
+@pytest.mark.parametrize(("high", "interval"), [(3.1e-4, ""), (1.4, " <span class=sem>[0, 1.4]</span>")])
+def test_an_E_at_the_bound_of_the_search_is_no_number(high, interval):
+    """The page had 0.000314 [0.000314, 0.000314] of it."""
+    coefficients = (Coefficient("E", 3.1e-4, 3.1e-4, high), Coefficient("A", 7.5, 7.4, 7.6), Coefficient("alpha", 0.082, 0.08, 0.084))  # fmt: skip
+    fit = PowerFit(("training steps",), ("t",), coefficients=coefficients)
+    said = describe_fits([curve_fit(fit, SimpleNamespace(value=np.array([3.14, 4.4])))], None, [], "")
+    assert "<td class=text>L = 7.5 x<sup>\u22120.082</sup></td>" in said
+    assert f"<td class=text>0 (at the bound){interval}</td>" in said and "0.00031" not in said
+    assert fit.formula() == "L = 0.00031 + 7.5 x^-0.082"  # as predictions keep it
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
