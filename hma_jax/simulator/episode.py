@@ -13,6 +13,7 @@ import numpy as np
 
 from hma_jax.config import require
 from hma_jax.generation.episodes import Episodes
+from hma_jax.simulator.interface import read_only
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -71,14 +72,15 @@ class Snapshot(NamedTuple):
     """Where all episodes of a simulator stood."""
 
     state: Episodes
-    images: np.ndarray
+    images: np.ndarray  # read-only
     episodes: tuple[Episode | None, ...]
+    identity: str  # of the model and of the tokenizer
 
 
 def as_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
     """A snapshot as arrays by name, for a file: its state, and the GROWING_FIELDS of its episodes, which must all have
     begun."""
-    arrays = {"images": snapshot.images}
+    arrays = {"images": snapshot.images, "identity": np.array(snapshot.identity)}
     for i, leaf in enumerate(jax.tree.leaves(snapshot.state)):
         arrays[f"state/{i}"] = np.asarray(leaf)
     for b, episode in enumerate(snapshot.episodes):
@@ -100,4 +102,5 @@ def from_arrays(arrays: Mapping[str, np.ndarray], fresh: Snapshot) -> Snapshot:
             rows = getattr(episode, name)
             rows.clear()
             rows.extend(arrays[f"episode/{b}/{name}"])
-    return Snapshot(tree.unflatten(state), arrays["images"], episodes)
+    images = read_only(arrays["images"])
+    return Snapshot(tree.unflatten(state), images, episodes, str(arrays["identity"]))

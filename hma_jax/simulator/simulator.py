@@ -299,11 +299,16 @@ class Simulator:
 
     def snapshot(self) -> Snapshot:
         """Where all episodes stand now."""
-        return Snapshot(self._copy_state(self._state), self._images, copy.deepcopy(tuple(self._episodes)))
+        episodes = copy.deepcopy(tuple(self._episodes))
+        return Snapshot(self._copy_state(self._state), self.images, episodes, self._identity)
+
+    @property
+    def _identity(self) -> str:
+        return f"{self.model.identity} {self.tokenizer.identity}"
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
-        """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same
-        frames. Raises ConfigError for a snapshot of another model, or of another number of episodes."""
+        """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same frames.
+        Raises ConfigError for a snapshot of another model or tokenizer, or of another number of episodes."""
         require(
             isinstance(snapshot, Snapshot), f"restore takes what `snapshot` returned, got {type(snapshot).__name__}"
         )
@@ -312,7 +317,8 @@ class Simulator:
             f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}",
         )
         kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), state) for state in (snapshot.state, self._state)]
-        require(kinds[0] == kinds[1], "the snapshot is of a simulator of another model")
+        same = snapshot.identity == self._identity and kinds[0] == kinds[1]
+        require(same, "the snapshot is of a simulator of another model or tokenizer")
         self._state, self._images = self._copy_state(snapshot.state), snapshot.images
         self._episodes = list(copy.deepcopy(snapshot.episodes))
         return self.images

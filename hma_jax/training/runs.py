@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
 import jax
+import numpy as np
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, Weights, require
 from hma_jax.config.base import require_choice
 from hma_jax.config.execution import FORMER_FIELDS
-from hma_jax.config.json import from_dict, to_dict
+from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.config.training import PREDICT_FRAMES
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
-from hma_jax.model.params import Declared, Params, inference_params
+from hma_jax.model.params import Declared, Params, inference_params, path_name
 from hma_jax.runtime.devices import default_device
 from hma_jax.training.reading import (
     CheckpointError,
@@ -68,6 +71,15 @@ class Model:
     @property
     def step(self) -> int:
         return self.run.step
+
+    @cached_property
+    def identity(self) -> str:
+        """A hash of the settings, the table and the parameters; these are read from their device once for it."""
+        digest = hashlib.sha256(stable_hash([self.config, self.table]).encode())
+        for path, array in jax.tree.leaves_with_path(self.params):
+            digest.update(path_name(path).encode())
+            digest.update(np.asarray(array).tobytes())
+        return digest.hexdigest()[:16]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (self.run, self.execution)

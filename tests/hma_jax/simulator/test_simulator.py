@@ -1,6 +1,7 @@
 """The simulator against `rollout`, and everything that may be done to its episodes."""
 
 import logging
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from hma_jax.simulator.starts import load_starts, save_starts
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
+from hma_jax.training.runs import Model
 from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, TOKENIZER, actions, parts, simulator, start
 from tests.tiny import TABLE
 
@@ -154,6 +156,40 @@ def test_a_snapshot_of_another_model_changes_nothing():
     with pytest.raises(ConfigError, match="of a simulator of another model"):
         sim.restore(longer)
     assert sim.counts == (1,) and sim.images is not kept.images and np.array_equal(sim.images, before)
+
+
+def test_a_snapshot_of_a_model_of_the_same_architecture_is_refused(tmp_path):
+    """All shapes are equal: it went on, with another model's cache."""
+    sim, (model, tokenizer) = simulator(), parts()
+    params = jax.tree.map(lambda x: x + 0.01 * (x.ndim == 2), model.params)
+    others = {
+        "model": Simulator(replace(model, run=replace(model.run, params=params)), tokenizer),
+        "tokenizer": Simulator(model, LfqTokenizer(TOKENIZER, declare_tokenizer(TOKENIZER).init(1))),
+        "run": Simulator(Model(model.run, model.declared, model.execution), tokenizer),
+    }
+    for one in (sim, *others.values()):
+        one.reset(start(1, 1))
+    kept = sim.snapshot()
+    np.savez(tmp_path / "kept.npz", **as_arrays(kept))
+    for name, other in others.items():
+        with np.load(tmp_path / "kept.npz") as file:
+            read = from_arrays(file, other.snapshot())
+        for snapshot in (kept, read):
+            with pytest.raises(ConfigError, match="another model") if name != "run" else nullcontext():
+                other.restore(snapshot)
+
+
+def test_the_frames_of_a_snapshot_cannot_be_written_to(tmp_path):
+    """They were the simulator's own."""
+    sim = simulator()
+    before = sim.reset(start(1, 1)).copy()
+    kept = sim.snapshot()
+    read = from_arrays({name: x.copy() for name, x in as_arrays(kept).items()}, kept)
+    for snapshot in (kept, read):
+        sim.restore(snapshot)
+        with pytest.raises(ValueError, match="read-only"):
+            snapshot.images[:] = 0
+        np.testing.assert_array_equal(sim.images, before)
 
 
 def test_a_snapshot_from_a_file_is_gone_on_from_and_taken_back(tmp_path):
