@@ -4,7 +4,6 @@ the data, and where its tokenizer is trained."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from experiments.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, get_preset
@@ -14,7 +13,7 @@ from experiments.running.slots import find_accelerators
 from experiments.running.trial import Trial
 from experiments.setting import Setting
 from experiments.study import Study, most_trajectories
-from experiments.sweeps.episodes import count_episodes
+from experiments.sweeps.episodes import count_trained_on
 from experiments.sweeps.sweep import Sweep
 from experiments.words import counted, few, in_thousands
 
@@ -91,11 +90,12 @@ def say_unused(study: Study) -> None:
     many."""
     from data_pipelines.registry import get_spec
 
-    def trained_on(name: str, have: int) -> int:
-        return count_episodes(replace(study, datasets=(name,), unseen=(), trajectory_counts=(have,)), None)
-
-    counts, declared = study.trajectory_counts, {name: get_spec(name).episodes for name in study.dataset_names()}
-    larger = {name: have for name, have in declared.items() if have and trained_on(name, have) > counts[-1]}
+    counts, specs = study.trajectory_counts, [get_spec(name) for name in study.dataset_names()]
+    larger = {
+        spec.name: spec.episodes
+        for spec in specs
+        if (count_trained_on(spec, study.store) or spec.episodes) > counts[-1]
+    }
     if larger:
         having = few([f"{name} has {have:,}" for name, have in larger.items()])
         every = ",".join(map(str, (*counts, max(larger.values()))))

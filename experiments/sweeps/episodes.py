@@ -12,12 +12,16 @@ Expected outcome: perplexity falls and flattens where only the largest robots st
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from experiments.program import run_sweep
-from experiments.study import Study
+from experiments.study import StoreConfig, Study
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
 from experiments.words import counted, few
 from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
 
 
 def plan(study: Study) -> Sweep:
@@ -57,28 +61,39 @@ def plan(study: Study) -> Sweep:
 
 
 def count_episodes(study: Study, cap: int | None) -> int:
-    """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly; of others
-    what the registry says, less those that are held out by hash, as if none was damaged and joined datasets were one.
-    Raises ConfigError where it says nothing."""
+    """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly, of others as
+    `count_trained_on` says. Raises ConfigError where it says nothing."""
     from data_pipelines.registry import get_spec
-    from data_pipelines.sampling.splits import count_held_out
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
     episodes = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
-    given = {name: get_spec(name) for name in study.dataset_names() if name not in episodes}
-    unknown = [name for name, spec in given.items() if not spec.episodes]
+    given = [get_spec(name) for name in study.dataset_names() if name not in episodes]
+    known = {spec.name: count for spec in given if (count := count_trained_on(spec, study.store)) is not None}
+    unknown = [spec for spec in given if spec.name not in known]
+    split = [spec.name for spec in unknown if spec.val_split]
     require(
         not unknown,
-        f"the axis episodes needs the number of trajectories, which is unknown for {few(unknown)}: write `episodes` "
-        "into the entries of your registry (`hma data inspect DIR --entry FILE` counts them), or leave the axis out",
+        "the axis episodes needs the number of training trajectories, which is unknown for "
+        f"{few([spec.name for spec in unknown])}: write `episodes` into the entries of your registry (`hma data inspect "
+        "DIR --entry FILE` counts them), or leave the axis out"
+        + (f"; how many of {few(split)} are in val_split, which is held out, no entry says" if split else ""),
     )
-    own = study.store
-    for name, spec in given.items():
-        held_out = count_held_out(spec.episodes, own.val_fraction, own.min_val, own.max_val, own.max_val_fraction)
-        episodes[name] = spec.episodes - (0 if spec.val_split else held_out)
+    episodes |= known
     most = study.trajectory_counts[-1]
     return sum(min(episodes[name], most, cap or most) for name in study.dataset_names())
+
+
+def count_trained_on(spec: DatasetSpec, settings: StoreConfig) -> int | None:
+    """Trajectories that the registry says a dataset has, less those that are held out by hash, as if none was damaged
+    and joined datasets were one. None where it does not say how many there are, or how many are in the split that is
+    held out."""
+    from data_pipelines.sampling.splits import count_held_out
+
+    if not spec.episodes or spec.val_split:
+        return None
+    bounds = settings.val_fraction, settings.min_val, settings.max_val, settings.max_val_fraction
+    return spec.episodes - count_held_out(spec.episodes, *bounds)
 
 
 if __name__ == "__main__":

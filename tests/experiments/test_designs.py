@@ -151,7 +151,7 @@ def test_trajectories_that_nobody_counted_are_not_counted_as_none(monkeypatch):
     counts, split = {"mine": 300, "yours": 40}, {"mine": "", "yours": ""}
     monkeypatch.setattr(
         "data_pipelines.registry.get_spec",
-        lambda name: SimpleNamespace(episodes=counts[name], val_split=split[name]),
+        lambda name: SimpleNamespace(name=name, episodes=counts[name], val_split=split[name]),
     )
     study = replace(CPU_FULL, datasets=tuple(counts), dataset_counts=(1, 2), unseen=(), trajectory_counts=(4, 200))
 
@@ -162,11 +162,15 @@ def test_trajectories_that_nobody_counted_are_not_counted_as_none(monkeypatch):
     assert found() == [(8, 4), (32, 16), (96, 64), (232, 200)]
     counts |= {"mine": 20, "yours": 20}  # 5 of each are held out: 16 and all of them were the same training twice
     assert found() == [(8, 4), (30, 200)]
-    split["yours"] = "val"
-    assert found() == [(8, 4), (31, 16), (35, 200)]
-    counts["yours"] = 0
+    split["yours"] = "val"  # `episodes` are of both splits
     with pytest.raises(
-        ConfigError, match="needs the number of trajectories, which is unknown for yours: write `episodes` into"
+        ConfigError, match="unknown for yours: .* leave the axis out; how many of yours are in val_split"
+    ):
+        find_axis("episodes")(study)
+    counts["yours"], split["yours"] = 0, ""
+    with pytest.raises(
+        ConfigError,
+        match="needs the number of training trajectories, which is unknown for yours: write `episodes` into",
     ):
         find_axis("episodes")(study)
 
