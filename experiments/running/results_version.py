@@ -37,6 +37,8 @@ OF_SOME = {
     "frames of what predicts none are not judged: inverse dynamics": {"train.masking.setting": "inverse"},
     "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
     "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
+    "the average of a robot's weights goes on in steps without it": {"train.ema_decay": 0.999},
+    "the average of a robot's weights goes on in steps without it, at 0.99": {"train.ema_decay": 0.99},
 }
 """Changes that alter the numbers of a few trials only: those whose fields have such values. They are part of the names
 of these trials, and all others stay finished."""

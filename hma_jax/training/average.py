@@ -5,18 +5,18 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from hma_jax.model.params import Params, ParamSpec, is_spec
-from hma_jax.training.optimizer import Presence
+from hma_jax.model.params import Params
 
 
-def update_average(ema: Params, params: Params, specs: Params, presence: Presence, decay: float) -> Params:
-    """decay * ema + (1 - decay) * params, for the parameters that the step updates (`Presence`).
+def update_average(ema: Params, params: Params, decay: float) -> Params:
+    """decay * ema + (1 - decay) * params, for all robots, those without an example too, whose parameters stand still.
 
-    The average starts as a copy of the initial parameters. A robot without an example keeps its average as it keeps its
-    parameters: its average is over the steps that had examples of it.
+    The average starts as a copy of the initial parameters. All of it is of the same steps: were a robot's only of those
+    that had examples of it, a rare robot's would be of weights from before the learning rate fell.
     """
 
-    def update(spec: ParamSpec, old: jax.Array, new: jax.Array) -> jax.Array:
-        return jnp.where(presence.of(spec), decay * old + (1 - decay) * new, old)
+    def update(old: jax.Array, new: jax.Array) -> jax.Array:
+        # The average of what is never trained stays the same to the bit, where the sum would be rounded.
+        return jnp.where(old == new, old, decay * old + (1 - decay) * new)
 
-    return jax.tree.map(update, specs, ema, params, is_leaf=is_spec)
+    return jax.tree.map(update, ema, params)
