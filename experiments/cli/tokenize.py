@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from rich.markup import escape
 from tyro.conf import arg
@@ -21,15 +20,9 @@ from experiments.setting import Setting, make_setting, short
 from experiments.sweeps.sweep import reference_trial
 from experiments.wrote import wrote
 from hma_jax.config import require
-from hma_jax.config.json import diff, to_dict
-from hma_jax.runtime.files import write_file
-from hma_jax.runtime.locks import Lock
 
 if TYPE_CHECKING:
     from experiments.preparing.sources import Source
-
-ASKED = ".asked.json"
-"""What the process that holds a directory was asked to make in it."""
 
 
 def tokenize(
@@ -69,11 +62,10 @@ def prepare_together(
         say_scale(setting, [dataclasses.replace(whole, max_trajectories=None)])
     with ExitStack() as stack:
         try:
-            lock = stack.enter_context(setting.workspace.locked())
+            stack.enter_context(setting.workspace.locked())
         except Busy as busy:
             _take_part(setting, busy, batch, threads, replace)
         else:
-            _write_asked(setting, lock)
             prepare(
                 setting.study, setting.workspace, setting.data, setting.tokenizer,
                 replace=replace, batch=batch, threads=threads,
@@ -81,42 +73,9 @@ def prepare_together(
     _finish(setting)
 
 
-def _asked(setting: Setting) -> dict[str, Any]:
-    """What tokens and windows depend on beside the contents of data and tokenizer, under the names that --set has."""
-    study = setting.study
-    return {
-        "datasets": study.all_names(),
-        "store": to_dict(study.store),
-        "rate": study.rate,
-        "model.frames": study.model.frames,
-        "eval": {name: getattr(study.eval, name) for name in ("seed", "windows_per_dataset", "prompt_frames")},
-        "--tokenizer": "given" if setting.tokenizer else "not given",
-    }
-
-
-def _write_asked(setting: Setting, lock: Lock) -> None:
-    """For those that join while this process, named by `lock`, holds the directory."""
-    asked = {"holder": lock.holder.token, "asked": _asked(setting)}
-    write_file(setting.workspace.root / ASKED, json.dumps(asked))
-
-
-def _require_same_asked(setting: Setting, busy: Busy) -> None:
-    """Raises Busy if the process that holds the directory was asked for something else, where it says so."""
-    try:
-        written = json.loads((setting.workspace.root / ASKED).read_text())
-    except FileNotFoundError:  # another command
-        return
-    lines = diff(written["asked"], _asked(setting))
-    if busy.holder is not None and written["holder"] == busy.holder.token and lines:
-        raise Busy(
-            f"{busy}. The work cannot be shared, since that one was asked for something else (there -> here):\n  "
-            + "\n  ".join(lines),
-            busy.holder,
-        )
-
-
 def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
     """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
+    from experiments.preparing.asked import require_same_asked
     from experiments.preparing.sources import find_sources, find_suite
     from experiments.preparing.store import make_store
     from experiments.preparing.tokenizer import require_same_tokenizer
@@ -129,13 +88,13 @@ def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | N
     if not tokenizer.is_dir():
         advice = f"Start this again when the tokenizer exists, or train it first: {setting.command('tokenizer train')}"
         raise Busy(f"{tokenizer}: no tokenizer yet, and {busy}. {advice}", busy.holder)
-    _require_same_asked(setting, busy)
     require_same_windows(study, workspace, None)
     if setting.data:
         sources = find_sources(study, setting.data)
     else:
         advice = f"Start this again when they exist, or make them first: {setting.command('data suite')}"
         sources = find_suite(study, workspace, advice)
+    require_same_asked(study, workspace, sources, setting.tokenizer, busy)
     require_same_tokenizer(setting.tokenizer, study, workspace, sources)
     console.print(f"sharing the work with {busy.who}, which prepares {short(workspace.root)}", soft_wrap=True)
     make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.preparing.asked import write_asked
 from experiments.preparing.counterfactual import make_counterfactual
 from experiments.preparing.made_from import Step
 from experiments.preparing.sources import check_sources, find_sources
@@ -47,6 +48,7 @@ def prepare(
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     check_sources(study, sources)
+    write_asked(study, workspace, sources, tokenizer)
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace)
     else:

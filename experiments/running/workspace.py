@@ -16,8 +16,10 @@ from experiments.study import Study
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
-from hma_jax.runtime.locks import Held, Lock, exclusive
+from hma_jax.runtime.locks import Held, Holder, Lock, exclusive, read_holder
 from hma_jax.runtime.outputs import unwritable
+
+LOCK = ".lock"
 
 
 class Busy(Held):
@@ -148,8 +150,13 @@ class Workspace:
         """Which study lives here."""
         return self.root / "study.json"
 
+    @property
+    def holder(self) -> Holder | None:
+        """Who holds the right to write in it; None if nobody does."""
+        return read_holder(self.root / LOCK)
+
     @contextmanager
-    def locked(self, lock: str = ".lock") -> Iterator[Lock]:
+    def locked(self, lock: str = LOCK) -> Iterator[Lock]:
         """Makes the directory and holds the right to write in it, or what another `lock` is for; it dies with its
         process.
 

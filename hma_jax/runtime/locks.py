@@ -87,7 +87,7 @@ class Lock:
         A lock file that cannot be read now, as on a shared disk that does not answer for a while, counts as held.
         """
         try:
-            return _read_holder(self.path) != self.holder
+            return read_holder(self.path) != self.holder
         except OSError:
             return False
 
@@ -118,7 +118,7 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
                 yield lock
         finally:
             with suppress(OSError):  # a disk that does not answer: what is left in the file ends with the lock or lease
-                if _read_holder(path) == lock.holder:
+                if read_holder(path) == lock.holder:
                     if remove:
                         path.unlink(missing_ok=True)
                     else:
@@ -142,7 +142,7 @@ def _open(path: Path, lease: bool) -> tuple[int, bool]:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             locked = _flock(fd)
-            holder = _read_holder(path)
+            holder = read_holder(path)
             if locked is None or lease and _leased(path, holder, locked):
                 held = Held(f"{path} is held by {holder or 'another process'}; wait for it or stop it", holder)
                 raise held
@@ -186,7 +186,7 @@ def _same_file(fd: int, path: Path) -> bool:
         return False
 
 
-def _read_holder(path: Path) -> Holder | None:
+def read_holder(path: Path) -> Holder | None:
     """None if it is gone, given back, or its holder has not written its name yet. Raises OSError if it cannot be
     read."""
     try:

@@ -15,12 +15,14 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.publishing.output_lock import lock_output
+from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.tokens import part_maker
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli import tokenize as cli_tokenize
 from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import sources
+from experiments.preparing.asked import write_asked
 from experiments.preparing.store import say_unreached_rates
 from experiments.progress import Eta
 from experiments.running.workspace import Workspace
@@ -126,14 +128,34 @@ def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, 
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path)]
     shutil.copytree(tokenizer[1], tmp_path / "tokenizer")  # trained on both datasets
     setting = make_setting(StudyArguments("smoke", tmp_path, tuple(data[1:])))
-    with Workspace(tmp_path).locked() as lock:
+    found = sources.find_sources(setting.study, setting.data)
+    with Workspace(tmp_path).locked():
         assert main([*arguments, *data[:2]]) == 2
         assert f"datasets: 2 -> 1, without {BASE.name}" in capsys.readouterr().err.replace("\n", " ")
-        cli_tokenize._write_asked(setting, lock)
+        write_asked(setting.study, setting.workspace, found, None)
         assert main([*arguments, *data, *tokenizer, "--set", "store.min_val=1", "--set", "model.frames=3"]) == 2
         message = capsys.readouterr().err
-        assert "cannot be shared" in message and "--tokenizer: 'not given' -> 'given'" in message
+        assert "cannot be shared" in message and "--tokenizer: 'not given' -> '" in message
         assert "store.min_val: 2 -> 1" in message and "model.frames: " in message
+    assert not (tmp_path / "tokens").exists()
+
+
+def test_who_has_other_recordings_or_entries_of_the_same_names_does_not_join(
+    data, tokenizer, tmp_path, capsys, monkeypatch
+):
+    """It tokenised them for hours before it was refused."""
+    monkeypatch.setattr(cli_tokenize, "_freeze", lambda *_: stop())
+    setting = make_setting(StudyArguments("smoke", tmp_path, tuple(data[1:]), tokenizer=Path(tokenizer[1])))
+    found = sources.find_sources(setting.study, setting.data)
+    other = str(write_rlds(tmp_path / "other", ARM, LENGTHS[::-1]))
+    (tmp_path / "my.toml").write_text(to_toml(replace(BASE, hz=BASE.hz + 1)))
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), "--data", other, data[2], *tokenizer]
+    with Workspace(tmp_path).locked():
+        write_asked(setting.study, setting.workspace, found, setting.tokenizer)
+        assert main([*arguments, "--registry", str(tmp_path / "my.toml")]) == 2
+        message = capsys.readouterr().err
+        assert "cannot be shared" in message and f"data.{ARM.name}.recordings: " in message
+        assert f"data.{BASE.name}.entry.hz: {BASE.hz} -> {BASE.hz + 1}" in message
     assert not (tmp_path / "tokens").exists()
 
 
