@@ -197,6 +197,7 @@ def _print_summary(summary: dict) -> None:
         NOTHING,
         describe_clipping,
         describe_control,
+        describe_few_policies,
         describe_head,
         describe_recorded_head,
     )
@@ -213,6 +214,7 @@ def _print_summary(summary: dict) -> None:
         describe_recorded_head(summary["head"]),
         describe_control(summary),
         describe_clipping(summary),
+        describe_few_policies(summary),
         "" if agreement else NOTHING,
     ):
         if text:

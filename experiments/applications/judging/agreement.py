@@ -19,12 +19,18 @@ from experiments.analysis.intervals import LEVEL, Interval
 
 DRAWS = 2000
 
+LEAST_POLICIES = 5
+"""Of which intervals of correlations and rank violation over policies are known: of fewer, many resamples have one or
+two different policies, which have no order or are always in perfect order or disorder."""
+
 Measure = Callable[[np.ndarray, np.ndarray], float]
 
 
 def pearson(true: np.ndarray, learned: np.ndarray) -> float:
-    """nan where one of them does not vary."""
-    if np.ptp(true) == 0 or np.ptp(learned) == 0:  # the mean of equal rates need not be one of them to the last bit
+    """nan where one of them does not vary, and of two, of which it is 1 or -1 whatever they are."""
+    if (
+        len(true) < 3 or np.ptp(true) == 0 or np.ptp(learned) == 0
+    ):  # the mean of equal rates need not be one of them to the last bit
         return math.nan
     a, b = true - true.mean(), learned - learned.mean()
     return float((a * b).sum() / math.sqrt(float((a * a).sum() * (b * b).sum())))
@@ -60,7 +66,7 @@ MEASURES: dict[str, Measure] = {
 class Agreement:
     """Measures of two worlds' success rates, with intervals over other policies of the kind and other starts."""
 
-    measures: dict[str, Interval]
+    measures: dict[str, Interval]  # of fewer than LEAST_POLICIES without the interval, but for the bias
     over_starts: dict[str, Interval]  # these policies, other starts
 
 
@@ -77,9 +83,11 @@ def agree_with_counts(
     successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS
 ) -> Agreement:
     """As `agree`, of policies of which elsewhere so many of so many episodes succeeded. Those are of other starts:
-    while the model's are resampled, each count is drawn anew from a binomial distribution of its own rate."""
-    rates, rng = successes_P / episodes_P, np.random.default_rng([0, 18])
-    return _agree(rates, lambda columns: rng.binomial(episodes_P, rates) / episodes_P, learned_PM, draws)
+    while the model's are resampled, each rate is drawn from what its count tells of it: Beta(s + 1/2, n - s + 1/2) of s
+    successes in n episodes (Jeffreys' prior), which leaves doubt at 0 and at n too."""
+    rng, failures_P = np.random.default_rng([0, 18]), episodes_P - successes_P
+    draw = lambda columns: rng.beta(successes_P + 0.5, failures_P + 0.5)  # noqa: E731
+    return _agree(successes_P / episodes_P, draw, learned_PM, draws)
 
 
 def _agree(
@@ -98,6 +106,8 @@ def _agree(
                 kept[name].append(measure(rates[0][which], rates[1][which]))
     value = {name: measure(true_P, learned_PM.mean(1)) for name, measure in MEASURES.items()}
     size = {"n": policies * starts, "episodes": starts}
+    if policies < LEAST_POLICIES:
+        drawn_measures[0].update({name: [] for name in MEASURES if name != "bias"})
     both, alone = (
         {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in drawn_measures
     )
@@ -123,10 +133,15 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS) -> Inte
 
 def mean_above(a_PM: np.ndarray, b_PM: np.ndarray, draws: int = DRAWS) -> Interval:
     """By how much the success of P policies at M starts is higher in `a_PM` than in `b_PM`, both bool [P, M], on
-    average; over other policies and starts."""
+    average; over other policies and starts. Where all differ alike, resampling knows no spread: as many episodes as
+    Wilson's interval of none of them allows may then differ by one more or less."""
     apart = a_PM.astype(float) - b_PM
     drawn = np.array([apart[np.ix_(rows, columns)].mean() for rows, columns in _resamples(*apart.shape, draws)])
-    return _interval(float(apart.mean()), drawn, {"n": apart.size, "episodes": apart.shape[1]})
+    above = _interval(float(apart.mean()), drawn, {"n": apart.size, "episodes": apart.shape[1]})
+    if np.ptp(apart) > 0:
+        return above
+    others = count_interval(0, apart.size).high
+    return dataclasses.replace(above, low=max(above.mean - others, -1.0), high=min(above.mean + others, 1.0))
 
 
 def _resamples(policies: int, starts: int, draws: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

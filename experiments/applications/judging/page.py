@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
-from experiments.applications.judging.agreement import count_interval
+from experiments.applications.judging.agreement import LEAST_POLICIES, count_interval
 from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
 from experiments.applications.judging.recordings import LAST
@@ -151,7 +151,7 @@ def write_page(judged: Judgement, summary: dict[str, Any], out: Path, command: s
 def _doubts(summary: dict[str, Any]) -> list[str]:
     return [
         f"<p><b>{html.escape(warning)}</b></p>"
-        for warning in (describe_control(summary), describe_clipping(summary))
+        for warning in (describe_control(summary), describe_clipping(summary), describe_few_policies(summary))
         if warning
     ]
 
@@ -175,12 +175,11 @@ def _agreement(summary: dict[str, Any]) -> str:
     ]
     heading = table(["compared", "interval over other", *measures], agreed, text=2)
     if summary["compared with"] == REAL:
-        counted = [name for name, rates in summary["policies"].items() if rates[REAL]["mean"] is not None]
         return section(
             "Agreement with the real robot",
             heading,
-            f"<p>Over the {len(counted)} policies with counts of the robot. Intervals over starts resample those of the model "
-            "and draw the robot's successes anew from its rates.</p>",
+            f"<p>Over the {len(_compared(summary))} policies with counts of the robot. Intervals over starts resample those "
+            "of the model and draw the robot's rates from what its counts tell of them.</p>",
         )
     return section(
         "Agreement with the true simulator",
@@ -223,6 +222,23 @@ def describe_control(summary: dict[str, Any]) -> str:
         f"are executed: the difference is {shown(above)} on average over policies. If there is none, the rates do not show "
         "what policies do, whatever they are compared with, or all starts are alike: look at the clips."
     )
+
+
+def describe_few_policies(summary: dict[str, Any]) -> str:
+    """A warning that the agreement is that of few policies; "" where these are enough, or nothing is compared."""
+    compared = _compared(summary)
+    if not compared or len(compared) >= LEAST_POLICIES:
+        return ""
+    return (
+        f"Only {len(compared)} policies are compared: how well they are told apart says little about others. Correlations and "
+        f"rank violation have an interval over other policies from {LEAST_POLICIES} on, correlations a value from 3."
+    )
+
+
+def _compared(summary: dict[str, Any]) -> list[str]:
+    """Policies with a rate outside the model."""
+    column = summary["compared with"]
+    return [name for name, rates in summary["policies"].items() if column and rates[column]["mean"] is not None]
 
 
 def describe_recorded_head(measured: dict[str, float]) -> str:

@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from experiments.applications.judging.agreement import agree, pearson, rank_violation, rate_interval, share, spearman
+from experiments.applications.judging.agreement import (
+    LEAST_POLICIES,
+    agree,
+    agree_with_counts,
+    count_interval,
+    mean_above,
+    pearson,
+    rank_violation,
+    rate_interval,
+    share,
+    spearman,
+)
 from experiments.applications.judging.head import auroc
 
 
@@ -29,6 +40,37 @@ def test_a_faithful_world_has_a_high_interval_and_one_without_relation_has_none(
     assert blind.low < 0 < blind.high
     starts = agree(true, true, draws=100).over_starts["bias"]
     assert (starts.mean, starts.low, starts.high) == (0, 0, 0)
+
+
+def test_few_policies_have_no_interval_over_policies_and_two_no_correlation():
+    """A resample of two has one of them, or a correlation of 1 or -1: the interval was 1.00 to 1.00."""
+    rng = np.random.default_rng(0)
+    for policies in (2, 3, LEAST_POLICIES - 1, LEAST_POLICIES):
+        true, learned = (rng.random((policies, 40)) < np.linspace(0.1, 0.9, policies)[:, None] for _ in range(2))
+        found = agree(true, learned, draws=100)
+        for name in ("pearson", "spearman", "rank violation"):
+            over_policies, over_starts = found.measures[name], found.over_starts[name]
+            assert np.isfinite(over_policies.low) == (policies >= LEAST_POLICIES), (policies, name)
+            known = policies > 2 or name == "rank violation"
+            assert np.isfinite(over_policies.mean) == np.isfinite(over_starts.low) == known, (policies, name)
+        assert found.measures["bias"].low < found.measures["bias"].high
+
+
+def test_a_robot_that_always_or_never_succeeded_leaves_doubt():
+    learned = np.repeat([[False], [True], [True]], 40, 1)
+    found = agree_with_counts(np.array([0, 3, 3]), np.array([3, 3, 3]), learned, draws=200)
+    assert found.measures["pearson"].mean == pytest.approx(1) and found.over_starts["pearson"].low < 0.95
+    assert found.over_starts["bias"].low < -0.05 and found.over_starts["bias"].high > 0.05
+
+
+def test_policies_that_are_all_alike_are_not_sure_to_be():
+    none = count_interval(0, 40).high  # of 40 episodes, so many may be otherwise
+    every, no = np.ones((4, 10), bool), np.zeros((4, 10), bool)
+    for a, b, low, mean, high in (
+        (every, no, 1 - none, 1, 1), (no, every, -1, -1, none - 1), (every, every, -none, 0, none)
+    ):  # fmt: skip
+        above = mean_above(a, b, draws=20)
+        assert (above.low, above.mean, above.high) == pytest.approx((low, mean, high))
 
 
 def test_intervals_of_rates_hold_at_the_ends():
