@@ -14,7 +14,7 @@ from experiments.analysis.controllability import Controllability, controllabilit
 from experiments.report.pieces import pm, table
 from experiments.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.running.provenance import Provenance
-from experiments.running.trial import trial_id
+from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.statistics import mean_and_sem
@@ -49,13 +49,11 @@ def robots_of(
 ) -> list[Robot]:
     """Of the scope of a sweep, by the trials at its default, the most controllable first. Where each seed judges robots
     of its own, of those seeds that judge all of the scope."""
-    tables, rate = {}, None
-    for p in sweep.points:
-        id = trial_id(p.trial, provenance)
-        whole = set(sweep.scope) <= set(p.trial.evaluated)
-        if p.role == POINT and p.x == sweep.reference_x and whole and id in windows:
-            tables[p.trial.train.seed] = windows[id]
-            rate = p.trial.rate
+    judging = _judging(sweep)
+    ids = {seed: trial_id(trial, provenance) for seed, trial in judging.items()}
+    tables = {seed: windows[id] for seed, id in ids.items() if id in windows}
+    rows = _rows_of(rows, sweep)
+    rate = next((judging[seed].rate for seed in tables), None)
     follows: dict[str, dict[str, Controllability]] = {name: {} for name in sweep.scope}
     for line in controllability(tables, rate=rate) if tables else ():
         follows.setdefault(line.robot, {})[line.metric] = line
@@ -66,6 +64,22 @@ def robots_of(
             errors = _errors_of_rows(rows, sweep, name)
         robots.append(Robot(name, errors, *_ahead(rows, sweep, name, list(tables.values())), follows[name]))
     return sorted(robots, key=lambda r: -r.errors if not math.isnan(r.errors) else math.inf)
+
+
+def _judging(sweep: Sweep) -> dict[int, Trial]:
+    """{seed: its trial at the default}, of the seeds that judge the robots of the sweep's scope and no others."""
+    scope = set(sweep.scope)
+    return {
+        p.trial.train.seed: p.trial
+        for p in sweep.points
+        if p.role == POINT and p.x == sweep.reference_x and set(p.scope or scope) == scope <= set(p.trial.evaluated)
+    }
+
+
+def _rows_of(rows: Sequence[Row], sweep: Sweep) -> list[Row]:
+    """Of one sweep, and of the seeds whose robots are shown: what they judge is one set of windows."""
+    seeds = _judging(sweep)
+    return [r for r in of_sweep(rows, sweep.name) if r.seed in seeds]
 
 
 def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
@@ -111,7 +125,7 @@ def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
 
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:
     """A line per robot, and the mean; data.json says how much there was of each."""
-    data, rows = read_data(data_summary), of_sweep(rows, sweep.name)
+    data, rows = read_data(data_summary), _rows_of(rows, sweep)
     measured = {r.metric for r in rows}
     metrics = [m for m in COLUMNS if m in measured]
     follows = [m for m in FOLLOWS if any(m in r.follows for r in robots)]
@@ -139,7 +153,10 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
     }
     lines = [[html.escape(robot.name), *(of_robot(robot) for of_robot, _ in columns.values())] for robot in robots]
     lines.append(["<b>all</b>", *(of_all for _, of_all in columns.values())])
-    return f"<p>{_words(robots, follows, bool(shares), 'psnr' in metrics)}</p>" + table(["robot", *columns], lines)
+    seeds = ", ".join(map(str, _judging(sweep)))
+    whose = f"Each seed judges robots of its own: these are those of seed {seeds}. " * sweep.robots_vary
+    words = whose + _words(robots, follows, bool(shares), "psnr" in metrics)
+    return f"<p>{words}</p>" + table(["robot", *columns], lines)
 
 
 def are_sorted(robots: Sequence[Robot]) -> bool:

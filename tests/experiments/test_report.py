@@ -15,6 +15,7 @@ from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.findings import read_findings
 from experiments.report.numbers import Numbers
+from experiments.report.pieces import pm
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import ERROR, LogTicks, count, drawn_curve, save
@@ -336,6 +337,20 @@ def test_robots_that_are_others_for_every_seed_are_shown_of_the_seed_that_judges
     assert all(line.seeds == 1 for r in robots for line in r.follows.values()) and not any(
         np.isnan(r.ahead) for r in robots
     )
+
+
+def test_robots_of_one_seed_are_not_averaged_with_those_of_others(drawn, tmp_path):
+    """A robot that two seeds judge was shown over both, and the line of all robots over all that any seed judges."""
+    sweep, names = plan_width(STUDY), STUDY.dataset_names()
+    sweep = replace(sweep, points=tuple(replace(p, scope=names[p.trial.train.seed :]) for p in sweep.points))
+    rows = rows_of(drawn, [sweep])
+    lines = describe_robots(rows, sweep, robots_of(rows, sweep, PROVENANCE, {}), tmp_path / "data.json")
+    assert "Each seed judges robots of its own: these are those of seed 0." in lines
+    at = [r for r in rows if (r.x, r.role, r.metric) == (sweep.reference_x, POINT, "perplexity")]
+    for scope, shown in ((names[1], names[1]), (OVERALL, "<b>all</b>")):
+        first, _ = sorted((r for r in at if r.scope == scope), key=lambda r: r.seed)
+        line = lines[lines.index(f">{shown}<") :]
+        assert f">{pm(first.mean, first.sem)}<" in line[: line.index("</tr>")]
 
 
 @pytest.mark.parametrize("axes", [("settings", "width"), ("conditioning", "horizon"), ("newcomers", "horizon")])
