@@ -1,5 +1,6 @@
 # `make study` runs the scaling study, `make play` serves a page on which a trained model is driven, `make test`
-# runs the tests. All first create .venv and install into it. PYTHON=python3.12 chooses the interpreter.
+# runs the tests. All first create .venv and install into it, which is all that `make install` does. PYTHON=python3.12
+# chooses the interpreter.
 
 PYTHON ?= python3
 VENV := .venv
@@ -9,23 +10,31 @@ PRESET ?= cpu
 WORKERS ?= 2
 PORT ?= 8765
 EXTRA ?=
-ifneq ($(EXTRA),$(filter cuda cuda12 tpu,$(EXTRA)))
-$(error EXTRA is '$(EXTRA)': give cuda, cuda12 or tpu, or leave it out for the processor)
+ifneq ($(EXTRA),)
+EXTRAS := $(shell sed -n '/^.project.optional/,/^\[/s/^\([a-z0-9]*\) = .*/\1/p' pyproject.toml)
+COMMA := ,
+ifneq ($(word 2,$(EXTRA))$(filter-out $(EXTRAS),$(subst $(COMMA), ,$(EXTRA))),)
+$(error EXTRA is '$(EXTRA)': give any of $(EXTRAS), separated by commas without spaces, or leave it out)
+endif
 endif
 
 # What is imported is compiled once and kept in .venv: hundreds of processes of the tests would each compile it again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help study play test test-slow clean
+.PHONY: help install study play test test-slow clean
 
 help:
+	@echo "make install    only install (EXTRA=cuda,convert: extras of pyproject.toml, separated by commas)"
 	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS); EXTRA=cuda, cuda12 or tpu)"
 	@echo "make play       drive a trained model in the browser (RUN=a training run, PORT=$(PORT))"
 	@echo "make test       run the tests that take less than about 20 s each"
 	@echo "make test-slow  run the others too"
 	@echo "make clean      remove the environment and caches; results under runs/ stay"
 
-# EXTRA is what JAX computes on: nothing for the processor, cuda (CUDA 13), cuda12 (for older drivers) or tpu.
+# EXTRA is what is installed besides: for other devices than the processor cuda (CUDA 13), cuda12 (for older drivers) or tpu.
+install: $(VENV)/installed$(addprefix -,$(EXTRA))
+	@echo "to use it in this shell: . $(BIN)/activate"
+
 study: $(VENV)/installed$(addprefix -,$(EXTRA))
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 

@@ -12,6 +12,8 @@ import importlib.util
 import itertools
 import re
 import shlex
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -196,6 +198,25 @@ def test_every_command_in_backticks_parses(parsed, capsys):
 def test_what_is_wrong_is_found(command, wrong, parsed, capsys):
     said = complaint(command, parsed, capsys, whole=True)
     assert (said is None) if wrong is None else (said and wrong in said), said
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        ("", "install .\n"),
+        ("cuda,convert,slurm", "install '.[cuda,convert,slurm]'\n"),
+        ("cuda convert", None),
+        ("cudda", None),
+    ],
+)
+def test_make_install_takes_the_extras_that_there_are(extra, said, tmp_path):
+    words = ["make", "-n", "install", f"EXTRA={extra}", f"VENV={tmp_path}"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    if said is None:
+        assert done.returncode and f"EXTRA is '{extra}': give any of cuda cuda12 tpu remote convert " in done.stderr
+    else:
+        assert not done.returncode and said in done.stdout
 
 
 def test_blocks_are_read_as_a_shell_does():
