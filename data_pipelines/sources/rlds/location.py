@@ -1,7 +1,7 @@
 """Locations of dataset files: paths on a disk, or URLs of any object store that fsspec supports.
 
 Owns the difference between the two, which no other module sees: a location has the methods of `pathlib.Path`
-either way, and any range of its bytes can be read without the others. Remote locations (gs://, s3://, hf://,
+either way, and any range of its bytes can be read without the others. Remote locations (gs://, s3://,
 memory://, ...) are `upath.UPath` objects, of the extra `remote`.
 """
 
@@ -80,8 +80,8 @@ def locate(text: str | Path | UPath) -> Location:
         location.fs  # noqa: B018  imports what the protocol needs
     except ImportError as error:
         raise ConfigError(
-            f"{text}: cannot be opened ({error}). Remote locations need the extra 'remote': "
-            "pip install 'hma-jax[remote]', or copy the dataset to a disk."
+            f"{text}: cannot be opened ({error}). gs:// and s3:// need the extra 'remote' (pip install 'hma-jax[remote]'), "
+            "other protocols also the package that fsspec asks for. Or copy the dataset to a disk."
         ) from error
     except ValueError as error:
         message = f"{text}: fsspec does not know this kind of location ({error}). Correct its protocol."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import sys
 import tempfile
 
 import numpy as np
@@ -177,6 +178,11 @@ def test_paths_stay_paths_and_urls_stay_urls(tmp_path, monkeypatch):
     assert not is_remote(tmp_path / "odd://name")
 
 
-def test_unknown_protocol_is_one_clear_message():
+def test_unknown_protocol_is_one_clear_message(monkeypatch):
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(
+        ConfigError, match="hf://x: .*huggingface_hub.*other protocols also the package that fsspec asks"
+    ):
+        locate("hf://x")
     with pytest.raises(ConfigError, match="nowhere://x: fsspec does not know this kind of location"):
         locate("nowhere://x")
