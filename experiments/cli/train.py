@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -385,6 +386,7 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
 
     prepared = open_prepared_data(setting.workspace)
     say_data(trial, prepared)
+    say(f"logs: {short(run)} (tensorboard --logdir {shlex.quote(short(run))})")
     steps, made = trial.train.steps, newest_step(run)
     there = f", of which it has {made:,}" if made else ""
     each = counted(trial.train.batch, "window")

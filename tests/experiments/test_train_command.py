@@ -70,6 +70,8 @@ def test_all_trajectories_unless_told_otherwise(train, tmp_path):
     said, trial, _ = train()
     assert trial.max_trajectories is None
     assert "training on 1 of 2 robots: 10 of 13 trajectories, 30 windows of 4 frames" in said
+    assert f"\nlogs: {tmp_path / 'run'} (tensorboard --logdir {tmp_path / 'run'})\n" in said
+    assert list((tmp_path / "run" / "tensorboard").iterdir())
     assert (
         f"note: not trained on {BASE.name}: a window has at least 2 frames, which at stride 2 need 4 native frames"
         in said
