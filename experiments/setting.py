@@ -45,7 +45,8 @@ class StudyArguments:
     """Which study, on which data, in which directory, on which devices."""
 
     preset: Preset = "cpu"
-    """Named study: smoke (seconds), cpu (minutes), cpu-full (17 hours), accelerator (one GPU), paper (as published).
+    """Named study: smoke (seconds), cpu (minutes), cpu-full (17 hours of two cores), accelerator (one GPU),
+    paper (as published).
     With -continuous: tokens are latents instead of ids. play-gpu: the model of `make play`; play: a smaller one."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/PRESET)")] = None
     """Directory for all output."""
@@ -63,7 +64,7 @@ class StudyArguments:
     """Change one setting, such as --set model.frames=4 --set train.steps=100.
     --set help lists all settings, --set model.help those of a group."""
     mesh: Annotated[tuple[int, int, int] | None, arg(metavar="DATA FSDP TENSOR"), UNSET] = None
-    """Number of devices for data, fsdp and tensor parallelism; -1 takes all that are left.
+    """Number of devices for data, fsdp and tensor parallelism; -1 takes all that are left. Presets have -1 1 1.
     Short for --set execution.mesh.data=... and so on. Does not change results."""
 
     def anywhere(self) -> StudyArguments:

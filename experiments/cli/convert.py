@@ -175,7 +175,7 @@ def to_stablehlo(
         unmask_steps: Unmasking steps per generated frame.
         temperature: 0 takes the most likely tokens, 1 samples from the model's distribution.
         sampler_steps: Steps of the diffusion sampler; no effect on discrete models.
-        sampler: The diffusion sampler; dpm++ needs 10 to 12 steps.
+        sampler: The diffusion sampler; dpm++ needs 8 to 12 steps.
         platforms: Platforms that the program can run on.
         weights: last: the last weights; ema: their moving average; auto: the average if there is one.
     """

@@ -31,22 +31,23 @@ class Hosts:
     lost_after: Annotated[float, arg(name="lost-after", metavar="SECONDS")] = 90.0
     """If a process gives no sign of life for so long, the others end with exit code 75."""
 
-    def _settings(self) -> Processes:
+    def _settings(self, detect: bool) -> Processes:
         from hma_jax.runtime.processes import Processes
 
         return Processes(
-            self.coordinator, self.processes, self.process, self.distributed, self.start_timeout, self.lost_after
+            self.coordinator, self.processes, self.process, detect, self.start_timeout, self.lost_after
         ).or_from(os.environ)
 
     def count(self) -> int:
-        """How many processes are asked for; 1 also where --distributed is to find it out."""
-        return self._settings().processes or 1
+        """How many processes are asked for, whether or not they are told how to meet; 1 also where --distributed is to
+        find it out."""
+        return self._settings(detect=True).processes or 1
 
     def join(self) -> None:
         """Joins the other processes, if there are any; from then on only process 0 writes to the screen."""
         from hma_jax.runtime.processes import start
 
-        settings = self._settings()
+        settings = self._settings(self.distributed)
         if not settings.several:
             return
         start(settings)

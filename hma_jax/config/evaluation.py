@@ -25,7 +25,7 @@ class SamplerConfig:
     """
 
     kind: SamplerKind = "ddpm"  # sampler of the diffusion heads
-    steps: int = 100  # sampler steps (evaluations of the denoiser); 10 to 12 are enough for dpm++
+    steps: int = 100  # sampler steps (evaluations of the denoiser); 8 to 12 are enough for dpm++
     temperature: float = 1.0  # factor on the noise; 0: no noise
     # dpm++: how much new noise each step adds, from 0 (none) to 1 (as much as ancestral sampling). 0 suits
     # an exact network best; a trained one errs, and noise corrects it (docs/performance.md).

@@ -86,7 +86,7 @@ def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch,
     for more, said in (
         ("", "priced for 1 device at 100.0 EFLOP/s each"),
         ("--mesh 2 -1 2", "priced for 4 devices at"),
-        ("--coordinator host0:29400 --processes 4 --process 0", "priced for 4 devices at"),
+        ("--processes 4", "priced for 4 devices at"),
         ("--set trial_seconds=7200", "2.0 h to train."),
     ):
         assert main([*dry, *more.split()]) == 0

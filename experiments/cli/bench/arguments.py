@@ -49,4 +49,4 @@ class Decode:
     sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100
     """Continuous models: steps of the diffusion sampler."""
     sampler: SamplerKind = "ddpm"
-    """Continuous models: the diffusion sampler. dpm++ needs 10 to 12 steps."""
+    """Continuous models: the diffusion sampler. dpm++ needs 8 to 12 steps."""
