@@ -43,7 +43,7 @@ EXP_OF = {"perplexity": HELD_OUT_LOSS}
 """{what is drawn: the metric of which it is exp of the mean}. The release's perplexity, which tables have, is a mean of
 exponentials: of a few hard robots, so that it may rank models otherwise than nats do."""
 BARS = "bars: s.e. over seeds and episodes"
-ERROR = f"mean, {BARS}"
+ERROR = "mean ± s.e. over seeds and episodes"
 MARKERS = "o^DvPXs"
 SHADES = 0.55
 """Where the colours of curves end on viridis: beyond it they are too light for white paper."""
@@ -132,7 +132,7 @@ class LogTicks(Locator):
         low, high = sorted((vmin, vmax))
         powers = [10.0**e for e in range(math.floor(math.log10(low)), math.ceil(math.log10(high)))]
         decades = ([m * power for power in powers for m in (*subs, 10)] for subs in self.DECADES)
-        even = (MaxNLocator(nbins=n, steps=(1, 2, 2.5, 5, 10), min_n_ticks=3) for n in range(5, 9))
+        even = (MaxNLocator(nbins=n, steps=(1, 2, 2.5, 5, 10), min_n_ticks=3) for n in range(6, 9))
         each = (sorted({*ticks}) for ticks in (*decades, *(place.tick_values(low, high) for place in even)))
         each = ([t for t in ticks if low <= t <= high] for ticks in each)
         each = [ticks for ticks in each if 3 <= len(ticks) <= 9]
