@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from data_pipelines.suite.embodiments import TRAINED
+from experiments.analysis.compare import Difference, Side, overall_difference
 from experiments.report.robots import Robot, robots_of
 from experiments.rows import Row, read_rows
 from experiments.running.trial import trial_id
@@ -58,6 +59,25 @@ def robots_at(study: str, axis: str, role: str = POINT) -> dict[float, tuple[lis
         at_x = replace(sweep, points=points, reference_x=x)
         found[x] = robots_of([], at_x, record.provenance, windows), len(ids)
     return found
+
+
+@functools.cache
+def variants(study: str, axis: str) -> tuple[dict[str, Side], tuple[str, ...]]:
+    """({name: its trials}, the robots that are judged) of an axis of names."""
+    workspace = Workspace(RESULTS / study)
+    record = load_record(workspace)
+    (sweep,) = plan_sweeps(record.study, (axis,))
+    found: dict[str, dict[int, WindowTable]] = {}
+    for p in (p for p in sweep.points if p.role == POINT):
+        table = WindowTable.load(workspace.trials / trial_id(p.trial, record.provenance) / WINDOWS)
+        found.setdefault(sweep.label(p.x), {})[p.trial.train.seed] = table
+    return {name: Side(name, seeds, "") for name, seeds in found.items()}, sweep.scope
+
+
+def paired(study: str, axis: str, a: str, b: str, metric: str) -> Difference:
+    """a minus b, window by window, with its error over seeds and episodes."""
+    sides, robots = variants(study, axis)
+    return overall_difference(sides[a], sides[b], metric, robots)
 
 
 def counts(robots: list[Robot]) -> list[int]:

@@ -23,6 +23,7 @@ from tests.experiments.committed_findings import (
     counts,
     findings,
     in_place_rows,
+    paired,
     readme,
     robots_at,
     rows_of,
@@ -276,14 +277,39 @@ def test_an_axis_of_one_curve_is_as_findings_say(sweep, study):
 
 
 def test_what_was_predicted_of_conditioning_is_as_findings_say():
-    points = {p.label: p for p in curve(rows_of(), "conditioning", "cross_entropy")}
-    lines = findings().splitlines()
+    page = findings()
+    lines = page.splitlines()
     for (sweep, _, x), e in expectations().items():
         if sweep == "conditioning":
-            mean, error = difference(points[x], points[e.against])
-            said = f"{e.mean:.2f}" if e.low <= mean <= e.high else f"**{e.mean:.2f}**"
-            line = f" | {mean:+.3f} ± {error:.3f} | {said} ({e.low:.2f} to {e.high:.2f}) |"
+            d = paired("cpu-full", "conditioning", x, e.against, "cross_entropy")
+            said = f"{e.mean:.2f}" if e.low <= d.mean <= e.high else f"**{e.mean:.2f}**"
+            line = f" | {d.mean:+.3f} ± {d.sem:.3f} | {said} ({e.low:.2f} to {e.high:.2f}) |"
             assert any(row.startswith(f"| {x} |") and row.endswith(line) for row in lines), line
+    d = paired("cpu-full", "conditioning", "cross_attention", "add", "cross_entropy")
+    said = f"`cross_attention` is {-d.mean:.3f} ± {d.sem:.3f} nats ahead of `add`"
+    assert said in " ".join(page.split()) and d.high < 0
+
+
+def test_what_seeing_and_predicting_actions_is_worth_is_as_findings_say():
+    page = " ".join(findings().split())
+    passive, full = (
+        paired("cpu-full", "settings", name, "forward dynamics", "cross_entropy")
+        for name in ("passive", "full dynamics")
+    )
+    assert f"worth {passive.mean:.2f} ± {passive.sem:.2f} nats** after 8,000 windows" in page
+    assert f"full dynamics is {full.mean:.2f} ± {full.sem:.2f} nats behind forward" in page
+
+
+def test_what_doublings_of_steps_gain_is_as_findings_say():
+    """Means over the seeds of both, of the last the one seed that it has."""
+    points = {p.x: p for p in curve(rows_of(), "horizon", "cross_entropy")}
+    first, *later, last = (difference(points[x], points[2 * x])[0] for x in sorted(points)[:-1])
+    assert first < min(later) and max(later) == later[-1] and last < first
+    said = (
+        f"gains {first:.2f} nats on average, each of those up to 16,000 steps more, the one from 8,000 the most, "
+        f"{later[-1]:.2f}; the last, to 32,000, one seed, gains {last:.2f}."
+    )
+    assert said in " ".join(findings().split()), said
 
 
 def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
@@ -418,6 +444,9 @@ def test_what_stands_between_the_tables_is_as_findings_say():
         """Of the control and of the same seed on true actions."""
         return tuple(point(sweep, metric, x, role, series).seeds[0] for role in (CONTROL, POINT))
 
+    rich = [difference(*(point("newcomers", m, x) for x in ("all robots", "alone"))) for m in ("psnr", "delta_psnr")]
+    said = "{:.2f} ± {:.2f} dB of PSNR ({:.2f} ± {:.2f} dB of ΔPSNR)".format(*rich[0], *rich[1])
+    assert said in page, said
     shuffled, true = seed_0("newcomers", "cross_entropy", "all robots")
     said = f"come to {shuffled:.2f} nats on its five, {true - shuffled:.2f} *better* than the same seed with true ones"
     assert f"{said} ({true:.2f}), at the same PSNR" in page

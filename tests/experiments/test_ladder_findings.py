@@ -13,7 +13,16 @@ from experiments.rows import OVERALL, curve, difference
 from experiments.sweeps.sweep import CONTROL
 from hma_jax.evaluation.windows import FILE as WINDOWS
 from hma_jax.evaluation.windows import WindowTable
-from tests.experiments.committed_findings import RESULTS, counts, findings, in_place_rows, readme, robots_at, rows_of
+from tests.experiments.committed_findings import (
+    RESULTS,
+    counts,
+    findings,
+    in_place_rows,
+    paired,
+    readme,
+    robots_at,
+    rows_of,
+)
 
 
 def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
@@ -33,9 +42,9 @@ def test_what_counting_changes_thrice_gives_is_as_findings_of_the_ladder_say():
     page, early, late, tenfold = " ".join(findings("ladder").split()), {}, {}, {}
     for metric in ("cross_entropy", "psnr", "action_nats", "delta_psnr"):
         points = {p.label.removeprefix("recall, Muon, "): p for p in curve(rows_of("ladder"), "ladder", metric)}
-        mean, error = difference(points["changes thrice, 4,000 steps"], points["4,000 steps"])
-        assert len(points["changes thrice, 4,000 steps"].seeds) == 3
-        early[metric] = f"{mean:.3f} ± {error:.3f}"
+        d = paired("ladder", "ladder", *(f"recall, Muon, {x}4,000 steps" for x in ("changes thrice, ", "")), metric)
+        assert d.seeds == 3
+        early[metric] = f"{d.mean:.3f} ± {d.sem:.3f}"
         late[metric], _ = difference(points["changes thrice, 32,000 steps"], points["32,000 steps"])
         tenfold[metric] = [
             difference(points[f"changes {n}, 4,000 steps"], points["4,000 steps"])[0] for n in ("thrice", "tenfold")
@@ -48,6 +57,21 @@ def test_what_counting_changes_thrice_gives_is_as_findings_of_the_ladder_say():
     shares = [in_place(in_place_rows(name), "model") for name in ("ladder-thrice", "ladder")]
     said = "{:.1f} ± {:.1f} % in place, {:.1f} ± {:.1f} % without"
     assert said.format(*(100 * x for mean, half, _ in shares for x in (mean, half))) in page
+
+
+def test_what_other_steps_of_the_ladder_give_is_as_its_findings_say():
+    page, both = " ".join(findings("ladder").split()), "recall, Muon"
+
+    def said(a: str, b: str, metric: str, digits: str = ".3f") -> str:
+        d = paired("ladder", "ladder", a, b, metric)
+        assert d.seeds == 3
+        return f"{abs(d.mean):{digits}} ± {d.sem:{digits}}"
+
+    long, chained = f"{both}, 4,000 steps", f"{both}, chained, 4,000 steps"
+    early, late = said(both, "reference", "cross_entropy"), said(long, "reference, 4,000 steps", "cross_entropy")
+    assert f"after 2,000 steps ({early} nats) and {late} ahead after 4,000" in page
+    nats, frames = (said(chained, long, metric) for metric in ("cross_entropy", "psnr"))
+    assert f"{nats} nats and {frames} dB (three seeds, paired)" in page
 
 
 def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():
