@@ -56,7 +56,7 @@ from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
-from experiments.progress import Eta, step
+from experiments.progress import Eta, say, step
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
@@ -114,22 +114,27 @@ class Settings:
         return start_seeds(self.make_task(), self.skip + self.starts)[self.skip :]
 
 
-def goal_image(task: Task, seed: int, size: int) -> np.ndarray:
+def goal_image(task: Task, seed: int, size: int, stride: int) -> np.ndarray:
     """uint8 [H, W, 3]: the frame in which an expert without noise ends, from this start."""
+    return fit_image(expert_end(task, seed, stride).render(), size)
+
+
+def expert_end(task: Task, seed: int, stride: int) -> Environment:
+    """Where an expert without noise is that has twice the time of an episode, of `stride` actions a frame."""
     spec = noisy(task, 0.0)
     world, seen = World(spec, [seed]), Environment(spec)
     expert = make_expert(world, 0)
-    for _ in range(2 * task.frames):
+    for _ in range(2 * task.frames * stride):
         world.step(expert.act().astype(np.float64))
     seen.set_state(world.state)
-    return fit_image(seen.render(), size)
+    return seen
 
 
 def run_planner(search: Search, model: Model, robot: Robot, settings: Settings, seed: int, size: int) -> dict:
     """One episode, until it is decided: {success, distance then, seconds of a plan}."""
     task, environment = settings.make_task(), Environment(settings.make_task().spec)
     environment.reset(seed)
-    cost = goal_image_cost(goal_image(task, seed, size))
+    cost = goal_image_cost(goal_image(task, seed, size, robot.stride))
     planner = Planner(search, settings.search, model, robot, cost, seed % 2**32)
     images, actions, reached, seconds = [fit_image(environment.render(), size)], [], [environment.success()], []
     remaining: list[np.ndarray] = []
@@ -280,6 +285,11 @@ def main() -> None:
     planners, eta = [name for name in PLANNERS if name in wanted], Eta()
     trials |= {way: [] for way in planners}
     if planners:
+        missed = sum(not expert_end(settings.make_task(), seed, robot.stride).success() for seed in seeds.tolist())
+        if missed:
+            say(
+                f"note: {missed} of {len(seeds)} pictures of the goal do not show success: the expert does not end at it"
+            )
         with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
             for k, seed in enumerate(seeds.tolist()):
                 for way in planners:

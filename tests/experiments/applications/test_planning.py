@@ -11,7 +11,7 @@ import pytest
 
 from data_pipelines.suite.environment import Environment
 from experiments.applications import plan_actions
-from experiments.applications.plan_actions import draw, summarise
+from experiments.applications.plan_actions import draw, goal_image, summarise
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import ActionRange, Planner
 from experiments.applications.planning.goals import block_means, goal_image_cost
@@ -19,6 +19,7 @@ from experiments.applications.planning.models import LearnedModel, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
 from experiments.applications.planning.search import SearchConfig, SearchResult, repeat_knots, warm_start
 from experiments.applications.planning.shooting import plan_shooting
+from experiments.applications.policies.closed_loop import start_seeds
 from experiments.applications.policies.tasks import find_task
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
@@ -196,6 +197,14 @@ def test_the_learned_model_begins_with_the_newest_frames_and_the_actions_between
     assert recorder.start.actions.ravel().tolist() == [2, 2, 3, 3]
     LearnedModel(recorder, robot).observe(images[:1], [], None)
     assert recorder.start.images.ravel().tolist() == [0] and recorder.start.actions.shape == (0, 1)
+
+
+def test_the_picture_of_the_goal_is_of_an_expert_that_had_the_time_of_two_episodes():
+    """Of a model with four actions per frame, whose episodes are four times as long, it was taken on the way."""
+    [seed] = start_seeds(find_task("pusher_sand", "reach"), 1).tolist()
+    of = lambda frames, stride: goal_image(find_task("pusher_sand", "reach", frames), seed, 32, stride)  # noqa: E731
+    np.testing.assert_array_equal(of(4, 4), of(16, 1))
+    assert (of(4, 1) != of(16, 1)).any()
 
 
 @pytest.mark.slow
