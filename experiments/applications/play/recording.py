@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_pipelines.names import made_name
 from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.rlds.example import encode_example
 from data_pipelines.sources.rlds.tfrecord import write_shard
@@ -82,7 +83,7 @@ class Recording:
     def dataset(self) -> bytes:
         """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it.
         metadata.json says the rate where it is known."""
-        name = f"{self.robot.name}_played"
+        name = made_name(f"{self.robot.name}_played")
         height, width = self._images[0].shape[:2]
         chunk = self.robot.stride * self.robot.action_dim
         step = {"observation/image": image_field(height, width), "action": vector_field(chunk)} | STEP_FIELDS

@@ -13,6 +13,7 @@ from importlib.resources import files
 
 from aiohttp import WSMsgType, web
 
+from data_pipelines.names import made_name
 from experiments.applications.play.requests import Truth, command, picture
 from experiments.applications.play.sessions import (
     MAX_INVALID_MESSAGES,
@@ -237,9 +238,10 @@ async def _recording(request: web.Request) -> web.Response:
     recording = recording.copy() if recording else None
     kinds: dict[str, tuple[Callable[[], bytes], str, str]] = {}
     if recording is not None and len(recording) > 1:
+        name = made_name(recording.robot.name)
         kinds = {
-            "mp4": (recording.video, "video/mp4", f"{recording.robot.name}.mp4"),
-            "rlds": (recording.dataset, "application/zip", f"{recording.robot.name}_rlds.zip"),
+            "mp4": (recording.video, "video/mp4", f"{name}.mp4"),
+            "rlds": (recording.dataset, "application/zip", f"{name}_rlds.zip"),
         }
     if request.match_info["kind"] not in kinds:
         raise web.HTTPNotFound(text="nothing was recorded")

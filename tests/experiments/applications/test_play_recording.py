@@ -2,6 +2,7 @@
 
 import io
 import json
+import tempfile
 import zipfile
 
 import numpy as np
@@ -11,6 +12,7 @@ pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from experiments.applications.play.recording import Recording
+from experiments.applications.play.server import SESSIONS
 from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.serving import Player, ask, serving
 
@@ -58,6 +60,26 @@ def test_a_recording_says_its_rate_where_it_is_known(hz, said):
 
     with av.open(io.BytesIO(recording.video())) as container:
         assert container.streams.video[0].average_rate == (said or 2), "the film is not in the robot's own time"
+
+
+@pytest.mark.parametrize(("name", "made"), [("lab/arm", "lab_arm"), ("../x", "x"), ('a"\r\nb', "a_b")])
+def test_a_robot_s_name_is_made_one_of_a_dataset_and_of_files(name, made, tmp_path, monkeypatch):
+    """It was part of a path, also out of the directory of temporary files."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    recording = Recording(Robot(name, 2, (0.0,), (1.0,), (0.0,)))
+    recording.add(np.zeros((8, 8, 3), np.uint8), np.zeros((2, 1)), np.zeros((8, 8, 3), np.uint8))
+    names = zipfile.ZipFile(io.BytesIO(recording.dataset())).namelist()
+    assert names and all(n.startswith(f"{made}_played/1.0.0/") for n in names)
+
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        client.server.app[SESSIONS].visitors[player.token].session.recording = recording
+        for kind, file in (("mp4", f"{made}.mp4"), ("rlds", f"{made}_rlds.zip")):
+            answer = await client.get(f"/recording/{player.token}/{kind}")
+            assert answer.headers["Content-Disposition"] == f'attachment; filename="{file}"'
+
+    serving(test)
 
 
 def _episodes(directory):
