@@ -164,7 +164,7 @@ DAMAGE = {
     "empty shard": (empty_shard, ["{shard}", "0 records", "says 3", "Download the shard again"]),
     "missing schema": (lose_schema, ["{dir}", "features.json", "Restore"]),
     "damaged metadata": (garble_info, ["{dir}", "dataset_info.json", "Restore"]),
-    "empty directory": (empty, ["{dir}", "it holds nothing", "Give the directory that tfds wrote"]),
+    "empty directory": (empty, ["{dir}", "it holds nothing", "as tfds wrote it"]),
 }
 
 
