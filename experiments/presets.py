@@ -142,7 +142,7 @@ CPU_FULL = replace(
 )  # fmt: skip
 
 SMALL_EPSILON = 1e-12
-"""AdamW's, with the released gains. DIFFERS: the release has 1e-8. The matrices of the conditioning start near zero, one
+"""AdamW's, with the released gains. DIFFERS: the release has 1e-8. The conditioning's matrices start near zero, one
 behind the other: the median root mean square of their gradients is 2e-10 in the first step and still 1e-8 in the 200th
 (measured at width 256 with two layers, eight robots and as many windows). With 1e-8 they would move at first at 2 % of
 the rate that muP assumes, and at half of it later."""
