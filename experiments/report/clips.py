@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from experiments.report.pieces import data_uri, frames
+from experiments.report.pieces import STILL, frames, moving
 
 KINDS = {"true": "recorded", "predicted": "predicted", "random": "other actions"}
 """Keys of samples.npz, with their captions."""
@@ -39,24 +39,24 @@ def describe_clips(path: Path, prompt: int, order: Sequence[str]) -> str:
         clips = {n: {k: samples[f"{n}/{k}"][0] for k in KINDS if f"{n}/{k}" in samples.files} for n in chosen}
     figures = [_figure(name, kinds, prompt) for name, kinds in clips.items()]
     rest = "".join(figures[SHOWN:])
-    more = f"<details><summary>{len(figures) - SHOWN} more robots</summary><div class=trios>{rest}</div></details>"
+    more = f"<details class=more><summary>{len(figures) - SHOWN} more robots</summary><div class=trios>{rest}</div></details>"
     paper = "".join(_strip(name, kinds, prompt) for name, kinds in list(clips.items())[:ON_PAPER])
     return (
         f"<p>The first validation window of each robot. Of its frames the first {prompt} are given (grey bar); the "
         "rest is predicted from actions alone: once from those that were recorded, once from others, drawn at random. "
         "Where the model listens, the right clip leaves the left one and the middle one stays with it.</p>"
-        f"<div class=trios>{''.join(figures[:SHOWN])}</div>{more if rest else ''}<div class=paper>{paper}</div>"
+        f"{STILL}<div class=trios>{''.join(figures[:SHOWN])}</div>{more if rest else ''}<div class=paper>{paper}</div>"
     )
 
 
 def _figure(name: str, kinds: dict[str, np.ndarray], prompt: int) -> str:
     captions = "".join(f"<span>{KINDS[k]}</span>" for k in kinds)
     height, width = next(iter(kinds.values())).shape[1:3]
-    ratio = f"{len(kinds) * width + (len(kinds) - 1) * _gap(width)} / {height + BAR + 1}"
+    size = f'style="aspect-ratio: {len(kinds) * width + (len(kinds) - 1) * _gap(width)} / {height + BAR + 1}"'
+    alt = f"{name}, a window of validation, side by side: {', '.join(KINDS[k] for k in kinds)}"
     return (
         f"<figure class=trio><figcaption>{html.escape(name)}</figcaption>"
-        f'<img alt="{html.escape(name)}: recorded and predicted frames" style="aspect-ratio: {ratio}" '
-        f'src="{data_uri(animate(list(kinds.values()), prompt), "webp")}"><div>{captions}</div></figure>'
+        f"{moving(animate(list(kinds.values()), prompt), alt, size)}<div>{captions}</div></figure>"
     )
 
 

@@ -20,7 +20,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.schema import field_slice
 from data_pipelines.tokens.row_sample import QUANTILES
 from experiments.report.drawings import clip, curves, histogram, lengths
-from experiments.report.pieces import table
+from experiments.report.pieces import STILL, table
 from experiments.report.style import CSS
 
 FASTEST = 4.0
@@ -84,7 +84,7 @@ class DatasetView:
 def draw_page(datasets: Sequence[DatasetView], frames: int, command: str) -> str:
     """The page. `frames`: T of the windows that are counted; `command`: what makes the page again."""
     title = ", ".join(d.facts.name for d in datasets)
-    body = [_summary(datasets, frames)]
+    body = [_summary(datasets, frames), STILL]
     body += [part for i, dataset in enumerate(datasets) for part in _dataset(i, dataset, frames)]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import io
 from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image
+
+from experiments.report.pieces import moving
 
 WIDTH = 300
 """Units of a drawing's width; pages scale it."""
@@ -25,9 +26,7 @@ def clip(frames: Sequence[np.ndarray], seconds: float, height: int, title: str) 
         buffer, "WEBP", save_all=True, append_images=pictures[1:], loop=0, quality=60, method=3,
         duration=max(round(1000 * seconds / len(pictures)), 20),
     )  # fmt: skip
-    data = base64.b64encode(buffer.getvalue()).decode()
-    size = f'width={width} height={height} alt="{html.escape(title)}"'
-    return f'<img class=clip {size} src="data:image/webp;base64,{data}">'
+    return moving(buffer.getvalue(), title, f"class=clip width={width} height={height}", lossless=False)
 
 
 def curves(rows: np.ndarray, lows: Sequence[float], highs: Sequence[float], names: Sequence[str]) -> str:
@@ -52,7 +51,7 @@ def curves(rows: np.ndarray, lows: Sequence[float], highs: Sequence[float], name
             elif points:  # a gap where there is no number
                 pieces, points = [*pieces, points], []
         parts += [f'<polyline points="{" ".join(piece)}" />' for piece in (*pieces, points)]
-    return _svg(len(names) * line, parts, "curves")
+    return _svg(len(names) * line, parts, "curves", f"values over time: {', '.join(names)}")
 
 
 def histogram(counts: Sequence[int], width: int = 96, height: int = 20) -> str:
@@ -65,7 +64,8 @@ def histogram(counts: Sequence[int], width: int = 96, height: int = 20) -> str:
         tall = max(height * count / most, 0.8) if count else 0
         place = f"x={i * step:.1f} y={height - tall:.1f} width={max(step - 0.8, 0.5):.1f} height={tall:.1f}"
         bars.append(f"<rect {place} />")
-    return f'<svg class=bars width={width} height={height} viewBox="0 0 {width} {height}">{"".join(bars)}</svg>'
+    size = f'width={width} height={height} viewBox="0 0 {width} {height}"'
+    return f'<svg class=bars {size} role=img aria-label="histogram">{"".join(bars)}</svg>'
 
 
 def lengths(steps: Sequence[int], needed: int | None) -> str:
@@ -91,8 +91,9 @@ def lengths(steps: Sequence[int], needed: int | None) -> str:
         parts.append(f"<line class=mark x1={x:.1f} x2={x:.1f} y1=0 y2={base} />")
         label_x = x + (-4 if side == "end" else 4)
         parts.append(f"<text class=mark x={label_x:.1f} y=9 text-anchor={side}>one window: {needed}</text>")
-    return _svg(base + 18, parts, "lengths")
+    return _svg(base + 18, parts, "lengths", f"histogram of the lengths of episodes, {low:g} to {high:g} steps")
 
 
-def _svg(height: float, parts: Sequence[str], kind: str) -> str:
-    return f'<svg class={kind} viewBox="0 0 {WIDTH} {height:g}" role=img>{"".join(parts)}</svg>'
+def _svg(height: float, parts: Sequence[str], kind: str, label: str) -> str:
+    named = f'role=img aria-label="{html.escape(label)}"'
+    return f'<svg class={kind} viewBox="0 0 {WIDTH} {height:g}" {named}>{"".join(parts)}</svg>'

@@ -13,6 +13,7 @@ import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from experiments.report.clips import describe_clips
 from experiments.report.findings import Findings, describe_expected, read_findings
 from experiments.report.fits import describe_fits
 from experiments.report.numbers import Numbers
-from experiments.report.pieces import card, picture, section, table
+from experiments.report.pieces import card, contents, picture, section, table
 from experiments.report.plot_style import drawn_metrics
 from experiments.report.robots import Robot, are_sorted, describe_robots, robots_of
 from experiments.report.style import CSS
@@ -69,8 +70,6 @@ def write_report(
     first = trial_id(_defaults(shown.sweep)[0], provenance) if shown else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
     has_reference = first in finished
-    dated = first if has_reference else next(iter(finished), None)
-    result = numbers.results[dated] if dated else None
     robots = robots_of(rows, shown.sweep, provenance, numbers.windows) if has_reference else []
     name, aside = (shown.name, shown.aside) if shown else (REFERENCE, "")
     model = record.study.model
@@ -78,8 +77,8 @@ def write_report(
     checks = check_study(sweeps, rows, optima, states, robots, name, numbers.outcomes, checked, vocabulary)
     findings = read_findings(workspace.findings, [s.name for s in sweeps])
     outcomes = compare_expected(read_expected(workspace.predictions / PREREGISTERED), rows)
+    headline = _headline(workspace, record, sweeps, rows, states, shown, _finished_when(numbers.results, finished))
     body = [
-        _headline(workspace, record, sweeps, rows, states, shown, result),
         draw_box(checks),
         *_curves(workspace, sweeps, rows, optima, along, outcomes, findings),
         _fits(workspace, numbers),
@@ -95,7 +94,7 @@ def write_report(
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>HMA-JAX study: {html.escape(record.study.name)}</title><style>{CSS}</style></head>\n"
-        f"<body><main>{''.join(body)}</main></body></html>\n"
+        f"<body><main>{headline}{contents(''.join(body))}{''.join(body)}</main></body></html>\n"
     )
     write_file(workspace.report, page)
 
@@ -136,7 +135,7 @@ def _headline(
     rows: Sequence[Row],
     states: dict[str, State],
     shown: _ShownTrials | None,
-    result: dict[str, Any] | None,
+    when: str,
 ) -> str:
     study = record.study
     metrics = drawn_metrics(rows, [s.name for s in sweeps])
@@ -162,7 +161,6 @@ def _headline(
                  f"dB; a control: should be zero within {EACH:g} standard errors"),
         ]  # fmt: skip
     cards.append(card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"))
-    when = result["run"]["finished"] if result else "no trial finished"
     unfinished = sum(state.event != FINISHED for state in states.values())
     lacking = f"{counted(unfinished, 'trial')} {'has' if unfinished == 1 else 'have'} no result"
     warning = f'<p class="warning">{lacking}; see the table of trials.</p>'
@@ -176,6 +174,15 @@ def _headline(
         f"<p class=meta>{html.escape(when)}</p></header>"
         f"<div class=cards>{''.join(cards)}</div>{warning if unfinished else ''}"
     )
+
+
+def _finished_when(results: Mapping[str, Mapping[str, Any]], finished: Sequence[str]) -> str:
+    """The first and the last day on which a trial finished, by the clocks of the machines that ran them."""
+    if not finished:
+        return "no trial finished"
+    times = [datetime.strptime(results[id]["run"]["finished"], "%Y-%m-%d %H:%M:%S %z") for id in finished]
+    first, last = (f"{time:%Y-%m-%d}" for time in (min(times), max(times)))
+    return f"trials finished {first}" + f" to {last}" * (first != last)
 
 
 def _at_default(rows: Sequence[Row], sweep: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
@@ -205,12 +212,16 @@ def _curves(
     sections = []
     scaling = [s for s in sweeps if s.single_curve]
     if scaling:
-        overview = picture(workspace.figures / "scaling.png", "Scaling curves")
+        overview = picture(
+            workspace.figures / "scaling.png", "Scaling curves, of which the tables below have the numbers"
+        )
         sections.append(section("Scaling curves", overview, note, *(say(s) for s in scaling)))
     for sweep in sweeps:
         if not sweep.single_curve:
             title = sweep.title or sweep.axis.capitalize()
-            figure = picture(workspace.figures / f"{sweep.name}.png", title)
+            figure = picture(
+                workspace.figures / f"{sweep.name}.png", f"{title}: the numbers of the tables below, over {sweep.axis}"
+            )
             sections.append(section(title, figure, "" if sections else note, say(sweep)))
     return sections
 
@@ -233,7 +244,10 @@ def _fits(workspace: Workspace, numbers: Numbers) -> str:
     """Nothing where no trial has the loss that is fitted, as of policies and latents; fits.csv says so."""
     if not any(fitted.fit.trials for fitted in numbers.fits) and not numbers.outcomes:
         return ""
-    figures = {"fits.png": "Scaling fits with residuals", "isoflop.png": "Best sizes for budgets"}
+    figures = {
+        "fits.png": "Scaling fits with residuals: the table of fits has their coefficients",
+        "isoflop.png": "Loss over size for each budget: the table of budgets has the best sizes",
+    }
     drawn = "".join(picture(workspace.figures / name, title) for name, title in figures.items())
     return section("Fits", describe_fits(numbers.fits, numbers.isoflop, numbers.outcomes, drawn))
 

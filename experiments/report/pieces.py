@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -15,9 +16,22 @@ from PIL import Image
 from experiments import words
 from experiments.rows import CurvePoint
 
+STILL = (
+    "<p class=pause><input type=checkbox id=pause> <label for=pause>clips stand still, at their last frame</label></p>"
+)
+"""What stops all clips of a page (`moving`); without it they stand still where the system asks for less motion."""
+
 
 def section(title: str, *parts: str) -> str:
-    return f"<section><h2>{html.escape(title)}</h2>{''.join(parts)}</section>"
+    anchor = re.sub(r"\W+", "-", title.lower()).strip("-")
+    return f'<section id="section-{anchor}"><h2>{html.escape(title)}</h2>{"".join(parts)}</section>'
+
+
+def contents(page: str) -> str:
+    """Links to the sections of a page."""
+    found = re.findall(r'<section id="(section-[^"]*)"><h2>(.*?)</h2>', page)
+    links = "".join(f'<li><a href="#{anchor}">{title}</a></li>' for anchor, title in found)
+    return f'<nav aria-label="sections"><ul>{links}</ul></nav>'
 
 
 def card(label: str, point: CurvePoint | None, note: str) -> str:
@@ -27,14 +41,18 @@ def card(label: str, point: CurvePoint | None, note: str) -> str:
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[str]], text: int = 1) -> str:
-    """Cells are HTML already, headings are not. The first `text` columns are words, the rest numbers."""
+    """Cells are HTML already, headings are not. The first `text` columns are words, the rest numbers. The first cell of
+    a line is its heading."""
 
-    def row(tag: str, cells: Sequence[str]) -> str:
-        kinds = [" class=text" if i < text else "" for i in range(len(cells))]
-        return "<tr>" + "".join(f"<{tag}{k}>{c}</{tag}>" for k, c in zip(kinds, cells, strict=True)) + "</tr>"
+    def cell(tag: str, i: int, content: str, scope: str = "") -> str:
+        return f"<{tag}{scope}{' class=text' if i < text else ''}>{content}</{tag}>"
 
-    heading = row("th", [html.escape(h) for h in head])
-    body = "".join(row("td", line) for line in lines)
+    def row(line: Sequence[str]) -> str:
+        first, *others = line
+        return cell("th", 0, first, " scope=row") + "".join(cell("td", i, c) for i, c in enumerate(others, 1))
+
+    heading = f"<tr>{''.join(cell('th', i, html.escape(h), ' scope=col') for i, h in enumerate(head))}</tr>"
+    body = "".join(f"<tr>{row(line)}</tr>" for line in lines)
     return f"<div class=scroll><table><thead>{heading}</thead><tbody>{body}</tbody></table></div>"
 
 
@@ -42,7 +60,7 @@ def pm(mean: float, error: float) -> str:
     """Mean ± standard error, with the digits that the error leaves meaningful."""
     if not 0 < error < math.inf:  # also nan
         return f"{mean:.4g}".replace("-", "\u2212")
-    return f"{number(mean, error)} <span class=sem>± {number(error, error)}</span>"
+    return f"{number(mean, error)}\u00a0<span class=sem>±\u00a0{number(error, error)}</span>"
 
 
 def number(value: float, error: float) -> str:
@@ -50,11 +68,30 @@ def number(value: float, error: float) -> str:
     return words.number(value, error).replace("-", "\u2212")
 
 
-def picture(path: Path, title: str) -> str:
+def picture(path: Path, alt: str) -> str:
+    """A figure; '' without its file. `alt`: what stands in its place for who does not see it."""
     if not path.exists():
         return ""
-    source = data_uri(path.read_bytes())
-    return f'<div class=scroll><img class=plot alt="{html.escape(title)}" src="{source}"></div>'
+    content = path.read_bytes()
+    with Image.open(io.BytesIO(content)) as image:
+        inches = image.width / image.info.get("dpi", (96,))[0]
+    # On a phone a figure scrolls at three quarters of its size: its text of 10 points is 10 pixels high.
+    wide = f"--wide: {72 * inches:.0f}px"
+    alt = html.escape(alt)
+    return f'<div class=scroll><img class=plot style="{wide}" alt="{alt}" src="{data_uri(content)}"></div>'
+
+
+def moving(animation: bytes, alt: str, attributes: str, lossless: bool = True) -> str:
+    """An animated WebP, and its last frame for whom motion disturbs. `attributes`: of both elements."""
+    still = io.BytesIO()
+    with Image.open(io.BytesIO(animation)) as film:
+        film.seek(film.n_frames - 1)
+        film.convert("RGB").save(still, "WEBP", lossless=lossless, method=4, quality=80)
+    pictures = {"moving": animation, "still": still.getvalue()}
+    return "".join(
+        f'<span class={kind}><img {attributes} alt="{html.escape(alt)}" src="{data_uri(content, "webp")}"></span>'
+        for kind, content in pictures.items()
+    )
 
 
 def frames(clip: np.ndarray, prompt: int) -> str:

@@ -55,16 +55,26 @@ code, pre { font: .86em/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, mono
 pre { background: var(--soft); padding: 1rem; border-radius: 8px; overflow-x: auto; }
 summary { cursor: pointer; color: var(--muted); margin: .8rem 0; }
 td.text:last-child:nth-child(n+4) { white-space: normal; min-width: 11rem; }
+nav ul { columns: 15rem; padding: 0; margin: 0 0 1.4rem; list-style: none; font-size: .9rem; }
+nav li { break-inside: avoid; } nav a { color: inherit; text-decoration-color: var(--muted); }
+tbody th { color: inherit; font-weight: inherit; } .sem { white-space: nowrap; }
+.pause { font-size: .86rem; color: var(--muted); }
+.moving, .still { display: contents; } .still, body:has(#pause:checked) .moving { display: none; }
+body:has(#pause:checked) .still { display: contents; }
+@media (prefers-reduced-motion: reduce) { .moving, .pause { display: none; } .still { display: contents; } }
 @media (max-width: 560px) { main { padding: 1.2rem .9rem 3rem; } h1 { font-size: 1.5rem; }
   .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); }
   .card { padding: .6rem .7rem; } .card b { font-size: 1.15rem; } .card b .sem { font-size: .8rem; }
-  .strip div { display: block; } .plot { padding: .2rem; width: auto; min-width: 100%; height: 24rem;
-  max-width: none; } dl { grid-template-columns: 1fr; } dd { margin-bottom: .5rem; } }
+  .strip div { display: block; } .plot { padding: .2rem; max-width: none; max-height: none;
+  width: max(100%, var(--wide)); } dl { grid-template-columns: 1fr; } dd { margin-bottom: .5rem; } }
 @media print { :root { color-scheme: light; --ink: #000; --muted: #444; --line: #bbb; --paper: #fff; --soft: #f5f7f8;
     --good: #1d5c36; --bad: #9c2415; }
   @page { margin: 14mm; } body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
-  details, .trios { display: none; } .paper { display: block; } .scroll { overflow: visible; }
-  table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; }
+  .trios, .pause, .more { display: none; } .paper { display: block; } pre { font-size: 6.5pt; white-space: pre-wrap; }
+  details pre { columns: 3; }
+  details::details-content { content-visibility: visible; block-size: auto; } .scroll { overflow: visible; }
+  table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; } td:nth-child(3).text { min-width: 0; }
+  table:has(th:nth-child(13)) .sem { display: block; }  /* errors below their numbers: side by side they do not fit */
   .plot { max-height: 100mm; }
-  figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3 { break-after: avoid; } }
+  figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3, h4, summary { break-after: avoid; } }
 """

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments.analysis.changes import find_changes
 from experiments.analysis.scaling import curves_of, fit_curve, trunk_parameters
@@ -15,11 +16,12 @@ from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.findings import read_findings
 from experiments.report.numbers import Numbers
-from experiments.report.pieces import pm
+from experiments.report.pieces import picture, pm
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import ERROR, LogTicks, count, drawn_curve, save
 from experiments.report.robots import describe_robots, read_data, robots_of
+from experiments.report.style import CSS
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.report.validity import Check, check_study
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
@@ -59,7 +61,7 @@ def test_rows_carry_hashes_and_average_over_the_scope(drawn):
 
 def test_the_time_of_a_trial_is_said_to_be_that_of_its_last_attempt(drawn):
     """After it was stopped at 95 % the page says minutes."""
-    assert "<th>time, last attempt</th>" in drawn.report.read_text()
+    assert "<th scope=col>time, last attempt</th>" in drawn.report.read_text()
 
 
 def test_tables_read_back_what_was_written(drawn, tmp_path):
@@ -148,12 +150,43 @@ def test_diverged_trial_is_in_csv_and_tally(drawn):
 
 def test_page_is_self_contained_and_names_what_failed(drawn):
     page = drawn.report.read_text()
-    assert not re.findall(r'(?:src|href)="(?!data:)', page) and "http" not in page
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page) and "http" not in page
     assert page.count("data:image/png;base64,") >= 1 + 3 * 3  # curves, and three strips of three datasets
     assert 'class="diverged"' in page and "the loss is &lt;nan&gt; at step 2; output in trials/" in page
     assert str(drawn.root) not in page
     for fact in ("hma study", PROVENANCE.tokenizer, "abacus", "1 trial has no result"):
         assert fact in page
+
+
+def test_a_page_has_links_to_its_sections_and_what_its_parts_are(drawn):
+    """For who reads on a phone, or by ear; links without an id, or to one of two, lead nowhere."""
+    page = drawn.report.read_text()
+    ids, links = re.findall(r' id="?([\w-]+)', page), re.findall(r'href="#([^"]+)"', page)
+    assert len(links) == page.count("<h2>") >= 5 and set(links) <= set(ids) and len(set(ids)) == len(ids)
+    assert page.count("<th ") == len(re.findall("<th scope=(?:row|col)", page)) and "<th>" not in page
+    assert 'alt="Scaling curves, of which the tables below have the numbers"' in page
+    assert page.count("<span class=still>") == page.count("<span class=moving>") == 3
+
+
+def test_a_page_is_dated_by_all_of_its_trials():
+    """It had the day of one of them alone, months before the last."""
+    days = {"a": "2026-02-03 23:00:00 +0000", "b": "2026-02-04 00:10:00 +0200", "c": "2025-12-31 12:00:00 +0000"}
+    results = {id: {"run": {"finished": day}} for id, day in days.items()}
+    assert page._finished_when(results, "abc") == "trials finished 2025-12-31 to 2026-02-03"
+    assert page._finished_when(results, "a") == "trials finished 2026-02-03"
+
+
+def test_paper_has_what_a_page_unfolds_and_no_line_ends_before_an_error():
+    paper = CSS[CSS.index("@media print") :]
+    assert "details::details-content { content-visibility: visible" in paper and "h3, h4, summary { break-af" in paper
+    assert " " not in pm(1.0, 0.1).replace("<span class", "")
+
+
+def test_a_figure_on_a_phone_keeps_the_size_of_its_text(drawn):
+    """All were equally high: text of the highest was half as high as that of the others."""
+    with Image.open(drawn.figures / "width.png") as image:
+        points = 72 * image.width / image.info["dpi"][0]
+    assert f'style="--wide: {points:.0f}px"' in picture(drawn.figures / "width.png", "")
 
 
 def test_figures_are_pictures(drawn):
@@ -261,7 +294,7 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     assert "perplexity" not in said and all(name.removeprefix("squared ") in said for name in shown)
     checked = check_study([sweep], rows, [], {}, [], "reference", [], Check("", "good", ""), None)
     assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
-    cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._ShownTrials(sweep, "reference"), None)
+    cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._ShownTrials(sweep, "reference"), "")
     assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
     listed = describe_robots(rows, sweep, robots_of(rows, sweep, PROVENANCE, {}), tmp_path / "data.json")
     assert ("s.e. above zero" in listed) == ("delta_psnr" in measured) and "ahead of copying" not in listed
@@ -281,7 +314,7 @@ def test_the_error_of_one_seed_is_not_said_to_be_over_seeds(drawn):
     sweep = plan_width(STUDY)
     rows = rows_of(drawn, [sweep])
     for own, said in ((rows, "and seeds"), ([r for r in rows if r.seed == 0], "of one seed")):
-        cards = page._headline(drawn, record_of(), [sweep], own, {}, page._ShownTrials(sweep, "reference"), None)
+        cards = page._headline(drawn, record_of(), [sweep], own, {}, page._ShownTrials(sweep, "reference"), "")
         assert f"s.e. over episodes {said}<" in cards
 
 
@@ -406,7 +439,8 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
     lost = {(8, "delta_psnr"), (16, "perplexity")}
     rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
     lines = re.findall(
-        r"<tr><td class=text>(\d+)</td><td>([\d,]+)</td>(.*?)</tr>", describe(sweep, rows, [], AxisStatistics())
+        r"<tr><th scope=row class=text>(\d+)</th><td>([\d,]+)</td>(.*?)</tr>",
+        describe(sweep, rows, [], AxisStatistics()),
     )
     assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [
         ("8", "6,400", 1),

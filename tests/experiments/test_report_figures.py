@@ -64,7 +64,10 @@ def test_the_best_rate_of_the_figure_is_that_of_the_nats():
 def test_tables_have_nats_beside_the_perplexity():
     sweep = plan_conditioning(CPU_FULL)
     said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.1, "perplexity": 75.0}), [], AxisStatistics())
-    assert "<th>nats per token</th><th>minus the default</th><th>perplexity</th><th>seeds</th>" in said
+    assert (
+        "".join(f"<th scope=col>{h}</th>" for h in ("nats per token", "minus the default", "perplexity", "seeds"))
+        in said
+    )
 
 
 def test_errors_of_variants_count_seeds_and_episodes():
@@ -101,7 +104,7 @@ def test_several_curves_are_shown_with_their_controls():
     assert bars.lines[0].get_xdata().tolist() == at and bars.lines[0].get_ydata() == pytest.approx([math.exp(5.3)] * 2)
     said = describe(sweep, rows, [], AxisStatistics())
     of_controls = said.split("<h4>4,000 steps, shuffled actions</h4>")[1]
-    assert all(f"<td class=text>{x:,}</td>" in of_controls for x in at) and pm(5.3, 0.1) in of_controls
+    assert all(f"<th scope=row class=text>{x:,}</th>" in of_controls for x in at) and pm(5.3, 0.1) in of_controls
 
 
 def test_a_curve_s_table_has_its_controls():
@@ -109,7 +112,9 @@ def test_a_curve_s_table_has_its_controls():
 
     sweep = plan(CPU_FULL)
     said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.0}), [], AxisStatistics())
-    assert all(f"<td class=text>{p.x:,}, shuffled actions</td>" in said for p in sweep.points if p.role == CONTROL)
+    assert all(
+        f"<th scope=row class=text>{p.x:,}, shuffled actions</th>" in said for p in sweep.points if p.role == CONTROL
+    )
 
 
 @pytest.mark.parametrize(("low", "high"), [(27, 66), (33, 72), (26.4, 95), (1.04, 1.6), (0.011, 0.9), (2, 9)])

@@ -20,7 +20,7 @@ from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, S
 from experiments.applications.judging.recordings import LAST
 from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE, shown
 from experiments.report.clips import animate
-from experiments.report.pieces import data_uri, picture, section, table
+from experiments.report.pieces import STILL, moving, picture, section, table
 from experiments.report.plot_style import INK, MUTED, STYLE, save
 from experiments.report.style import CSS
 from hma_jax.runtime.files import write_file
@@ -132,7 +132,7 @@ def write_page(judged: Judgement, summary: dict[str, Any], out: Path, command: s
         f"<h1>{html.escape(summary['robot'])}: {html.escape(summary['task'])}</h1>",
         f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode "
         f"succeeds when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
-        picture(out / "scatter.png", "success by policy"),
+        picture(out / "scatter.png", "Success by policy, of which the table below has the numbers"),
         section("Success by policy", table(["policy", *columns], lines), *_doubts(summary)),
         _agreement(summary),
         _head(summary),
@@ -293,6 +293,6 @@ def _clips(judged: Judgement, *sides: tuple[str, str]) -> str:
         )
         figures.append(
             f"<figure class=trio><figcaption>{html.escape(name)}, start {start}</figcaption>"
-            f'<img alt="" src="{data_uri(animate(clips, 1), "webp")}"><div>{words}</div></figure>'
+            f"{moving(animate(clips, 1), f'{name}, start {start}', '')}<div>{words}</div></figure>"
         )
-    return f"<div class=trios>{''.join(figures)}</div>"
+    return f"{STILL}<div class=trios>{''.join(figures)}</div>"
