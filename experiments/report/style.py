@@ -73,7 +73,8 @@ body:has(#pause:checked) .still { display: contents; }
   .trios, .pause, .more { display: none; } .paper { display: block; } pre { font-size: 6.5pt; white-space: pre-wrap; }
   details pre { columns: 3; }
   details::details-content { content-visibility: visible; block-size: auto; } .scroll { overflow: visible; }
-  table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; } td:nth-child(3).text { min-width: 0; }
+  table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; }
+  td:nth-child(3).text { min-width: 0; }
   table:has(th:nth-child(13)) .sem { display: block; }  /* errors below their numbers: side by side they do not fit */
   .plot { max-height: 100mm; }
   figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3, h4, summary { break-after: avoid; } }
