@@ -9,6 +9,7 @@ import json
 import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
 from aiohttp import WSMsgType, web
@@ -33,11 +34,20 @@ LARGEST_MESSAGE = 2**16
 HEARTBEAT = 20.0
 """Seconds between questions whether a silent visitor is still there."""
 
+REQUEST_SECONDS = 30.0
+"""Within which a connection must have sent a whole request, its first or a further one, or it is closed. aiohttp's own
+limit is an hour: a few hundred half requests would take all the connections that the process may have."""
+
 EXTRA_CONNECTIONS = 32
 """Connections beyond the number of sessions that are accepted; further ones are refused."""
 
+MAX_DOWNLOADS = 2
+"""Of one visitor, one of each kind, that are being made or wait; for more there is 429."""
+
 SESSIONS = web.AppKey("sessions", SessionManager)
 SOCKETS = web.AppKey("sockets", set)
+DOWNLOADS = web.AppKey("downloads", ThreadPoolExecutor)
+"""Of one thread: downloads are made one after the other, or they would take the cores from those who drive."""
 REFUSED = web.AppKey("refused", set)
 """Reasons of refusals that were logged: strangers cannot fill the log."""
 HEADERS = {
@@ -74,7 +84,7 @@ def make_app(
 
 async def serve(app: web.Application, host: str, port: int, ready: Callable[[int], None]) -> None:
     """Serves until cancelled; `ready` is told the port, which port 0 leaves open. Raises OSError for a taken one."""
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0, keepalive_timeout=REQUEST_SECONDS)
     await runner.setup()
     try:
         await web.TCPSite(runner, host, port).start()
@@ -88,6 +98,7 @@ async def _manage_sessions(
     app: web.Application, simulator: Simulator, truth: Truth, max_acting: int | None
 ) -> AsyncIterator[None]:
     sessions = app[SESSIONS] = SessionManager(simulator, truth, max_acting)
+    downloads = app[DOWNLOADS] = ThreadPoolExecutor(1, "downloads")
     serving = asyncio.create_task(sessions.serve())
     yield
     serving.cancel()
@@ -96,6 +107,7 @@ async def _manage_sessions(
     for socket in list(app[SOCKETS]):
         await socket.close(code=1001)
     sessions.close()
+    downloads.shutdown(wait=False, cancel_futures=True)
 
 
 def describe(simulator: Simulator, truth: Truth) -> list[dict]:
@@ -246,6 +258,12 @@ async def _recording(request: web.Request) -> web.Response:
     if request.match_info["kind"] not in kinds:
         raise web.HTTPNotFound(text="nothing was recorded")
     make, kind, name = kinds[request.match_info["kind"]]
-    body = await asyncio.get_running_loop().run_in_executor(None, make)
+    if visitor.downloads >= MAX_DOWNLOADS:
+        raise web.HTTPTooManyRequests(text="earlier downloads of yours are being made; try again when they have come")
+    visitor.downloads += 1
+    try:
+        body = await asyncio.get_running_loop().run_in_executor(request.app[DOWNLOADS], make)
+    finally:
+        visitor.downloads -= 1
     disposition = f'attachment; filename="{name}"'
     return web.Response(body=body, content_type=kind, headers=HEADERS | {"Content-Disposition": disposition})

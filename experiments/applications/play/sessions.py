@@ -66,6 +66,7 @@ class Visitor:
     socket: web.WebSocketResponse | None = None
     transport: asyncio.Transport | None = None  # of the socket
     active: float = field(default_factory=time.monotonic)
+    downloads: int = 0  # that are being made or wait
     acted: int = 0  # the newest round in which an action of this visitor was executed
 
     def tell(self, message: Message) -> None:

@@ -1,8 +1,10 @@
 """What a visitor of the page records, as MP4 and as RLDS."""
 
+import asyncio
 import io
 import json
 import tempfile
+import threading
 import zipfile
 
 import numpy as np
@@ -14,7 +16,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from experiments.applications.play.recording import Recording
 from experiments.applications.play.server import SESSIONS
 from hma_jax.simulator.robots import Robot
-from tests.experiments.applications.serving import Player, ask, serving
+from tests.experiments.applications.serving import SECONDS, Player, ask, serving, until
 
 
 def test_a_recording_is_a_video_and_a_dataset(tmp_path):
@@ -78,6 +80,36 @@ def test_a_robot_s_name_is_made_one_of_a_dataset_and_of_files(name, made, tmp_pa
         for kind, file in (("mp4", f"{made}.mp4"), ("rlds", f"{made}_rlds.zip")):
             answer = await client.get(f"/recording/{player.token}/{kind}")
             assert answer.headers["Content-Disposition"] == f'attachment; filename="{file}"'
+
+    serving(test)
+
+
+def test_downloads_are_made_one_at_a_time_and_a_visitor_waits_for_two_at_most():
+    async def test(client):
+        player, go_on, under_way = Player(client), threading.Event(), []
+        await player.enter()
+
+        class Slow(Recording):
+            def copy(self):
+                return self
+
+            def video(self):
+                under_way.append(threading.current_thread().name)
+                assert go_on.wait(SECONDS) and len(under_way) == 1, "two are made at once"
+                return str(under_way.pop()).encode()
+
+        recording = Slow(Robot("arm", 2, (0.0,), (1.0,), (0.0,)))
+        recording.add(np.zeros((8, 8, 3), np.uint8), np.zeros((2, 1)), np.zeros((8, 8, 3), np.uint8))
+        client.server.app[SESSIONS].visitors[player.token].session.recording = recording
+        get = lambda: asyncio.create_task(client.get(f"/recording/{player.token}/mp4"))  # noqa: E731
+        for _ in range(2):
+            asked = [get() for _ in range(5)]
+            await until(lambda: sum(task.done() for task in asked) == 3)
+            go_on.set()
+            answers = [await task for task in asked]
+            assert sorted(answer.status for answer in answers) == [200] * 2 + [429] * 3
+            go_on.clear()
+        assert {(await a.read()).decode() for a in answers if a.status == 200} == {"downloads_0"}
 
     serving(test)
 

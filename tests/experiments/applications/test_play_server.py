@@ -15,13 +15,15 @@ import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
+from aiohttp import ClientSession
 
 from experiments.applications.play import server
 from experiments.applications.play import sessions as sessions_module
 from experiments.applications.play.requests import Session
 from experiments.applications.play.sessions import MAX_PENDING_REPLIES, Visitor
 from hma_jax.config import require
-from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving, until
+from tests.experiments.applications.serving import SECONDS, Player, ask, hear, no_truth, serving, until
+from tests.hma_jax.simulator.small import simulator, start
 
 
 def test_the_page_and_what_it_must_know_are_served():
@@ -341,6 +343,34 @@ def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch, many
         assert len(await player.drive(0.5, 2)) == 2
 
     serving(test)
+
+
+def test_a_request_that_is_never_finished_ends_its_connection_and_a_visitor_who_waits_stays(monkeypatch):
+    """Each kept its connection for an hour: as many as the process may have kept everybody out."""
+    monkeypatch.setattr(server, "REQUEST_SECONDS", 0.3)
+
+    async def main() -> None:
+        sim, ports = simulator(), asyncio.Queue()
+        sim.starts = (start(0, 2),)
+        serve = asyncio.create_task(server.serve(server.make_app(sim, no_truth), "127.0.0.1", 0, ports.put_nowait))
+        port = await asyncio.wait_for(ports.get(), SECONDS)
+        async with ClientSession("http" + f"://127.0.0.1:{port}") as client:
+            player = Player(client)
+            await player.enter("pusher")
+            for half in (
+                b"",
+                b"GET / HTTP/1.1\r\nHost: localhost\r\n",
+                b"GET /robots HTTP/1.1\r\nHost: localhost\r\n\r\nGET",
+            ):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(half)
+                await asyncio.wait_for(reader.read(), 10)  # to its end
+                writer.close()
+            assert (await ask(player.socket, type="act", action=[0.0, 0.0]))["type"] == "frame"
+        serve.cancel()
+        await asyncio.gather(serve, return_exceptions=True)
+
+    asyncio.run(main())
 
 
 def test_one_who_never_reads_is_let_go_and_others_play_on(monkeypatch):
