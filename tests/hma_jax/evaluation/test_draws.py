@@ -26,6 +26,8 @@ def test_random_actions_follow_the_robot_s_statistics():
     assert draws.shape == (400, 3, 6, TABLE.action_width)
     np.testing.assert_allclose(draws[..., :3].std((0, 1, 2)), [1.0, 0.0, 3.0], rtol=0.05)
     assert (draws[..., 9:] == 0).all()
+    arm = TABLE.index("arm")
+    np.testing.assert_allclose(draw(TABLE, arm, range(200))[..., :14].mean((0, 1, 2)), 0.5, atol=0.01)
     values = draws[..., [0, 2, 3, 5, 6, 8]] / [1, 3, 1, 3, 1, 3]  # the live ones, by their own deviation
     together = np.corrcoef(values.reshape(400, -1), rowvar=False)
     assert np.abs(together - np.eye(len(together))).max() < 0.3

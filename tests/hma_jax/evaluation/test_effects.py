@@ -6,6 +6,8 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.effects import Change, Difference, find_effects, make_loss
+from hma_jax.evaluation.metrics import factored_cross_entropy
+from hma_jax.generation import next_frame_outputs
 from tests.tiny import TABLE, lively_params, random_batch, shallow_config
 
 DIM, WINDOWS = 4, 48
@@ -120,10 +122,19 @@ def test_a_model_that_is_deaf_ignores_every_dimension():
 
 def test_a_model_that_was_trained_without_actions_listens_to_none():
     config, settings = shallow_config(frames=3), ("passive", "forward")
-    params, batch = lively_params(config)[1], random_batch(0, config, 2)
+    (declared, params), batch = lively_params(config), random_batch(0, config, 2)
     losses = [jax.jit(make_loss(config, TABLE, setting)) for setting in settings]
     passive, forward = ([np.asarray(loss(params, batch, x * batch["actions"])) for x in (1, 3)] for loss in losses)
     assert (passive[0] == passive[1]).all() and (forward[0] != forward[1]).all()
+
+    @jax.jit
+    def by_hand(params):
+        hma, given = declared.merge(params), (batch["actions"], batch["embodiment"])
+        followed = batch["tokens"][:, 1:]
+        logits = hma.logits(next_frame_outputs(hma, batch["tokens"], *given), followed)
+        return factored_cross_entropy(logits, followed).mean((1, 2))
+
+    np.testing.assert_allclose(forward[0], by_hand(params), rtol=1e-5)
     # What stands in the padding of a window is no part of its loss.
     padded = {**batch, "real": np.array([[True, True, False], [True] * 3])}
     other = {**padded, "tokens": np.array(batch["tokens"])}

@@ -12,13 +12,15 @@ from hma_jax.evaluation import evaluate as module
 from hma_jax.evaluation import protocol
 from hma_jax.evaluation.evaluate import Evaluation, evaluate, in_groups, make_evaluator, one_ahead, plan_groups
 from hma_jax.evaluation.images import decode_in_pieces
-from hma_jax.evaluation.metrics import psnr, ssim
+from hma_jax.evaluation.metrics import factored_cross_entropy, psnr, ssim
 from hma_jax.evaluation.protocol import evaluation_inputs
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
-from hma_jax.generation import rollout
+from hma_jax.generation import next_frame_outputs, rollout
 from hma_jax.model.embodiments import Embodiment
+from hma_jax.model.frames import compose
 from hma_jax.model.hma import declare_model
+from hma_jax.model.readout import choose_likeliest
 from hma_jax.training.adapt import add_embodiments
 from tests.hma_jax.evaluation.fakes import SIZE, GreyTokenizer, make_batches
 from tests.tiny import DIFFUSION, TABLE, lively_params, shallow_config
@@ -80,7 +82,8 @@ def test_parameters_of_another_model_are_not_evaluated(params):
 
 
 def test_images_are_compared_as_the_host_would(params):
-    """The rollout of the library, decoded by the tokenizer's own `decode`, in float64."""
+    """The rollout of the library, decoded by the tokenizer's own `decode`, in float64; the likelihood is that of the
+    frames after the first."""
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
     result = evaluate(params, CONFIG, TABLE, TOKENIZER, iter([batch]), EVAL)
 
@@ -88,13 +91,20 @@ def test_images_are_compared_as_the_host_would(params):
     def roll_out(params, batch):
         sequences, keys = evaluation_inputs(batch, TABLE, EVAL)
         hma = declare_model(CONFIG, TABLE).merge(params)
-        return rollout(hma, batch["tokens"][:, :2], sequences, batch["embodiment"], keys, DECODE)
+        out = next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"])
+        logits = hma.logits(out, batch["tokens"][:, 1:])
+        likeliest = compose(hma.frame_head.decode_factors(out, choose_likeliest)[0], CONFIG.factor_vocab)
+        return rollout(hma, batch["tokens"][:, :2], sequences, batch["embodiment"], keys, DECODE), logits, likeliest
 
-    made = roll_out(params, {k: batch[k] for k in ("tokens", "actions", "embodiment", "episode", "start")})
+    inputs = {k: batch[k] for k in ("tokens", "actions", "embodiment", "episode", "start")}
+    made, logits, likeliest = roll_out(params, inputs)
+    followed = batch["tokens"][:, 1:]
     images = TOKENIZER.decode(np.asarray(made).reshape(-1, CONFIG.tokens)).reshape(4, 4, 4, SIZE, SIZE, 3)
     true, last = batch["images"][:, 2:], batch["images"][:, -1]
     random = np.stack([psnr(images[:, r, -1], last) for r in (1, 2, 3)], axis=1)
     want = {
+        "cross_entropy": factored_cross_entropy(logits, followed).mean((1, 2)),
+        "accuracy": (likeliest == followed).mean((1, 2)),
         "psnr": psnr(images[:, 0], true).mean(1),
         "psnr_last": psnr(images[:, 0, -1], last),
         "psnr_random": random.mean(1),
@@ -104,6 +114,38 @@ def test_images_are_compared_as_the_host_would(params):
     }
     for metric, values in want.items():
         np.testing.assert_allclose(result.windows.metrics[metric], values, rtol=0, atol=1e-5, err_msg=metric)
+
+
+def test_actions_differ_from_the_chunk_that_leads_to_the_first_predicted_frame(params, monkeypatch):
+    """Random ones, and those of another episode; every seed draws its own."""
+
+    class Asked(Exception):
+        """What is to be rolled out."""
+
+    def ask(hma, prompt, sequences, robots, keys, *_, **__):
+        raise Asked(sequences, keys)
+
+    def asked_with(seed: int, batch):
+        with pytest.raises(Asked) as asked:
+            protocol.make_predictor(CONFIG, TABLE, replace(EVAL, seed=seed))(params, batch)
+        return asked.value.args
+
+    monkeypatch.setattr(protocol, "rollout", ask)
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    inputs = {k: batch[k] for k in ("tokens", "actions", "embodiment", "episode", "start", "images")}
+    own, first, live = batch["actions"][:, None], EVAL.prompt_frames - 1, TABLE.entries[TABLE.index("arm")].chunk
+    inputs |= {"other_actions": own + 1, "other_valid": np.ones((4, 1), bool), "other_images": batch["images"]}
+    (sequences, keys), (reseeded, other_keys) = jax.jit(lambda batch: [asked_with(seed, batch) for seed in (0, 1)])(
+        inputs
+    )
+    random, draws = sequences[:, 1:-1], EVAL.random_actions
+    assert random.shape[1] == draws
+    np.testing.assert_array_equal(sequences[:, 0], own[:, 0])
+    np.testing.assert_array_equal(sequences[:, :, :first], np.repeat(own[:, :, :first], 2 + draws, axis=1))
+    np.testing.assert_array_equal(sequences[:, -1:, first:], own[:, :, first:] + 1)
+    for others in (own, reseeded[:, 1:-1]):
+        assert (random != others)[:, :, first:, :live].all()
+    assert (jax.random.key_data(keys) != jax.random.key_data(other_keys)).any(-1).all()
 
 
 NEWCOMERS = (
@@ -201,6 +243,19 @@ def test_an_untrained_model_has_the_perplexity_of_the_vocabulary():
     assert overall["perplexity_corpus"].mean <= overall["perplexity"].mean
 
 
+def test_a_perplexity_is_of_as_many_windows_as_asked_for(params, monkeypatch):
+    """Of those windows it is a mean over."""
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    monkeypatch.setattr(
+        module,
+        "make_evaluator",
+        lambda *_: lambda *_: ({"cross_entropy": np.arange(4.0), "finite": np.ones(4, bool)}, None),
+    )
+    for group, want in ((1, np.exp(np.arange(4.0)).mean()), (2, np.exp([0.5, 2.5]).mean())):
+        found = evaluate(params, CONFIG, TABLE, TOKENIZER, [batch], replace(EVAL, perplexity_group=group))
+        assert found.summary.datasets["arm"]["perplexity"].mean == pytest.approx(want)
+
+
 def test_samples_show_true_predicted_and_randomly_driven_clips(params):
     result = run(params)
     (batch, *_) = make_batches(CONFIG)
@@ -223,6 +278,11 @@ def test_after_recorded_frames_every_frame_but_the_first_is_predicted(params):
     same, other = (e.windows.metrics["cross_entropy"] for e in (recorded, generated))
     np.testing.assert_allclose(same, other, rtol=1e-5)  # the likelihood is that of recorded frames in both
     assert recorded.summary.overall["delta_psnr"].sem > 0
+    # Copying shows the image before each.
+    images = np.concatenate([batch["images"][batch["valid"]] for batch in make_batches(CONFIG)])
+    np.testing.assert_allclose(
+        recorded.windows.metrics["psnr_copy"], psnr(images[:, :-1], images[:, 1:]).mean(1), rtol=0, atol=1e-5
+    )
 
 
 @pytest.mark.slow
