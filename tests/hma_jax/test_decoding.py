@@ -1,5 +1,6 @@
 """How one frame is filled: how many tokens stay masked, which are drawn, and what tokens do not allow."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -69,6 +70,33 @@ def test_every_look_samples_all_that_is_no_longer_masked_where_that_is_asked_for
     decode = DecodeConfig(2, sampler=SamplerConfig(steps=3), resample=resample)
     decoding.decode_frame(SimpleNamespace(config=config), predictions, lambda _: predictions, keys, decode)
     assert drawn == sizes
+
+
+def test_the_surest_tokens_are_drawn_first_or_any_by_the_order_that_is_asked_for(monkeypatch):
+    """Of four tokens the first of two looks leaves three masked; ids say which look drew them."""
+    config, rows = model_config(tokens=4), 8
+    confidence = jnp.tile(jnp.array([0.1, 0.4, 0.2, 0.3]), (rows, 1))
+    monkeypatch.setattr(decoding, "sample_tokens", lambda head, look, *_: (look, confidence))
+    model, look = SimpleNamespace(config=config, frame_head=None), jnp.ones((rows, 4), jnp.int32)
+
+    @jax.jit
+    def draw(keys):
+        decodes = [DecodeConfig(2, order=order) for order in ("confidence", "random")]
+        return [decoding.decode_frame(model, look, lambda _: look + 1, keys, decode) for decode in decodes]
+
+    surest, other = draw(jax.random.split(jax.random.key(0), rows))
+    np.testing.assert_array_equal(surest, np.tile([2, 1, 2, 2], (rows, 1)))
+    assert ((other == 1).sum(1) == 1).all() and len(np.unique(other, axis=0)) > 1
+
+
+def test_latents_are_kept_within_the_clip_of_the_configuration():
+    """Of a network that takes all that it sees for noiseless."""
+    config = model_config(tokens=4, diffusion=replace(DIFFUSION, clip=0.1))
+    shape = (2, 4, 2 * config.diffusion.token_channels)
+    model = SimpleNamespace(config=config, denoiser=lambda x, t, z: jnp.zeros(shape))
+    keys, decode = jax.random.split(jax.random.key(0), 2), DecodeConfig(sampler=SamplerConfig(steps=3))
+    made = jax.jit(lambda z: decoding.denoise(model, z, keys, decode))(jnp.zeros((2, 4, 3)))
+    assert np.abs(made).max() == np.float32(0.1)
 
 
 def test_every_look_draws_with_random_numbers_of_its_own(monkeypatch):

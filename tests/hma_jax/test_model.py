@@ -46,7 +46,6 @@ def test_the_future_does_not_reach_the_past():
     a = logits_of(config, declared, params, batch)
     b = logits_of(config, declared, params, changed)
     np.testing.assert_array_equal(a[:, :4], b[:, :4])
-    assert np.abs(a[:, 4:] - b[:, 4:]).min(axis=(0, 2, 3, 4)).max() >= 0
     assert all(np.abs(a[:, t] - b[:, t]).max() > 1e-3 for t in (4, 5))
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -90,6 +91,25 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
     for rounds, share in enumerate(shares, start=1):
         assert (share[:rounds] == 1).all()
     assert shares[0][1] < 0.9
+
+
+def test_every_round_draws_with_random_numbers_of_its_own(monkeypatch):
+    """Where the model says nothing, rounds of the same numbers would draw the same ids."""
+    config = shallow_config(action_heads=False)
+    declared, params = lively_params(config)
+    batch, every_frame = random_batch(0, config, 4), 1e9
+    before, given = jnp.asarray(batch["tokens"])[:, :-1], (batch["actions"], batch["embodiment"])
+    nothing = SimpleNamespace(predictions=jnp.zeros((*before.shape, config.factors, config.factor_vocab)))
+    monkeypatch.setattr(own_past, "teacher_forced_pass", lambda *_, **__: nothing)
+
+    @jax.jit
+    def draw(keys):
+        model = declared.merge(params)
+        return [draw_own_past(model, before, *given, None, every_frame, rounds, keys, given[1]) for rounds in (1, 2, 3)]
+
+    first, second, third = draw(noise_keys(jax.random.key(0), 4))
+    for one, other in ((first, second), (second, third), (first, third)):
+        assert (one[:, 1:] != other[:, 1:]).mean() > 0.9
 
 
 def test_it_needs_a_past_that_is_shown():

@@ -8,13 +8,13 @@ import pytest
 from hma_jax.config import DecodeConfig, DiffusionConfig, SamplerConfig
 from hma_jax.generation import read_actions
 from hma_jax.model.hma import Outputs
-from tests.tiny import lively_params, model_config
+from tests.tiny import TABLE, lively_params, model_config
 
 pytestmark = pytest.mark.exact
 
 
 def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():
-    diffusion = DiffusionConfig(channels=1, patch=1, width=16, depth=1)
+    diffusion = DiffusionConfig(channels=1, patch=1, width=16, depth=1, clip=0.5)
     config = model_config(layers=1, diffusion=diffusion)
     declared, params = lively_params(config)
     pusher = jnp.zeros(2, jnp.int32)  # 2 values of 14
@@ -31,3 +31,5 @@ def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():
     into["kernel"] = into["kernel"].at[:, 2:].add(1.0)  # rows that only padding meets
     np.testing.assert_array_equal(before[..., :2], read(params)[..., :2])
     assert (before[..., 2:] == 0).all()
+    normalised = np.abs((before[..., :2] - TABLE.entries[0].mean) / TABLE.entries[0].std)
+    assert normalised.max() == pytest.approx(0.5) and normalised.min() < 0.4  # within the clip, if not all at it
