@@ -1,13 +1,23 @@
 """What a tokenizer's reconstruction of held-out frames is said to be, and how surely."""
 
+import inspect
 import itertools
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from data_pipelines.loading.frames import make_frame_loader
 from experiments.preparing import tokenizer as tokenizer_step
+from experiments.preparing.made_from import MadeFrom
 from experiments.preparing.tokenizer import reconstruction_psnr
+from experiments.presets import SMOKE
+from experiments.running.workspace import Workspace
+from experiments.study import StoreConfig
 from hma_jax.evaluation.metrics import psnr
+from hma_jax.evaluation.statistics import Stat
 
 EACH, GROUPS, EPISODES = 4, 4, 3
 
@@ -65,3 +75,41 @@ def test_every_frame_counts_equally():
     found = reconstruction_psnr(Off(), Frames(np.random.default_rng(1)))
     expected = [psnr(Off().decode(batch), batch) for batch in images]
     assert found.mean == pytest.approx(np.mean(expected))
+
+
+def test_a_tokenizer_is_trained_on_what_the_store_does_not_hold_out_and_judged_on_what_it_does(tmp_path, monkeypatch):
+    held_out = {"val_fraction": 0.3, "min_val": 3, "max_val": 7, "max_val_fraction": 0.4}
+    kept = {"corrupt": "skip", "max_skipped": 5.0}
+    study = replace(
+        SMOKE,
+        store=StoreConfig(**held_out, **kept),
+        tau=2.0,
+        tokenizer_train=replace(SMOKE.tokenizer_train, seed=4),
+    )
+    loaders, judged = [], []
+
+    def make(*arguments, **options) -> SimpleNamespace:
+        loaders.append(SimpleNamespace(**inspect.signature(make_frame_loader).bind(*arguments, **options).arguments))
+        return loaders[-1]
+
+    def train(config, train, frames, aside: Path, **_) -> Off:
+        frames(6)
+        aside.mkdir()
+        return Off()
+
+    def judge(tokenizer, frames) -> Stat:
+        judged.append(frames)
+        return reconstruction_psnr(Off(), Frames(np.random.default_rng(0)))
+
+    monkeypatch.setattr("data_pipelines.loading.frames.make_frame_loader", make)
+    monkeypatch.setattr("hma_jax.tokenizers.train.train_tokenizer", train)
+    monkeypatch.setattr(tokenizer_step, "reconstruction_psnr", judge)
+    monkeypatch.setattr(tokenizer_step, "tokenizer_made_from", lambda *_: MadeFrom({}))
+    tokenizer_step.make_tokenizer(study, Workspace(tmp_path), [(SimpleNamespace(name="arm"), tmp_path)])
+
+    same = {"tau": 2.0, "seed": 4, "batch": study.tokenizer_train.batch, "image_size": study.tokenizer.image_size}
+    (test, training) = loaders
+    for loader, split, start in ((test, "val", 0), (training, "train", 6)):
+        expected = held_out | kept | same | {"split": split, "start_step": start}
+        assert {name: getattr(loader, name) for name in expected} == expected
+    assert judged == [test]
