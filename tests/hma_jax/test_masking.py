@@ -6,15 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
 from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.objective.losses import count_targets, masked_loss
+from hma_jax.objective.losses import LossSums, count_targets, masked_loss
 from hma_jax.objective.masking import hidden_at_inference, mask_tokens
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
-from tests.tiny import DIFFUSION, TABLE, lively_params, mask, random_batch, shallow_config, train_config
+from tests.tiny import (
+    DIFFUSION,
+    SMALLER,
+    TABLE,
+    lively_params,
+    mask,
+    model_config,
+    random_batch,
+    shallow_config,
+    train_config,
+)
 
 MIXED = EmbodimentTable(
     (
@@ -183,6 +194,44 @@ def test_tokens_that_change_may_count_more():
         MaskingConfig(setting="policy", change_weight=2.0)
 
 
+def test_the_gradient_of_actions_counts_as_their_loss_does(monkeypatch):
+    """Of a loss whose sums are those of the parameters, so that no model is differentiated."""
+    config = model_config(**SMALLER)
+    declared, batch = declare_model(config, TABLE), random_batch(0, config)
+    state = init_state(declared, TABLE, 0)
+
+    def total(model, *_):
+        actions = sum(jnp.sum(x) for x in jax.tree.leaves(nnx.state(model)))
+        return LossSums(jnp.zeros(()), jnp.zeros(()), actions)
+
+    monkeypatch.setattr("hma_jax.training.step.masked_loss", total)
+    policies = (MaskingConfig(setting="policy", action_loss_weight=weight) for weight in (1.0, 3.0))
+    steps = [make_train_step(declared, TABLE, config, train_config(masking=policy)) for policy in policies]
+    once, thrice = jax.jit(lambda state: [step(state, batch)[1]["grad_norm"] for step in steps])(state)
+    assert once > 0
+    np.testing.assert_allclose(thrice, 3 * once, rtol=1e-5)
+
+
+def test_only_in_training_are_latents_noised_and_weighed_as_it_is_configured(monkeypatch):
+    """Under `weight_cap` and `time_shift`; held-out losses of models that were trained otherwise are comparable."""
+    config, masking, seen = shallow_config(diffusion=DIFFUSION), MaskingConfig(), []
+
+    def frame_loss(model, z_BTSD, tokens_BTSC, key_B, training=False):
+        seen.append(training)
+        return jnp.zeros(tokens_BTSC.shape[:3])
+
+    monkeypatch.setattr("hma_jax.objective.losses.frame_diffusion_loss", frame_loss)
+    declared, data = declare_model(config, TABLE), random_batch(0, config)
+
+    def both(params, keys):
+        model, (_, masked) = declared.merge(params), masked_batch(config, masking, batch=8)
+        inputs = masked, data["tokens"], data["actions"], data["embodiment"], masking, keys
+        return masked_loss(model, *inputs), masked_loss(model, *inputs, training=False)
+
+    jax.eval_shape(both, declared.shapes(), jax.random.split(jax.random.key(0), 8))
+    assert seen == [True, False]
+
+
 def test_weights_of_change_are_of_ids():
     config, train = shallow_config(diffusion=DIFFUSION), train_config(masking=MaskingConfig(change_weight=2.0))
     with pytest.raises(ConfigError, match="change_weight works only for models on ids: latents change everywhere"):
@@ -320,6 +369,29 @@ def test_stems_and_modulation_learn_from_hidden_actions_that_leak(conditioning: 
     reached = np.asarray(predictions(actions) != predictions(actions + 1))
     assert reached.any() == bool(presence.shared["actions_shown"]) == (conditioning != "concat" or leak == "all")
     assert reached[:, 0].any() == (reached.any() and alignment == "released")
+
+
+def test_a_step_updates_what_its_real_frames_and_its_leak_concern(monkeypatch):
+    """Else stems of a model that is passive but for a leak stood still, and what only padding shows moved."""
+    config, seen = model_config(**SMALLER), []
+
+    def find(masked, embodiment_B, trained_E, model, everything=True, real_BT=None, leak="none"):
+        seen.append((real_BT, leak))
+        return find_presence(masked, embodiment_B, trained_E, model, everything, real_BT, leak)
+
+    monkeypatch.setattr("hma_jax.training.step.find_presence", find)
+    train = train_config(masking=MaskingConfig(setting="passive", action_leak="all"))
+    declared, batch = declare_model(config, TABLE), random_batch(0, config)
+    step = make_train_step(declared, TABLE, config, train)
+    given = batch | {"real": np.ones(batch["tokens"].shape[:2], bool)}
+    state = jax.eval_shape(lambda: init_state(declared, TABLE, 0))
+
+    def traced(state, given):
+        step(state, given)
+        ((real_BT, leak),) = seen
+        assert real_BT is given["real"] and leak == "all"
+
+    jax.eval_shape(traced, state, given)
 
 
 @pytest.mark.parametrize(
