@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -232,6 +233,29 @@ def test_the_weighed_loss_of_a_token_is_the_error_times_its_weight_and_the_bound
     time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, 0), x0.shape[1:], config.steps))(keys)
     weight = FULL.noise_over_signal(2.0)[np.asarray(time)]
     np.testing.assert_allclose(weighed, plain + (weight - 1) * np.square(noise).mean(-1), rtol=1e-4, atol=1e-5)
+
+
+def test_every_repeat_noises_a_token_anew():
+    """A denoiser that says 0 errs by the noise: the mean of two repeats tells what the second one drew."""
+    x0, keys = jnp.ones((2, 3, 4, 3)), jax.random.split(jax.random.key(0), 2)
+
+    @jax.jit
+    def losses():
+        return [
+            frame_diffusion_loss(
+                SimpleNamespace(
+                    config=SimpleNamespace(diffusion=DiffusionConfig(channels=3, patch=1, repeats=repeats)),
+                    denoiser=lambda x, t, z: jnp.concatenate([jnp.zeros_like(x)] * 2, axis=-1),
+                ),
+                x0,
+                x0,
+                keys,
+            )
+            for repeats in (1, 2)
+        ]
+
+    first, mean = map(np.asarray, losses())
+    assert np.all(np.abs(2 * mean - first - first) > 1e-4)
 
 
 def test_shifted_steps_are_drawn_as_often_as_the_shift_says():
