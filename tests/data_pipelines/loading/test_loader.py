@@ -267,6 +267,16 @@ def test_shuffled_actions_reach_every_real_frame(tmp_path):
         assert (given[true["real"]] != true["actions"][..., 0][true["real"]]).all()
 
 
+def test_windows_of_a_single_episode_meet_actions_of_another_window_of_it(tmp_path):
+    """There is no other episode to take them from."""
+    store = store_of(tmp_path, {"single": [40, 40]}, min_val=1, max_val=1)
+    config, table = LoaderConfig(frames=6, batch=15), store.embodiment_table(("single",))
+    assert len(store.manifest("single").train.episodes) == 1 and len(select_windows(store, config).sets["single"]) >= 10
+    (true,), (shuffled,) = take(store, table, 1, config), take(store, table, 1, replace(config, shuffle_actions=True))
+    assert np.array_equal(true["tokens"], shuffled["tokens"])
+    assert (true["actions"] != shuffled["actions"]).any(axis=(1, 2)).all()
+
+
 def test_dataset_without_windows_is_dropped_and_reported(tmp_path):
     store = store_of(tmp_path, {"long": [20] * 6, "short": [3] * 6})
     selected = select_windows(store, LoaderConfig(frames=6, batch=4))
