@@ -247,6 +247,15 @@ def test_history_bounds_how_far_an_episode_is_taken_back():
     np.testing.assert_array_equal(run(sim, plan[10:]), made[10:])
 
 
+def test_a_whole_number_gives_each_episode_a_seed_of_its_own():
+    sim, chunk, shown = simulator(episodes=2), chunks_of(1, 1)[0], []
+    for seeds in (4, [4, 5]):
+        sim.reset(start(1, 2), seeds=seeds)
+        shown.append(sim.step([chunk, chunk]))
+    np.testing.assert_array_equal(*shown)
+    assert (shown[0][0] != shown[0][1]).any()
+
+
 def test_branches_differ_by_their_actions_alone():
     sim, plan = simulator(episodes=3), chunks_of(1, 6)
     sim.reset([start(0, 2), start(1, 2), start(2, 2)], seeds=4)
