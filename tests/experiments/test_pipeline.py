@@ -8,6 +8,7 @@ import pytest
 from data_pipelines.errors import DataError
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
+from data_pipelines.suite import counterfactual as simulator
 from data_pipelines.windows.evalset import eval_batches
 from data_pipelines.windows.other_actions import OtherWindows
 from experiments.override import override
@@ -47,7 +48,13 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     counterfactual.make_counterfactual(study, workspace)
     assert workspace.counterfactual.stat().st_mtime_ns == made  # it is there
     workspace.counterfactual.write_bytes(b"torn")
+    asked, frames_under = [], simulator.frames_under
+    monkeypatch.setattr(simulator, "frames_under", lambda *given: asked.append(given[2:4]) or frames_under(*given))
     counterfactual.make_counterfactual(study, workspace)
+    for (recorded, times), (changed, _) in zip(asked[::2], asked[1::2], strict=True):
+        for own, other, at in zip(recorded, changed, times, strict=True):
+            differ = (own[: len(other)] != other).any(1)
+            assert np.argmax(differ) == at[prompt - 1] and differ.any()  # from the last frame of the prompt on
     assert open_prepared_data(workspace).counterfactual.frames.keys() == truth.frames.keys()
     workspace.counterfactual.unlink()
     seed_of = counterfactual._seed_of
