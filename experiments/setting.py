@@ -45,8 +45,7 @@ class StudyArguments:
     """Which study, on which data, in which directory, on which devices."""
 
     preset: Preset = "cpu"
-    """Named study: smoke (seconds), cpu (minutes), cpu-full (17 hours of two cores), accelerator (one GPU),
-    paper (as published).
+    """Named study: smoke (seconds), cpu (minutes), cpu-full (17 hours), accelerator (one GPU), paper (as published).
     With -continuous: tokens are latents instead of ids. play-gpu: the model of `make play`; play: a smaller one."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/PRESET)")] = None
     """Directory for all output."""
