@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from experiments.preparing.sources import Source, open_source
+from experiments.preparing.sources import Source, check_sources
 from experiments.running.workspace import Busy, Workspace
 from experiments.study import Study
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
 
+if TYPE_CHECKING:
+    from data_pipelines.sources.source import EpisodeSource
+
 FILE = ".asked.json"
 
 
-def asked_for(study: Study, sources: Sequence[Source], tokenizer: Path | None) -> dict[str, Any]:
+def asked_for(
+    study: Study, sources: Sequence[Source], opened: Mapping[str, EpisodeSource], tokenizer: Path | None
+) -> dict[str, Any]:
     """What tokens and windows depend on, under the names that --set has; a `tokenizer` that is given, by its directory,
-    is known by its identity. Raises ConfigError and DataError for what cannot be opened."""
+    is known by its identity. `opened`: the sources by name, as `check_sources` gives them."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     return {
@@ -29,34 +34,38 @@ def asked_for(study: Study, sources: Sequence[Source], tokenizer: Path | None) -
         "eval": {name: getattr(study.eval, name) for name in ("seed", "windows_per_dataset", "prompt_frames")},
         "--tokenizer": load_tokenizer(tokenizer, expect=study.tokenizer).identity if tokenizer else "not given",
         "data": {
-            spec.name: {
-                "entry": to_dict(spec.facts()),
-                "recordings": open_source((spec, path), study.store).fingerprint(),
-            }
-            for spec, path in sources
+            spec.name: {"entry": to_dict(spec.facts()), "recordings": opened[spec.name].fingerprint()}
+            for spec, _ in sources
         },
     }
 
 
-def write_asked(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Path | None) -> None:
+def write_asked(
+    study: Study,
+    workspace: Workspace,
+    sources: Sequence[Source],
+    opened: Mapping[str, EpisodeSource],
+    tokenizer: Path | None,
+) -> None:
     """For those that join while the directory is held."""
     holder = workspace.holder
     if holder is not None:
-        written = {"holder": holder.token, "asked": asked_for(study, sources, tokenizer)}
+        written = {"holder": holder.token, "asked": asked_for(study, sources, opened, tokenizer)}
         write_file(workspace.root / FILE, json.dumps(written))
 
 
 def require_same_asked(
     study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Path | None, busy: Busy
 ) -> None:
-    """Raises Busy if the process that holds the directory was asked for something else, where it says so."""
+    """Raises Busy if the process that holds the directory was asked for something else, where it says so, and as
+    `check_sources` does."""
     try:
         written = json.loads((workspace.root / FILE).read_text())
     except FileNotFoundError:  # another command
         return
     if busy.holder is None or written["holder"] != busy.holder.token:
         return
-    there, here = written["asked"], asked_for(study, sources, tokenizer)
+    there, here = written["asked"], asked_for(study, sources, check_sources(study, sources), tokenizer)
     both = there["data"].keys() & here["data"].keys()  # the others are told by `datasets`
     for one in (there, here):
         one["data"] = {name: one["data"][name] for name in both}

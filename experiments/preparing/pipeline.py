@@ -47,8 +47,7 @@ def prepare(
         require_lpips()  # before all that the evaluation comes after
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
-    check_sources(study, sources)
-    write_asked(study, workspace, sources, tokenizer)
+    write_asked(study, workspace, sources, check_sources(study, sources), tokenizer)
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace)
     else:

@@ -87,15 +87,17 @@ def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
     return sources
 
 
-def check_sources(study: Study, sources: Sequence[Source]) -> None:
-    """Opens every dataset before anything is made of one, which may take hours. Raises ConfigError and DataError for
-    what tokenising would refuse of it without reading an episode."""
+def check_sources(study: Study, sources: Sequence[Source]) -> dict[str, EpisodeSource]:
+    """Opens every dataset, by name, before anything is made of one, which may take hours. Raises ConfigError and
+    DataError for what tokenising would refuse of it without reading an episode."""
     from data_pipelines.tokens.tokenize_job import resolve_frame_step
 
+    opened = {}
     for spec, path in sources:
         resolve_frame_step(spec, study.store.frame_step, study.rate)
-        opened = open_source((spec, path), study.store)
-        opened.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+        opened[spec.name] = open_source((spec, path), study.store)
+        opened[spec.name].check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+    return opened
 
 
 def check_entries(study: Study, data: Sequence[str]) -> None:

@@ -104,7 +104,7 @@ def _identity(trial: Trial) -> dict[str, Any]:
     altered = [
         what
         for what, where in OF_SOME.items()
-        if all(_at(fields, path.split(".")) == value for path, value in where.items())
+        if all(_has(_at(fields, path.split(".")), wanted) for path, wanted in where.items())
     ]
     for path, before in LATER.items():
         _drop(fields, path.split("."), before)
@@ -133,6 +133,11 @@ def _at(fields: dict[str, Any], path: list[str]) -> Any:
     for name in path:
         found = found[name] if found else None
     return found
+
+
+def _has(found: Any, wanted: Any) -> bool:
+    """Whether a field has the value, or one that the function `wanted` is true of."""
+    return wanted(found) if callable(wanted) else found == wanted
 
 
 def loader_of(trial: Trial) -> LoaderConfig:

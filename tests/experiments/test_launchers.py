@@ -95,7 +95,7 @@ class FakeRay:
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    pytest.importorskip("submitit")
+    pytest.importorskip("submitit", reason="needs the extra `slurm`")
 
     def make(name: str, root: Path):
         if name == "local":
@@ -168,7 +168,7 @@ def test_where_one_process_cannot_start_the_others_end(tmp_path):
 @pytest.fixture
 def submitted(tmp_path, monkeypatch):
     """A Slurm launcher, its fake, and a job that only stands in the queue."""
-    pytest.importorskip("submitit")
+    pytest.importorskip("submitit", reason="needs the extra `slurm`")
     fake = FakeSlurm(tmp_path / "slurm", monkeypatch)
     place = SlurmLauncher(tmp_path, None, executor=fake)
     place.pause = 0.0
@@ -264,7 +264,7 @@ def test_a_trial_on_ray_stops_though_ray_forgets_to_say_so(tmp_path):
 
 def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_path):
     """What submitit calls on SIGUSR2, before it puts the job back into the queue."""
-    pytest.importorskip("submitit")
+    pytest.importorskip("submitit", reason="needs the extra `slurm`")
     attempt, thread, codes = start_attempt(tmp_path, SlurmAttempt)
     again = attempt.checkpoint()
     thread.join(20)
@@ -275,7 +275,7 @@ def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_pat
 
 @pytest.mark.parametrize(("grace", "to_save"), [(600, 590), (12, 6)])
 def test_a_trial_has_the_grace_of_its_job_to_save(tmp_path, monkeypatch, grace, to_save):
-    pytest.importorskip("submitit")
+    pytest.importorskip("submitit", reason="needs the extra `slurm`")
     fake, submitted = FakeSlurm(tmp_path / "slurm", monkeypatch), []
     fake.submit_array = lambda attempts: submitted.extend(attempts) or attempts
     SlurmLauncher(tmp_path, None, SlurmSettings(grace=grace), executor=fake).launch([tmp_path])

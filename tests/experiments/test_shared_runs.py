@@ -215,11 +215,13 @@ def test_a_change_that_alters_some_trials_renames_these_alone(monkeypatch):
     one = reference_trial(CPU_FULL, 0)
     attends = replace(one, model=replace(one.model, conditioning="cross_attention"))
     after = replace(one, source=attends)
+    averages = [replace(one, train=replace(one.train, ema_decay=decay)) for decay in (0.5, 0.9999)]
+    trials = one, attends, after, *averages
     name = trial_id.__wrapped__  # not what is remembered, nor to be remembered
-    before = [name(trial, PROVENANCE) for trial in (one, attends, after)]
+    before = [name(trial, PROVENANCE) for trial in trials]
     monkeypatch.setattr(trial_module, "OF_SOME", {})
-    changed = [name(trial, PROVENANCE) != id for trial, id in zip((one, attends, after), before, strict=True)]
-    assert changed == [False, True, True]
+    changed = [name(trial, PROVENANCE) != id for trial, id in zip(trials, before, strict=True)]
+    assert changed == [False, True, True, True, True]
 
 
 def test_names_of_trials_stay():

@@ -132,7 +132,7 @@ def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, 
     with Workspace(tmp_path).locked():
         assert main([*arguments, *data[:2]]) == 2
         assert f"datasets: 2 -> 1, without {BASE.name}" in capsys.readouterr().err.replace("\n", " ")
-        write_asked(setting.study, setting.workspace, found, None)
+        write_asked(setting.study, setting.workspace, found, sources.check_sources(setting.study, found), None)
         assert main([*arguments, *data, *tokenizer, "--set", "store.min_val=1", "--set", "model.frames=3"]) == 2
         message = capsys.readouterr().err
         assert "cannot be shared" in message and "--tokenizer: 'not given' -> '" in message
@@ -151,7 +151,8 @@ def test_who_has_other_recordings_or_entries_of_the_same_names_does_not_join(
     (tmp_path / "my.toml").write_text(to_toml(replace(BASE, hz=BASE.hz + 1)))
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), "--data", other, data[2], *tokenizer]
     with Workspace(tmp_path).locked():
-        write_asked(setting.study, setting.workspace, found, setting.tokenizer)
+        opened = sources.check_sources(setting.study, found)
+        write_asked(setting.study, setting.workspace, found, opened, setting.tokenizer)
         assert main([*arguments, "--registry", str(tmp_path / "my.toml")]) == 2
         message = capsys.readouterr().err
         assert "cannot be shared" in message and f"data.{ARM.name}.recordings: " in message
