@@ -106,9 +106,16 @@ class HeartbeatServer(socketserver.ThreadingTCPServer):
     daemon_threads, allow_reuse_address, request_queue_size = True, True, 1024
 
     def __init__(self, token: str):
+        # The coordinator's address may be of either kind, and JAX's own service listens to both too.
+        self.address_family = socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET
         super().__init__(("", 0), _HeartbeatHandler)
         self.token, self.heartbeats = token, dict[int, Heartbeat]()
         threading.Thread(target=self.serve_forever, name="heartbeats", daemon=True).start()
+
+    def server_bind(self) -> None:
+        if self.address_family == socket.AF_INET6:
+            self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, False)  # of IPv4 too
+        super().server_bind()
 
     @property
     def port(self) -> int:

@@ -179,19 +179,30 @@ def test_the_slurm_script_of_the_page_puts_lost_jobs_back_into_the_queue(code):
     assert start(20).stdout == ""
 
 
-def test_heartbeats_are_sent_to_the_server_and_those_of_all_come_back():
+def has_address(host: str) -> bool:
+    try:
+        socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has_address("::1"), reason="no IPv6"))]
+)
+def test_heartbeats_are_sent_to_the_server_and_those_of_all_come_back(host):
     server = HeartbeatServer("word")
     assert server.exchange(0, [1]) == {0: [1]}
-    assert send_heartbeat("127.0.0.1", server.port, "word", 1, [7]) == {0: [1], 1: [7]}
+    assert send_heartbeat(host, server.port, "word", 1, [7]) == {0: [1], 1: [7]}
     with pytest.raises(ConnectionResetError):
-        send_heartbeat("127.0.0.1", server.port, "of another program", 1, [8])
-    with socket.create_connection(("127.0.0.1", server.port)) as stranger:
+        send_heartbeat(host, server.port, "of another program", 1, [8])
+    with socket.create_connection((host, server.port)) as stranger:
         stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
-    assert send_heartbeat("127.0.0.1", server.port, "word", 2, [1]) == {0: [1], 1: [7], 2: [1]}
+    assert send_heartbeat(host, server.port, "word", 2, [1]) == {0: [1], 1: [7], 2: [1]}
     server.shutdown()
     server.server_close()
     with pytest.raises(ConnectionRefusedError):
-        send_heartbeat("127.0.0.1", server.port, "word", 1, [9])
+        send_heartbeat(host, server.port, "word", 1, [9])
 
 
 def test_a_watchdog_ends_its_process_with_the_failure_and_not_after_its_own_end():
