@@ -227,7 +227,7 @@ def _read_schema(directory: Location) -> tuple[tuple[FieldFacts, ...], tuple[Spl
 
 def _field(key: str, feature: FlatFeature) -> FieldFacts:
     if feature.image:
-        kind = "image" if feature.dtype == "uint8" else "depth"  # a grey image is decoded to three equal channels
+        kind = "image" if feature.camera else "depth"  # a grey image is decoded to three equal channels
     elif feature.encoding:
         kind = "bytes"
     else:

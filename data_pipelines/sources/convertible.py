@@ -44,7 +44,7 @@ class Layout:
                 step_key(key): FlatFeature(image=False, size=0, shape=shape)
                 for key, shape in unsupported_images.items()
             },
-            **{step_key(key): FlatFeature(image=True, size=0) for key in self.images},
+            **{step_key(key): FlatFeature(image=True, size=0, dtype="uint8") for key in self.images},
             **{step_key(key): FlatFeature(image=False, size=size) for key, size in self.vectors.items()},
         }
 

@@ -54,6 +54,11 @@ class FlatFeature:
     dtype: str = "string"
     encoding: str = ""
 
+    @property
+    def camera(self) -> bool:
+        """Whether it is an image of colours or of grey values; tfds stores depths as images of other types."""
+        return self.image and self.dtype == "uint8"
+
 
 def parse_features(schema: Any) -> dict[str, FlatFeature]:
     """Fields by the flat key under which a record holds them, as `steps/observation/image`.

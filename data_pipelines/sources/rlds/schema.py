@@ -237,17 +237,16 @@ def check_fields(
 ) -> None:
     """Raises ConfigError unless the camera and the action fields are among the `features` of a step of the dataset
     `name`, as the file `schema` says them, with these sizes."""
-    cameras = [k for k, f in features.items() if f.image]
+    cameras = [k for k, f in features.items() if f.camera]
     numbers = [k for k, f in features.items() if f.size and "action" in k]
     if step_key(image_key) not in features:
         raise ConfigError(
             f"{name}: no image {image_key!r} in {schema}; "
             f"images there: {listing(cameras)}{closest(image_key, cameras)}. Correct image_key."
         )
-    require(
-        features[step_key(image_key)].image,
-        f"{name}: {image_key!r} is not an image; images: {listing(cameras)}. Correct image_key.",
-    )
+    chosen = features[step_key(image_key)]
+    what = f"holds depths ({chosen.dtype}), which are not an image" if chosen.image else "is not an image"
+    require(chosen.camera, f"{name}: {image_key!r} {what}; images: {listing(cameras)}. Correct image_key.")
     for n, key in enumerate(action_keys):
         field, part = field_slice(key)
         feature = features.get(step_key(field))

@@ -180,6 +180,19 @@ def test_wrong_image_key_lists_the_images(directory):
         RldsDataset(directory).check_keys("action", ("action",))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.uint16])
+def test_depths_are_no_camera(directory, dtype):
+    """tfds keeps the bytes of float32 depths as the four channels of a PNG: they were read as colours."""
+    from tensorflow_datasets import features as tf
+
+    step = {"image": tf.Image(shape=(8, 8, 3)), "depth": tf.Image(shape=(8, 8, 1), dtype=dtype, encoding_format="png")}
+    tf.FeaturesDict({"steps": tf.Dataset({"observation": step})}).save_config(str(directory))
+    with pytest.raises(
+        ConfigError, match=f"'observation/depth' holds depths .{dtype.__name__}.*images: observation/image[.]"
+    ):
+        RldsDataset(directory).check_keys("observation/depth", ())
+
+
 def test_wrong_action_key_or_size(directory):
     dataset = RldsDataset(directory)
     with pytest.raises(ConfigError, match="no numeric field 'actoin'.*closest: action"):
