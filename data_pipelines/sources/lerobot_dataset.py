@@ -104,6 +104,18 @@ class LeRobotDataset(EpisodeSource):
 
     @contextmanager
     def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
+        with self._open(i, image_key, action_keys, with_success=self._read.layout.knows_success) as episode:
+            yield episode
+
+    def frames(
+        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
+    ) -> list[np.ndarray]:
+        """As `EpisodeSource.frames`; those of a video are read without the episode's table."""
+        with self._open(i, image_key, (), with_success=False) as episode:
+            return episode.images(choose)
+
+    @contextmanager
+    def _open(self, i: int, image_key: str, action_keys: Sequence[str], with_success: bool) -> Iterator[OpenEpisode]:
         self.check_keys(image_key, action_keys)
         camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
         entry, where = self._entries[i], self._where(i)
@@ -111,7 +123,7 @@ class LeRobotDataset(EpisodeSource):
             what = f"{where}: the meta folder lists this episode with no steps; leave it out with corrupt='skip'."
             raise EpisodeError(what).at(entry.data, -1)
         with ExitStack() as stack:
-            if not keys and self._cameras[camera] in entry.videos:  # frames alone: no table is needed
+            if not keys and not with_success and self._cameras[camera] in entry.videos:  # no table is needed
                 steps, actions, success = entry.length, np.zeros((entry.length, 0), np.float32), None
                 times = np.arange(steps) / self.hz
             else:

@@ -90,6 +90,12 @@ class OpenEpisode:
     def image(self, n: int) -> np.ndarray:
         return self.decode(n, self.fetch(n))
 
+    def images(self, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
+        """Those that `choose`, which maps N to frame numbers, names."""
+        chosen = choose(self.steps)
+        seen = {t: self.image(t) for t in sorted(set(chosen))}
+        return [seen[t] for t in chosen]
+
 
 class EpisodeSource(ABC):
     """Random access to the episodes of one split, of which there are `len(source)`. Thread-safe; pickles.
@@ -188,9 +194,7 @@ class EpisodeSource(ABC):
         Images may be decoded at a reduced size, with no side shorter than `at_least` pixels, where that saves time.
         """
         with self.open_episode(i, image_key, ()) as episode:
-            chosen = choose(episode.steps)
-            seen = {t: episode.image(t) for t in sorted(set(chosen))}
-            return [seen[t] for t in chosen]
+            return episode.images(choose)
 
     def check_keys(self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None) -> None:
         """Raises ConfigError unless the camera and the action fields exist, with these sizes."""

@@ -98,6 +98,7 @@ def test_lerobot_actions_alone_can_be_sliced_and_be_none(tmp_path):
         *lerobot_actions(1, 9)[3, :2], 1, 3
     ]  # fmt: skip
     assert source.episode(1, TOP.image_key, ()).actions.shape == (9, 0)
+    assert [source.episode(i, TOP.image_key, ()).success for i in (0, 1)] == [True, False]
     with pytest.raises(ConfigError, match="toy_arm: no image 'observation/tip' in .*info.json; images there: "):
         source.check_keys("observation/tip", ())
 
