@@ -6,6 +6,7 @@ An episode is named by its `episode_index`.
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import weakref
@@ -89,6 +90,10 @@ class LeRobotDataset(EpisodeSource):
 
     def fingerprint(self) -> str:
         """Hash over the meta folder, statistics of episodes included, and all files' names and sizes."""
+        return self._fingerprint
+
+    @functools.cached_property
+    def _fingerprint(self) -> str:
         digest = hash_meta(self.location)
         for path, size in self._bytes.items():
             digest.update(f"{path.relative_to(self.location).as_posix()}:{size};".encode())

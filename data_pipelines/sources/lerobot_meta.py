@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -104,12 +105,21 @@ def read_meta(root: Path) -> LeRobotMeta:
 
 
 def hash_meta(root: Path) -> hashlib._Hash:
-    """SHA-256, to be added to, of the names and contents of all files of the meta folder."""
+    """SHA-256, to be added to, of the names and contents of all files of the meta folder.
+
+    Hidden ones are left out: file managers and editors write them (.DS_Store, .info.json.swp).
+    """
     digest, meta = hashlib.sha256(), root / "meta"
     for path in sorted(p for p in meta.rglob("*") if p.is_file()):
-        content = hashlib.sha256(retry(path, path.read_bytes)).hexdigest()
-        digest.update(f"{path.relative_to(meta).as_posix()}:{content};".encode())
+        name = path.relative_to(meta).as_posix()
+        if not any(part.startswith(".") for part in name.split("/")):
+            digest.update(f"{name}:{retry(path, partial(_hash_file, path))};".encode())
     return digest
+
+
+def _hash_file(path: Path) -> str:
+    with path.open("rb") as file:  # in small parts: statistics of every episode can be half a gigabyte
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _episodes_2(root: Path, info: dict[str, Any], videos: list[str]) -> list[EpisodeEntry]:

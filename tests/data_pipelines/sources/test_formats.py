@@ -9,6 +9,7 @@ import pickle
 import re
 import shutil
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources import lerobot_dataset
+from data_pipelines.sources.lerobot import LeRobotSource
 from data_pipelines.sources.open import find_format, open_source, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
@@ -120,6 +122,21 @@ def test_an_episode_of_lerobot_keeps_its_name_when_others_are_gone(tmp_path):
     info = root / "meta" / "info.json"
     info.write_text(json.dumps(json.loads(info.read_text()) | {"total_episodes": 2}))
     assert open_source(root).ids.tolist() == [ids[0], ids[2]]
+
+
+def test_hidden_files_of_the_meta_folder_are_no_part_of_the_dataset(tmp_path, monkeypatch):
+    """A file manager's made finished tokens those of other recordings. The others are hashed once per opened source,
+    in bounded memory."""
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1")
+    before, identity = open_source(root).fingerprint(), LeRobotSource(root).identity()
+    (root / "meta" / ".cache").mkdir()
+    for name in (".DS_Store", ".cache/lock"):
+        (root / "meta" / name).write_text("here")
+    monkeypatch.setattr(Path, "read_bytes", None)
+    source = open_source(root)
+    assert source.fingerprint() == before and LeRobotSource(root).identity() == identity
+    (root / "meta" / "stats.json").write_text("{}")
+    assert source.fingerprint() == before != open_source(root).fingerprint()
 
 
 def test_more_lost_episodes_than_can_be_named_are_damage_whatever_is_allowed(tmp_path):
