@@ -176,7 +176,7 @@ class _Frames(Sequence[SourceFrame]):
             rows = slice(at * self._rows, (at + 1) * self._rows)
             self._at, self._block = at, read_rows(self._demo, self._key, rows, self._where)
             self.nbytes += self._block.nbytes
-        return self._block[n - at * self._rows]
+        return self._block[n - at * self._rows].copy()  # a view would keep the whole block as long as the frame is used
 
 
 class _LazyFrames(Sequence[SourceFrame]):

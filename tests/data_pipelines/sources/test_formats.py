@@ -179,6 +179,7 @@ def test_robomimic_is_read_where_it_lies(tmp_path):
             assert [number(image) for image in episode.images] == [24 * k + t for t in range(steps)]
             np.testing.assert_array_equal(episode.actions, demo_actions(k, steps).astype(np.float32))
             assert episode.success is (k != 1)
+            assert all(image.base is None for image in episode.images)  # none keeps those read with it in memory
         backward = source.frames(1, "observation/robot0_eye_in_hand", lambda n: [0, 22, 1])
         assert [number(image) for image in backward] == [46, 24, 45]
     some = open_source(path, "valid")
