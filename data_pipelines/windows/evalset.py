@@ -9,6 +9,7 @@ import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -244,7 +245,9 @@ class _Rows:
         other_actions: int,
         counterfactual: CounterfactualFrames | None,
     ):
-        self._store, self._table, self._names = store, table, tuple(names)
+        self._table, self._names = table, tuple(names)
+        # A record holds all frames of an episode, and its windows follow one another.
+        self._episode = lru_cache(1)(store.episode)
         self._slicers = {name: make_slicer(store, name, manifest.frames, manifest.rate) for name in names}
         self._some_are_short = 0 < manifest.least < manifest.frames
         self._count, self._counterfactual = other_actions, counterfactual
@@ -254,7 +257,7 @@ class _Rows:
             self._statistics = store.embodiment_table(names, manifest.rate).statistics()
 
     def __call__(self, name: str, episode: int, start: int) -> dict:
-        slicer, item = self._slicers[name], self._store.episode(name, "val", episode)
+        slicer, item = self._slicers[name], self._episode(name, "val", episode)
         width = self._table.action_width
         mean, std = (x[self._names.index(name)] for x in self._statistics)
         row = {

@@ -60,6 +60,13 @@ def names_of(batch):
     return [name for name, valid in zip(rows, batch["valid"], strict=True) if valid]
 
 
+def test_an_episode_is_read_once_for_all_its_windows(store, table, monkeypatch):
+    frozen, read, episode = freeze_manifest(store, ("arm",), 4, 5, 0), [], TokenStore.episode
+    monkeypatch.setattr(TokenStore, "episode", lambda self, *place: read.append(place) or episode(self, *place))
+    windows = sum(batch["valid"].sum() for batch in eval_batches(store, table, frozen, batch=2))
+    assert windows == 5 and len(read) == len(set(read)) == 2
+
+
 def test_batches_give_each_window_once_with_its_images_and_actions(store, table, manifest):
     seen = []
     for batch in eval_batches(store, table, manifest, batch=2):
