@@ -276,7 +276,7 @@ _call_counts: dict[str, int] = {}
 def _wait_for(client: Any, key: str) -> str:
     while True:
         try:
-            return client.blocking_key_value_get(key, 60_000)
+            return client.blocking_key_value_get(key, 1_000)  # milliseconds in which no signal is handled
         except jax.errors.JaxRuntimeError as error:
             if "DEADLINE_EXCEEDED" not in str(error):
                 raise

@@ -8,16 +8,18 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 from pathlib import Path
 
 import pytest
+from jax._src.lib import _jax
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime import processes
-from hma_jax.runtime.exits import Exit, sigterm_as_interrupt
+from hma_jax.runtime.exits import Exit, Terminated, sigterm_as_interrupt
 from hma_jax.runtime.processes import Processes
 from hma_jax.runtime.watchdog import DONE, FAILED, Heartbeats, HeartbeatServer, Watchdog, send_heartbeat
-from tests.multihost.processes import by_address, by_slurm, run
+from tests.multihost.processes import by_address, by_slurm, free_port, run
 
 ROOT = Path(__file__).parents[2]
 
@@ -85,6 +87,22 @@ def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, mes
     asked = Processes("a:1", 2, 0, start_timeout=1.0)
     with pytest.raises(Left, match=f"{code}: {message}"), sigterm_as_interrupt():
         processes.start(asked)
+
+
+def test_a_process_that_waits_for_another_one_stops_when_it_is_asked():
+    """Its wait is a call of JAX that no signal interrupts."""
+    address = f"127.0.0.1:{free_port()}"
+    service = _jax.get_distributed_runtime_service(address, 1)
+    client = _jax.get_distributed_runtime_client(address, 0)
+    client.connect()
+    request = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
+    began = time.monotonic()
+    with pytest.raises(Terminated), sigterm_as_interrupt():
+        request.start()
+        processes._wait_for(client, "nobody sets it")
+    assert time.monotonic() - began < 5
+    client.shutdown()
+    service.shutdown()
 
 
 class World:
