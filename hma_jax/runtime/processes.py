@@ -97,6 +97,35 @@ class Processes:
         return self.detect or (self.processes or 1) > 1
 
 
+ALL_DEVICES: list[int] = []
+"""As `local_device_ids` of JAX: all that the process sees."""
+
+
+def own_devices(environment: Mapping[str, str]) -> list[int] | None:
+    """The `local_device_ids` of a process that JAX detects. None leaves the choice to JAX: under Slurm and Open MPI the
+    one GPU whose number is that of the process on its node, elsewhere all.
+
+    A process that is alone on its node takes all that it sees, and so does one that sees fewer GPUs than there are
+    processes on the node: they were shared out already, and count from 0 in each.
+    """
+    if "JAX_LOCAL_DEVICE_IDS" in environment:  # the user's choice
+        return None
+    visible, neighbours = environment.get("CUDA_VISIBLE_DEVICES"), _processes_on_node(environment)
+    shared_out = visible is not None and len(visible.split(",")) < neighbours
+    return ALL_DEVICES if neighbours == 1 or shared_out else None
+
+
+def _processes_on_node(environment: Mapping[str, str]) -> int:
+    """How many processes of this program are on this node; 0 if Open MPI and Slurm do not tell."""
+    if "OMPI_COMM_WORLD_LOCAL_SIZE" in environment:
+        return int(environment["OMPI_COMM_WORLD_LOCAL_SIZE"])
+    counts: list[int] = []
+    for part in environment.get("SLURM_STEP_TASKS_PER_NODE", "0").split(","):  # such as 8(x3),4
+        count, _, nodes = part.rstrip(")").partition("(x")
+        counts += [int(count)] * int(nodes or 1)
+    return counts[int(environment.get("SLURM_NODEID", "0"))]
+
+
 def start(asked: Processes) -> None:
     """Joins the other processes (`jax.distributed`); must be called before anything else of JAX. Does nothing for a
     single process. Raises ConfigError if joining fails. If not all processes come in time, or this one is asked to stop
@@ -113,6 +142,7 @@ def start(asked: Processes) -> None:
                 asked.coordinator,
                 asked.processes,
                 asked.process,
+                local_device_ids=own_devices(os.environ) if asked.detect else None,
                 cluster_detection_method=None if asked.detect else "deactivate",
                 initialization_timeout=int(asked.start_timeout + MARGIN),
                 heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),

@@ -6,6 +6,7 @@ import sys
 
 import jax
 import numpy as np
+from jax._src.xla_bridge import CUDA_VISIBLE_DEVICES
 from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MeshConfig
@@ -43,6 +44,7 @@ def main(path: str) -> None:
         "from_writer": broadcast_from_writer("chief", f"p{me}"),
         "agreed": agreed,
         "sum": float(jax.jit(lambda t: t["x"].sum() + t["y"].sum(), out_shardings=whole)(laid)),
+        "gpus": CUDA_VISIBLE_DEVICES.value,
         "rows": {f"{m}": own_rows(MeshConfig(*m), 8).tolist() for m in ((-1, 1, 1), (1, 2, 1), (1, 1, 2))},
     }
     print(json.dumps(report), flush=True)

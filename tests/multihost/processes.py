@@ -46,10 +46,11 @@ def by_address(processes: int) -> list[dict[str, str]]:
 
 
 def by_slurm(processes: int) -> list[dict[str, str]]:
-    """What srun says to each of its tasks on one node."""
+    """What srun says to each of its tasks on one node, with a GPU for each."""
     step = {
         "SLURM_JOB_ID": "7", "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": str(processes),
-        "SLURM_STEP_NUM_NODES": "1", "JAX_COORDINATOR_PORT": str(free_port()),
+        "SLURM_STEP_NUM_NODES": "1", "SLURM_STEP_TASKS_PER_NODE": str(processes), "SLURM_NODEID": "0",
+        "CUDA_VISIBLE_DEVICES": "0", "JAX_COORDINATOR_PORT": str(free_port()),
     }  # fmt: skip
     return [step | {"SLURM_PROCID": str(p), "SLURM_LOCALID": str(p)} for p in range(processes)]
 

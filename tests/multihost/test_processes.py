@@ -17,7 +17,7 @@ from jax._src.lib import _jax
 from hma_jax.config import ConfigError
 from hma_jax.runtime import processes
 from hma_jax.runtime.exits import Exit, Terminated, sigterm_as_interrupt
-from hma_jax.runtime.processes import Processes
+from hma_jax.runtime.processes import ALL_DEVICES, Processes, own_devices
 from hma_jax.runtime.watchdog import DONE, FAILED, Heartbeats, HeartbeatServer, Watchdog, send_heartbeat
 from tests.multihost.processes import by_address, by_slurm, free_port, run
 
@@ -33,7 +33,7 @@ def test_two_processes_meet(said, tmp_path: Path):
     for report in (first, second):
         assert report["seen"] == "here" and report["told"] == ["p0", "p1"] and report["from_writer"] == "p0"
         assert report["agreed"] == [0, 0, 1, 2]  # of each step the largest request, a step later
-        assert report["sum"] == 5.0
+        assert report["sum"] == 5.0 and report["gpus"] == "all"
 
 
 @pytest.mark.parametrize(
@@ -57,6 +57,31 @@ def test_what_is_given_goes_before_the_environment():
     asked = Processes(coordinator="a:1").or_from(environment)
     assert (asked.coordinator, asked.processes, asked.process, asked.several) == ("a:1", 2, 1, True)
     assert not Processes().or_from({}).several
+
+
+SLURM = {"SLURM_LOCALID": "3", "SLURM_NODEID": "2", "SLURM_STEP_TASKS_PER_NODE": "8(x2),4,1"}
+EIGHT = {"CUDA_VISIBLE_DEVICES": "0,1,2,3,4,5,6,7"}
+MPI = {"OMPI_COMM_WORLD_LOCAL_RANK": "1"}
+
+
+@pytest.mark.parametrize(
+    ("environment", "devices"),
+    [
+        (SLURM | EIGHT, None),  # srun --ntasks-per-node 4 --gpus-per-node 8
+        (SLURM | {"CUDA_VISIBLE_DEVICES": "0"}, ALL_DEVICES),  # --gpus-per-task 1
+        (SLURM | {"CUDA_VISIBLE_DEVICES": "6,7"}, ALL_DEVICES),  # --gpus-per-task 2
+        (SLURM | {"SLURM_NODEID": "3"} | EIGHT, ALL_DEVICES),  # --ntasks-per-node 1 --gpus-per-node 8
+        (SLURM | {"SLURM_NODEID": "1", "CUDA_VISIBLE_DEVICES": "0,1,2,3"}, ALL_DEVICES),
+        (SLURM | {"SLURM_NODEID": "3", "JAX_LOCAL_DEVICE_IDS": "5"} | EIGHT, None),
+        (SLURM, None),
+        (MPI | {"OMPI_COMM_WORLD_LOCAL_SIZE": "1"}, ALL_DEVICES),
+        (MPI | {"OMPI_COMM_WORLD_LOCAL_SIZE": "8"} | EIGHT, None),
+        ({}, None),
+    ],
+)
+def test_a_process_takes_all_devices_that_are_its_own(environment, devices):
+    """JAX would take the one with the number of the process on its node."""
+    assert own_devices(environment) == devices
 
 
 class Left(Exception):
