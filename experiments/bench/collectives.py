@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,20 @@ from hma_jax.kernels.dense import FROM_EXAMPLES, TO_EXAMPLES
 from hma_jax.runtime.sharding import GATHER, SCATTER
 from hma_jax.training.optimizer import ORTHOGONALISE
 
-KINDS = ("all-gather", "all-reduce", "reduce-scatter", "all-to-all", "collective-permute")
+RECEIVED: dict[str, Callable[[int], float]] = {
+    "all-gather": lambda n: (n - 1) / n,
+    "all-reduce": lambda n: 2 * (n - 1) / n,  # sums are scattered, then gathered
+    "reduce-scatter": lambda n: n - 1,
+    "all-to-all": lambda n: (n - 1) / n,
+    "collective-permute": lambda n: 1,
+}
+"""What each of n devices receives from the others, over the size of its result."""
+KINDS = tuple(RECEIVED)
 LINE = re.compile(rf"= (?P<result>\(.*?\)|\S+) (?P<kind>{'|'.join(KINDS)})(?P<start>-start)?\(")
 ARRAY = re.compile(r"\b(?:pred|[a-z]+?(?P<bits>\d+)\w*)\[(?P<shape>[\d,]*)\]")
+PART = r"(?:\([^()]*\)|[^(),]+\[[\d,]*\])"
+SECOND = re.compile(rf"\({PART}, ({PART})")
+"""In a tuple of arrays, or of tuples of arrays."""
 SMALL = 2**16
 """Bytes of what is called numbers and flags below."""
 
@@ -27,20 +38,22 @@ class Collective:
 
     kind: str
     over: str  # mesh axes, joined by "+"; "" where the program does not say
-    looped: bool  # in the body of a loop: once for every layer, or for every micro-batch
+    loops: int  # how many loops it is in, one in another: over micro-batches, if there are several, and over layers
     purpose: str
 
 
 @dataclass(frozen=True)
 class Sent:
     count: int  # as they stand in the program's text
-    bytes: int  # of their results on one device, once through the text
+    bytes: int  # that one device receives, once through the text
 
 
 def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sent]:
-    """Those of a program compiled for a mesh of those sizes, most bytes first."""
+    """Those of a program compiled for a mesh of those sizes, most bytes first. One that does not tell its groups is
+    taken to be among all devices."""
+    devices = math.prod(mesh.values())
     counts: Counter[Collective] = Counter()
-    sizes: Counter[Collective] = Counter()
+    received: Counter[Collective] = Counter()
     channels: set[tuple[str, str]] = set()
     for line in text.splitlines():
         if (match := LINE.search(line)) is None:
@@ -54,14 +67,15 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
             if (kind, channel[1]) in channels:
                 continue
             channels.add((kind, channel[1]))
-        arrays, over = count_bytes(match["result"]), find_axes(line, mesh)
-        # What starts a gather or a permutation holds what is sent beside what is received.
-        size = max(arrays) if match["start"] and kind in ("all-gather", "collective-permute") else sum(arrays)
-        collective = Collective(kind, over, "while/body" in name, explain(kind, name, over, size))
+        group = _first_group(line, devices)
+        # What starts a collective holds what is sent beside its result; of an all-reduce, the result alone.
+        size = count_bytes(match["result"], started=bool(match["start"]) and kind != "all-reduce")
+        over = "" if group is None else find_axes(group, mesh)
+        collective = Collective(kind, over, name.count("while/body"), explain(kind, name, over, size))
         counts[collective] += 1
-        sizes[collective] += size
-    order = sorted(counts, key=lambda c: (-sizes[c], str(c)))
-    return {collective: Sent(counts[collective], sizes[collective]) for collective in order}
+        received[collective] += round(size * RECEIVED[kind](len(group or range(devices))))
+    order = sorted(counts, key=lambda c: (-received[c], str(c)))
+    return {collective: Sent(counts[collective], received[collective]) for collective in order}
 
 
 def count_kinds(collectives: Mapping[Collective, Sent]) -> dict[str, int]:
@@ -98,12 +112,9 @@ def explain(kind: str, name: str, over: str, size: int) -> str:
     return f"other: {name.removeprefix('jit(step)/')[-60:] or 'the program does not say'}"
 
 
-def find_axes(line: str, mesh: Mapping[str, int]) -> str:
-    """The mesh axes along which the devices of one group lie."""
-    devices = _first_group(line, math.prod(mesh.values()))
-    if devices is None:
-        return ""
-    places = np.stack(np.unravel_index(devices, tuple(mesh.values())))
+def find_axes(group: Sequence[int], mesh: Mapping[str, int]) -> str:
+    """The mesh axes along which the devices of a group lie."""
+    places = np.stack(np.unravel_index(group, tuple(mesh.values())))
     return "+".join(axis for axis, place in zip(mesh, places, strict=True) if len(set(place)) > 1)
 
 
@@ -123,7 +134,10 @@ def _first_group(line: str, devices: int) -> list[int] | None:
     return list(range(devices)) if "replica_groups={}" in line else None
 
 
-def count_bytes(result: str) -> list[int]:
-    """Of each array in the type of an instruction's result, such as 'f32[8]{0}' or '(f32[8], u32[])'."""
-    arrays = [(int(x["bits"] or 8), x["shape"]) for x in ARRAY.finditer(re.sub(r"\{[^}]*\}|/\*.*?\*/", "", result))]
-    return [bits * math.prod(int(n) for n in shape.split(",") if n) // 8 for bits, shape in arrays]
+def count_bytes(result: str, started: bool = False) -> int:
+    """Of the arrays in the type of an instruction's result, such as 'f32[8]{0}' or '(f32[8], u32[])'; of one that is
+    only `started`, of the second part of that type: (operands, results, ...)."""
+    arrays = re.sub(r"\{[^}]*\}|/\*.*?\*/", "", result)
+    second = SECOND.match(arrays) if started else None
+    found = ARRAY.finditer(second[1] if second else arrays)
+    return sum(int(x["bits"] or 8) * math.prod(int(n) for n in x["shape"].split(",") if n) // 8 for x in found)

@@ -91,7 +91,7 @@ def plan(
     if not brief:
         for name, made in rows:
             _print_layouts(name, made)
-            _print_sent(name, made)
+            _print_sent(name, made, execution.accumulate)
     averaged = train.ema_decay > 0
     report = tidy_table(
         f"{what}: {rows[0][1].parameters / 1e6:,.1f} M parameters, batch {train.batch}, {execution.dtype}, "
@@ -107,7 +107,7 @@ def plan(
         verdict = "" if name == "local" and limit is None else "fits"
         if made.refusal or limit is not None and made.peak > limit:
             verdict = "[red]does not fit[/]"
-        report.add_row(name, shape, *shown, f"{made.flops_per_step / 1e12:,.1f}", verdict)
+        report.add_row(name, shape, *shown, f"{made.flops_per_step / made.devices / 1e12:,.1f}", verdict)
     console.print(report)
     for name, made in rows:
         if made.refusal:
@@ -164,15 +164,22 @@ def _print_layouts(name: str, made: Plan) -> None:
     )
 
 
-def _print_sent(name: str, made: Plan) -> None:
+def _print_sent(name: str, made: Plan, accumulate: int) -> None:
     from hma_jax.runtime.audit import size_of
 
     lines = [
-        f"{sent.count:4} {c.kind:18} {size_of(sent.bytes):>10} {'each layer' if c.looped else 'once':10} "
+        f"{sent.count:4} {c.kind:18} {size_of(sent.bytes):>10} {how_often(c.loops, accumulate)}, "
         f"over {c.over or 'groups not told'}: {c.purpose}"
         for c, sent in made.collectives.items()
     ]
-    _print_lines(f"{name}: collectives, and what one device receives per step", "\n".join(lines) or "nothing")
+    title = f"{name}: collectives, and what one device receives through those of a line, each time"
+    _print_lines(title, "\n".join(lines) or "nothing")
+
+
+def how_often(loops: int, accumulate: int) -> str:
+    """How often what is in so many loops of a step with so many micro-batches occurs. Loops in a layer are not told."""
+    inner = ["each layer", *["each micro-batch"] * (accumulate > 1)]
+    return " of ".join(inner[-loops:]) if loops else "once"
 
 
 def _print_lines(title: str, lines: str) -> None:

@@ -16,7 +16,7 @@ from experiments.bench.models import MODELS
 from experiments.bench.plan import Plan, abstract_inputs, chips_of, find_devices, make_plan
 from experiments.cli.bench.arguments import Model
 from experiments.cli.main import main
-from experiments.cli.plan import read_memory
+from experiments.cli.plan import how_often, read_memory
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.mesh import make_mesh
@@ -78,16 +78,47 @@ def test_collectives_are_counted_once_with_what_is_sent_over_which_axes():
         "all-to-all": 3,
         "collective-permute": 1,
     }
-    assert found[Collective("all-to-all", "fsdp", False, "robots' parameters, to their examples")] == Sent(
-        1, 8 * 4096 * 4
-    )
-    shared_out = Collective("all-to-all", "tensor", False, "Muon's matrices, to one device each and back")
-    assert found[shared_out] == Sent(2, 2 * 4 * 4)
-    gathered = Collective("all-gather", "fsdp+tensor", True, "parameters, from storage to compute")
-    assert found[gathered] == Sent(1, 2 * 128)
+    to_examples = Collective("all-to-all", "fsdp", 0, "robots' parameters, to their examples")
+    assert found[to_examples] == Sent(1, 8 * 4096 * 4 // 2)
+    shared_out = Collective("all-to-all", "tensor", 0, "Muon's matrices, to one device each and back")
+    assert found[shared_out] == Sent(2, 2 * 4 * 4 // 2)
+    gathered = Collective("all-gather", "fsdp+tensor", 1, "parameters, from storage to compute")
+    assert found[gathered] == Sent(1, 2 * 128 * 3 // 4)
     by_axes = {c.kind: c.over for c in found}
     assert by_axes["all-reduce"] == "data" and by_axes["collective-permute"] == "fsdp"
     assert by_axes["reduce-scatter"] == "data+fsdp"
+
+
+@pytest.mark.parametrize(
+    ("instruction", "received"),
+    [
+        ("f32[32,8]{1,0} all-gather(%x)", 32 * 8 * 4 * 7 // 8),
+        ("f32[32,8]{1,0} all-reduce(%x)", 2 * 32 * 8 * 4 * 7 // 8),
+        ("f32[4,8]{1,0} reduce-scatter(%x)", 7 * 4 * 8 * 4),
+        ("f32[32,8]{1,0} all-to-all(%x)", 32 * 8 * 4 * 7 // 8),
+        ("f32[32,8]{1,0} all-reduce-start(%x)", 2 * 32 * 8 * 4 * 7 // 8),
+        # Several at once, as XLA combines them.
+        ("((f32[4,8]{1,0}, f32[8,8]{1,0}), (f32[32,8]{1,0}, f32[64,8]{1,0})) all-gather-start(%x, %y)", 96 * 8 * 4 * 7 // 8),
+        ("((f32[32,8]{1,0:T(8,128)}), f32[4,8]{1,0:T(8,128)}, u32[]{:S(2)}) reduce-scatter-start(%x)", 7 * 4 * 8 * 4),
+    ],
+)  # fmt: skip
+def test_a_device_receives_the_parts_of_the_others(instruction, received):
+    """Not its own; of sums every part once for each that is added."""
+    (sent,) = find_collectives(
+        f"  %a = {instruction}, replica_groups={{}}", {"data": 1, "fsdp": 8, "tensor": 1}
+    ).values()
+    assert sent == Sent(1, received)
+
+
+@pytest.mark.parametrize(
+    ("loops", "accumulate", "words"),
+    [
+        (0, 4, "once"), (1, 1, "each layer"), (2, 1, "each layer"), (1, 4, "each micro-batch"),
+        (2, 4, "each layer of each micro-batch"), (3, 4, "each layer of each micro-batch"),
+    ],
+)  # fmt: skip
+def test_what_is_sent_in_loops_says_how_often(loops, accumulate, words):
+    assert how_often(loops, accumulate) == words
 
 
 @pytest.fixture
@@ -179,7 +210,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, capsys):
 
     def make(*asked):
         calls.append(asked)
-        return Plan((), 1, {"data": 1, "fsdp": 1, "tensor": 1}, 0.0, 1e12, temporary=3 * 2**30, peak=4 * 2**30)
+        return Plan((), 8, {"data": 8, "fsdp": 1, "tensor": 1}, 0.0, 8e12, temporary=3 * 2**30, peak=4 * 2**30)
 
     monkeypatch.setattr(planning, "make_plan", make)
 
