@@ -114,6 +114,14 @@ class Replacing(pytest.MonkeyPatch):
 
 
 @pytest.fixture
+def hangup_heard():
+    """SIGHUP as it is by default, which it is not where the tests themselves run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.fixture
 def monkeypatch():
     with Replacing.context() as patch:
         yield patch

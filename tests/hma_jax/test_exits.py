@@ -27,6 +27,7 @@ def test_every_code_is_documented():
     assert len(set(Exit)) == len(Exit)
 
 
+@pytest.mark.usefixtures("hangup_heard")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_sigterm_and_sighup_end_a_block_as_ctrl_c_does_with_a_code_of_their_own(number):
     before = signal.getsignal(number)
@@ -38,6 +39,7 @@ def test_sigterm_and_sighup_end_a_block_as_ctrl_c_does_with_a_code_of_their_own(
     assert signal.getsignal(number) is before
 
 
+@pytest.mark.usefixtures("hangup_heard")
 def test_what_is_printed_on_a_closed_terminal_does_not_keep_a_program_from_saving(tmp_path: Path):
     program = (
         "import fcntl, sys, termios, time; from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt\n"
@@ -61,6 +63,7 @@ def test_what_is_printed_on_a_closed_terminal_does_not_keep_a_program_from_savin
     assert process.wait(30) == Exit.STOPPED
 
 
+@pytest.mark.usefixtures("hangup_heard")
 def test_a_second_sighup_does_not_interrupt_what_the_first_began():
     """A shell whose terminal is closed sends it to its jobs, and the system does once more when the shell ends."""
     saved = []

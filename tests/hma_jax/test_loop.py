@@ -284,6 +284,7 @@ def test_a_request_that_was_lost_before_training_stops_it_after_a_step(tmp_path:
     assert stopped.value.exit == Exit.STOPPED and list_steps(tmp_path / "checkpoints") == [1]
 
 
+@pytest.mark.usefixtures("hangup_heard")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_saves_before_it_stops_training_and_one_of_another_kind_changes_nothing(number, tmp_path: Path):
     def stop(step: int, steps: int, metrics: dict) -> None:
