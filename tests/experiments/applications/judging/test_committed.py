@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.applications.judging.agreement import pearson, rate_interval, share, spearman
+from experiments.applications.judging.agreement import LOWEST, pearson, rate_interval, share, spearman
 from experiments.applications.judging.outcomes import read_outcomes, successes
 from experiments.applications.judging.summary import COLUMNS, COMPARED, CONTROL, MODEL, REFERENCE, shown
 from experiments.applications.policies import find_task, record
@@ -66,6 +66,10 @@ def test_the_summary_is_that_of_the_table(directory):
         if agreed["pearson"]["mean"] is not None:
             assert agreed["pearson"]["mean"] == pytest.approx(pearson(true, rates), abs=1e-4)
             assert agreed["spearman"]["mean"] == pytest.approx(spearman(true, rates), abs=1e-4)
+        for measure, alone in summary["agreement"][kind]["starts"].items():
+            if alone["mean"] is not None:
+                low, high = alone["mean"] - alone["low"], alone["high"] - alone["mean"]
+                assert low == pytest.approx(high, abs=2e-4) or alone["low"] == LOWEST[measure] or alone["high"] == 1
 
 
 def test_the_page_shows_every_judgement_that_is_kept():
