@@ -31,7 +31,8 @@ class ActionRange:
         return cls(low, high, (np.array(robot.rest, np.float32) - low) / half - 1)
 
     def denormalise(self, values: np.ndarray) -> np.ndarray:
-        return (self.low + (values + 1) * (self.high - self.low) / 2).astype(np.float32)
+        raw = self.low + (values + 1) * (self.high - self.low) / 2
+        return np.clip(raw, self.low, self.high).astype(np.float32)  # rounding takes the ends beyond the range
 
 
 class Planner:

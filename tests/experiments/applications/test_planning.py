@@ -97,6 +97,15 @@ def test_units_span_the_recorded_range():
     np.testing.assert_allclose(units.denormalise(units.rest), [0.0, 0.0])
 
 
+def test_the_ends_of_the_units_are_within_the_range():
+    """high - low is rounded: added to low, it came out above high, and was reported as clipped."""
+    robot = Robot("r", 1, (-0.3, -0.4999987781047821), (0.7, 0.4999997615814209), (0.0, 0.0))
+    ends = ActionRange.of(robot).denormalise(np.array([[-1.0, -1.0], [1.0, 1.0]]))
+    for action in ends:
+        robot.clip_to_range(action[None], "refuse")
+    np.testing.assert_allclose(ends, [robot.low, robot.high], rtol=1e-6)
+
+
 def test_every_plan_of_a_planner_has_its_own_numbers_and_a_warm_start():
     plan, began = np.array([[0.1], [0.2], [0.3]]), []
 
