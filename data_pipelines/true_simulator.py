@@ -6,7 +6,7 @@ Owns what all true simulators share; each subclass says which robots it has and 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Generic, Protocol, TypeVar, get_args
 
 import numpy as np
@@ -111,7 +111,7 @@ class TrueSimulator(ABC, Generic[W]):
             for action in start.actions:
                 world.step(action)
             self._worlds[b], self._before[b] = (world, self.robots[start.robot]), []
-            self._draw(b, world)
+        self._draw(which)
         return self.images
 
     def step(self, actions: Actions) -> np.ndarray:
@@ -130,7 +130,7 @@ class TrueSimulator(ABC, Generic[W]):
             del self._before[b][:-HISTORY]  # as many as a learned simulator keeps
             for action in chunk:
                 world.step(action)
-            self._draw(b, world)
+        self._draw(asked)
         return self.images
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
@@ -147,7 +147,7 @@ class TrueSimulator(ABC, Generic[W]):
             if frames:
                 world.set_state(before[-frames])
                 del before[-frames:]
-            self._draw(b, world)
+        self._draw(worlds)
         return self.images
 
     def max_rewind(self, b: int) -> int:
@@ -171,9 +171,10 @@ class TrueSimulator(ABC, Generic[W]):
         require(world is not None, f"episode {b} has not begun; reset it first")
         return world
 
-    def _draw(self, b: int, world: W) -> None:
+    def _draw(self, which: Iterable[int]) -> None:
         images = self._images.copy()  # callers keep the frames they were given
-        images[b] = fit_image(world.render(), self.image_size)
+        for b in which:
+            images[b] = fit_image(self._begun(b)[0].render(), self.image_size)
         self._images = images
 
 
