@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.applications.detector import Detector
+from data_pipelines.sources.rlds.images import fit_images
+from experiments.applications.detector import Detector, enlarged
 from experiments.applications.endurance.drives import Drive
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
@@ -62,7 +63,8 @@ def make_films(
     first_frame, parts = _resume(simulator, drives, unfinished) if unfinished.exists() else (0, [[] for _ in drives])
     images, longest = [simulator.images.copy()], max(map(len, drives))
     points = [drive.points() for drive in drives]
-    start_frames = [drive.frames(0, 1)[0] for drive in drives]
+    size = simulator.tokenizer.image_size
+    start_frames = [fit_images(drive.frames(0, 1), size)[0] for drive in drives]
     for start in range(first_frame, longest, BLOCK):
         stop = min(start + BLOCK, longest)
         for t in range(start, stop):
@@ -72,7 +74,7 @@ def make_films(
         for i, drive in enumerate(drives):
             end = min(stop, len(drive))
             if end > start:
-                film, true = block[: end - start + 1, i], drive.frames(start, end + 1)
+                film, true = block[: end - start + 1, i], fit_images(drive.frames(start, end + 1), size)
                 parts[i].append(_measure_block(detector, drive, points[i], start, film, true, start_frames[i]))
         images = images[-1:]
         _save_progress(simulator, parts, stop, unfinished)
@@ -110,7 +112,7 @@ def _measure_block(
     """The measures of frames start + 1 .. start + n; `film` and `true` have the frame before them, too."""
     name, n = drive.robot.name, len(film) - 1
     now, film, true = slice(start + 1, start + n + 1), film[1:], true[1:]
-    detected, detected_true = detector.detect(name, film), detector.detect(name, true)
+    detected, detected_true = (detector.detect(name, enlarged(images)) for images in (film, true))
     grey, true_grey = film.astype(np.float64), true.astype(np.float64)
     kept = [t - start - 1 for t in SHOWN if start < t <= start + n]
     return {

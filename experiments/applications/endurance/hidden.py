@@ -20,12 +20,13 @@ from typing import Literal
 
 import numpy as np
 
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
-from experiments.applications.detector import CLOSE_PX, COMMITTED, MIN_CONFIDENCE, WEIGHTS, Detector
+from experiments.applications.detector import CLOSE_PX, COMMITTED, MIN_CONFIDENCE, WEIGHTS, Detector, enlarged
 from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row
@@ -116,6 +117,7 @@ def judge(
         goals = rollout.goals[e.episode : e.episode + 1]
         images = render_frames(spec, draw_appearance(spec, seeds), goals, q, objects, np.zeros(len(q), int))
         recorded = rollout.actions[e.episode]
+        images = fit_images(images, simulator.tokenizer.image_size)
         starts.append(Start(spec.name, images[: e.start + 1], recorded[: e.start], int(seeds[0])))
         actions.append(np.clip(recorded[e.start : e.start + last], np.float32(robot.low), np.float32(robot.high)))
         true.append((images[-1], points_of(spec, np.repeat(seeds, len(q)), q, objects)))
@@ -126,7 +128,7 @@ def judge(
     for b, (e, (image, points)) in enumerate(zip(events, true, strict=True)):
         row: Row = {"robot": spec.name, "kind": e.kind, "gone": e.gone, "lag": e.lag}
         for name, seen in (("", film[e.lag, b]), ("true_", image)):
-            found = detector.detect(spec.name, seen[None])
+            found = detector.detect(spec.name, enlarged(seen[None]))
             off = float(np.linalg.norm(found.position[0, e.point] - points.position[-1, e.point]))
             confidence = float(found.confidence[0, e.point])
             row |= {

@@ -8,9 +8,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from data_pipelines.sources.rlds.images import fit_images
+from data_pipelines.suite.rollout import episode_seeds, simulate
+from experiments.applications.detector_network import Detections
 from experiments.applications.endurance import films
+from experiments.applications.endurance.drives import make_drive
 from experiments.applications.endurance.films import Film, make_films
+from experiments.applications.endurance.hidden import Event, judge
+from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, actions, simulator, start
 
 
@@ -67,3 +75,22 @@ def test_films_that_a_kill_cut_short_go_on_and_come_out_the_same(slide, tmp_path
 
 def _kill() -> None:
     raise InterruptedError
+
+
+@pytest.mark.slow
+def test_frames_smaller_than_a_detector_s_are_enlarged_for_it(tmp_path):
+    """A run that has fewer pixels than the suite's frames: refused after a block had been simulated."""
+    table = EmbodimentTable((Embodiment("pusher_sand", 2, 1, (0.0, 0.0), (2.0, 2.0)),))
+    simulator, seen = load_simulator(make_run(tmp_path, table=table)), []
+
+    def see(robot: str, frames: np.ndarray) -> Detections:
+        seen.append(frames)
+        return Detections(np.zeros((len(frames), 4, 2)), np.ones((len(frames), 4)))
+
+    detector, robot, size = SimpleNamespace(detect=see), simulator.robots["pusher_sand"], simulator.tokenizer.image_size
+    drive = make_drive(robot, simulator.starts[0], 2, "behaviour", seed=0)
+    film = make_films(simulator, detector, [drive], tmp_path / "a.npz.unfinished")["pusher_sand"]
+    np.testing.assert_array_equal(film.shown[0, 0], fit_images(drive.frames(1, 2), size)[0])
+    rollout = simulate(drive.spec, episode_seeds(drive.spec, 1, 0, "val"))
+    [row] = judge(simulator, detector, drive.spec, rollout, [Event("hidden", 0, 2, 0, 1, 2)])
+    assert row["robot"] == "pusher_sand" and {frames.shape[1:] for frames in seen} == {(64, 64, 3)} and len(seen) == 4
