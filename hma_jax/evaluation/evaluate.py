@@ -146,7 +146,7 @@ def make_evaluator(
         others = (batch["other_images"], batch["other_seen"]) if "other_images" in batch else None
         recorded = batch["images"], batch.get("real"), others
         compared = _on_each_device(compare, mesh)(metric_params, predicted, recorded)
-        return metrics | compared, predicted
+        return metrics | compared | {"finite": metrics["finite"] & compared["finite"]}, predicted
 
     def evaluate_batch(params: Params, metric_params: MetricParams, batch: dict[str, jax.Array]):
         groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, devices_per_batch(mesh))

@@ -117,8 +117,10 @@ def make_predictor(
     execution: ExecutionConfig = ExecutionConfig(),
 ) -> Callable[[Params, Batch], tuple[dict[str, jax.Array], Predicted | None]]:
     """f(params, batch) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. Where the model was
-    trained for actions alone, no Predicted, and among the metrics whether these are `finite`, as `image_metrics` says
-    of frames.
+    trained for actions alone, no Predicted.
+
+    `finite`, bool [B], says whether likelihoods and, where there are actions to predict, their error are numbers: ids
+    are whole numbers even where they were chosen by logits that are none.
 
     Raises ConfigError for a prompt that fills the window.
     """
@@ -142,17 +144,13 @@ def make_predictor(
         def keys(purpose: Purpose) -> jax.Array:
             return window_keys(config.seed, purpose, table, window[2], batch["episode"], batch["start"])
 
-        metrics, predicted = {}, None
+        metrics, predicted = {"finite": jnp.ones(len(window[0]), bool)}, None
         if predicts_frames(setting):
             metrics, predicted = _frame_metrics(hma, window, batch, table, config, setting, keys("likelihood"))
         if predicts_actions(model, setting):
             causally, statistics = setting != "inverse", action_statistics(batch, table)
-            metrics |= _policy_errors(hma, *window, keys("policy"), config, causally, statistics, seen)
-            if predicted is None:
-                judged = (statistics[1] > 0).any(-1)
-                if seen is not None:
-                    judged &= seen[:, config.prompt_frames - 1 :].any(1)
-                metrics["finite"] = jnp.isfinite(metrics["action_error"]) | ~judged
+            errors = _policy_errors(hma, *window, keys("policy"), config, causally, statistics, seen)
+            metrics |= errors | {"finite": metrics["finite"] & errors["finite"]}
         return metrics, predicted
 
     return predict
@@ -201,8 +199,10 @@ def _frame_metrics(
         predicted = Predicted(made[:, 0], last, random[:, 0], made[:, -1] if counterfactual else None)
     if "other_actions" in batch:
         found = for_each_sequence(likelihood_under, window[1], batch["other_actions"][:, :, : model.frames])
-        loss = found["diffusion_loss" if model.diffusion else "cross_entropy"]
-        return {name: x[0] for name, x in found.items()} | action_metrics(loss, batch["other_valid"]), predicted
+        loss, finite = found["diffusion_loss" if model.diffusion else "cross_entropy"], found["finite"]
+        metrics = {name: x[0] for name, x in found.items()} | action_metrics(loss, batch["other_valid"])
+        metrics["finite"] &= (finite[1:] | ~batch["other_valid"].T).all(0)
+        return metrics, predicted
     return likelihood_under(window[1]) if config.context == "generated" else likelihood(out), predicted
 
 
@@ -246,16 +246,16 @@ def _after_recorded(
 def _likelihood(
     model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array, real_BT: jax.Array | None
 ) -> dict[str, jax.Array]:
-    """Per window [B]: how well the predictions `out` fit the true tokens. DIFFERS: accuracy is that of the likeliest
-    ids of the wholly masked frame; the release's is that of the ids after all unmasking steps (reference section
-    6.3)."""
+    """Per window [B]: how well the predictions `out` fit the true tokens, and whether the loss is `finite`. DIFFERS:
+    accuracy is that of the likeliest ids of the wholly masked frame; the release's is that of the ids after all
+    unmasking steps (reference section 6.3)."""
     if model.config.diffusion:
-        return {"diffusion_loss": mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)}
+        loss = mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)
+        return {"diffusion_loss": loss, "finite": jnp.isfinite(loss)}
     guess = compose(model.frame_head.decode_factors(out, choose_likeliest)[0], model.config.factor_vocab)
-    return {
-        "cross_entropy": mean_over_frames(factored_cross_entropy(model.logits(out, truth), truth), real_BT),
-        "accuracy": mean_over_frames((guess == truth).astype(jnp.float32), real_BT),
-    }
+    loss = mean_over_frames(factored_cross_entropy(model.logits(out, truth), truth), real_BT)
+    accuracy = mean_over_frames((guess == truth).astype(jnp.float32), real_BT)
+    return {"cross_entropy": loss, "accuracy": accuracy, "finite": jnp.isfinite(loss)}
 
 
 def _policy_errors(
@@ -271,7 +271,7 @@ def _policy_errors(
 ) -> dict[str, jax.Array]:
     """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live action value, of the
     model and of always giving the mean; nan where no value is live, as of a robot without actions, and where the window
-    ends before the prompt does."""
+    ends before the prompt does. `finite` says whether the error is a number wherever there is one."""
     decode, first = config.decode, config.prompt_frames - 1
     if causally:
         predicted = predict_next_actions(model, tokens, actions_BTU, embodiment_B, key_B, decode)
@@ -292,4 +292,6 @@ def _policy_errors(
         return jnp.sum(of_window * alive_BU, -1) / alive_BU.sum(-1)
 
     error, of_mean = mean((guess - truth) ** 2), mean(truth**2)
-    return {"action_error": error, "action_error_of_mean": of_mean, "action_gain": of_mean - error}
+    some = alive_BU.any(-1) if real_BT is None else alive_BU.any(-1) & real_BT[:, first:].any(1)
+    metrics = {"action_error": error, "action_error_of_mean": of_mean, "action_gain": of_mean - error}
+    return metrics | {"finite": jnp.isfinite(error) | ~some}

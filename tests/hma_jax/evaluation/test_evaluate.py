@@ -218,6 +218,33 @@ def test_what_was_trained_for_actions_alone_is_judged_by_them_alone(params, sett
         evaluate(broken, CONFIG, TABLE, TOKENIZER, batches, EVAL, setting=setting)
 
 
+def test_ids_chosen_by_logits_that_are_no_numbers_are_not_judged(params):
+    """Ids are whole numbers whatever chose them, and among losses that are no numbers the true actions were found."""
+    broken = jax.tree.map(lambda x: x * jnp.nan, params)
+    with pytest.raises(ConfigError, match=r"predictions are not finite \(pusher\); did the model diverge"):
+        run(broken)
+
+
+@pytest.mark.parametrize("wrong", ["actions", "the loss under another episode's actions"])
+def test_no_part_of_what_is_predicted_may_be_no_number(wrong, params, monkeypatch):
+    """Both metrics are NaN where a window has nothing to judge, and were so left out of means."""
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    inputs = {k: batch[k] for k in ("tokens", "actions", "embodiment", "episode", "start")}
+    losses = np.zeros((3, 4), np.float32)
+    if wrong == "actions":
+        inputs["actions"] = inputs["actions"] + np.nan
+    else:
+        losses[1:, 2:] = np.nan
+    found = {"cross_entropy": jnp.asarray(losses), "finite": jnp.isfinite(losses)}
+    inputs |= {"other_actions": np.zeros((4, 2, 6, 1)), "other_valid": np.array([[True] * 2] * 3 + [[False] * 2])}
+    monkeypatch.setattr(protocol, "rollout", lambda _, prompt, sequences, *__, **___: jnp.zeros((4, 4, 4, 9)))
+    monkeypatch.setattr(protocol, "for_each_sequence", lambda *_: found)
+    monkeypatch.setattr(protocol, "predict_next_actions", lambda model, tokens, actions, *_: actions)
+    metrics, _ = protocol.make_predictor(CONFIG, TABLE, EVAL, "full")(params, inputs)
+    finite = [False] * 4 if wrong == "actions" else [True, True, False, True]
+    np.testing.assert_array_equal(metrics["finite"], finite)
+
+
 @pytest.mark.slow
 def test_latents_that_are_no_numbers_are_not_decoded_into_images():
     config = shallow_config(diffusion=DIFFUSION)
