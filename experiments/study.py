@@ -209,8 +209,8 @@ class Study:
             f"rate, in frames per second, must be positive, or null for the native rate, got {self.rate}",
         )
         require(
-            self.eval.prompt_frames < self.model.frames,
-            f"eval.prompt_frames {self.eval.prompt_frames} leaves no frame to predict in a window of model.frames "
+            self.eval.prompt_frames < self.model.frames + (not self.train.masking.predicts_frames),
+            f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of model.frames "
             f"{self.model.frames}; use fewer",
         )
         require(len(set(self.datasets)) == len(self.datasets), f"datasets repeat: {self.datasets}")

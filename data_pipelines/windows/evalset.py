@@ -126,7 +126,8 @@ def freeze_manifest(
 ) -> EvalManifest:
     """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.
 
-    Windows of short episodes have at least the `prompt` frames and one more; without a prompt all are whole.
+    Windows of short episodes have at least the `prompt` frames and one more; all are whole without a prompt, or where
+    it fills the window, as that of a policy may.
     Starts within an episode lie `spacing` model frames apart; the default, `frames`, makes
     windows disjoint, so that standard errors do not count the same pixels twice.
     DIFFERS: the release evaluates the first windows of each dataset (reference section 6.1).
@@ -137,7 +138,7 @@ def freeze_manifest(
     require(windows_per_dataset >= 1, f"windows_per_dataset must be at least 1, got {windows_per_dataset}")
     require(spacing >= 1, f"spacing must be at least 1, got {spacing}")
     require(len(datasets) >= 1, "no dataset was given to evaluate on")
-    least = frames if prompt is None else prompt + 1
+    least = frames if prompt is None else min(prompt + 1, frames)
     sets = {name: val_windows(store, name, frames, least, rate=rate) for name in sorted(set(datasets))}
     require_windows(sets)
     chosen, shortest = [], frames

@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.images import Decode, Decoder, Sample, image_metrics, make_clips
 from hma_jax.evaluation.lpips import load_lpips
-from hma_jax.evaluation.protocol import Predicted, make_predictor
+from hma_jax.evaluation.protocol import Predicted, make_predictor, predicts_frames
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable, join
 from hma_jax.model.embodiments import EmbodimentTable
@@ -92,7 +92,7 @@ def evaluate(
             require(not missing, f"a batch to evaluate lacks {', '.join(missing)}")
             require_known(model, table, *(np.asarray(batch[name]) for name in ("tokens", "actions", "embodiment")))
             groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, devices_per_batch(mesh))
-            _check_lengths(batch, config)
+            _check_lengths(batch, config, setting)
             arrays = (*REQUIRED_ARRAYS, *(name for name in OPTIONAL_ARRAYS if name in batch))
             on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
             with jax.set_mesh(mesh):
@@ -155,11 +155,12 @@ def make_evaluator(
     return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
-def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
-    """Raises ConfigError for a window without a frame to compare."""
+def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: Setting) -> None:
+    """Raises ConfigError for a window without a frame to compare, or, of what predicts none, without an action."""
     if "real" not in batch:
         return
-    real = np.where(batch["valid"], np.sum(batch["real"], axis=1), config.first_predicted + 1)
+    least = config.first_predicted + predicts_frames(setting)
+    real = np.where(batch["valid"], np.sum(batch["real"], axis=1), least)
     row = int(np.argmin(real))
     if config.context == "generated":
         what = f"eval.prompt_frames {config.prompt_frames}"
@@ -167,8 +168,9 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
     else:
         what, advice = "eval.context recorded", "freeze windows of at least 2 frames"
     require(
-        real[row] > config.first_predicted,
-        f"a window of {batch['dataset'][row]} has {real[row]} frames, so with {what} there is none to predict; {advice}",
+        real[row] >= least,
+        f"a window of {batch['dataset'][row]} has {real[row]} frames, so with {what} there is nothing to predict; "
+        f"{advice}",
     )
 
 

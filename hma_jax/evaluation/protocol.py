@@ -122,10 +122,10 @@ def make_predictor(
     `finite`, bool [B], says whether likelihoods and, where there are actions to predict, their error are numbers: ids
     are whole numbers even where they were chosen by logits that are none.
 
-    Raises ConfigError for a prompt that fills the window.
+    Raises ConfigError for a prompt that leaves nothing to judge.
     """
     require(
-        config.first_predicted < model.frames,
+        config.first_predicted < model.frames or not predicts_frames(setting),
         f"eval.prompt_frames {config.prompt_frames} leaves no frame to predict in a window of {model.frames} frames; "
         "use fewer",
     )

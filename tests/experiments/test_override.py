@@ -44,7 +44,7 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("model.frames=2.5", "expected a value like"),
         ("train.steps=1e4", "expected a whole number, written 10000"),
         ("model.mup.enabled=3", "expected a value like"),
-        ("eval.prompt_frames=4", "leaves no frame to predict"),
+        ("eval.prompt_frames=4", "leaves nothing to predict"),
         ("model.tokens=9", "the tokenizer makes 16"),
         ("model=4", "this is a group of settings"),
         ("tau.x=4", "tau is a value, 3.0"),
@@ -77,6 +77,13 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
 def test_wrong_override_names_the_field(setting, message):
     with pytest.raises(ConfigError, match=message):
         override(SMOKE, [setting])
+
+
+def test_a_prompt_may_fill_the_window_of_a_policy():
+    policy = ["model.action_heads=true", "train.masking.setting=policy"]
+    assert override(SMOKE, [*policy, "eval.prompt_frames=4"]).eval.prompt_frames == SMOKE.model.frames
+    with pytest.raises(ConfigError, match="eval.prompt_frames 5 leaves nothing to predict"):
+        override(SMOKE, [*policy, "eval.prompt_frames=5"])
 
 
 @pytest.mark.parametrize(

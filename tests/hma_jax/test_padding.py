@@ -190,10 +190,12 @@ def test_a_window_without_a_frame_to_predict_is_refused():
     (batch,) = make_batches(MODEL, names=("arm",), each=4)
     batch["real"] = np.arange(FRAMES) < np.array([5, 2, 5, 5])[:, None]
     params = lively_params(MODEL)[1]
-    with pytest.raises(ConfigError, match="a window of arm has 2 frames, so with eval.prompt_frames 2 there is none"):
+    with pytest.raises(
+        ConfigError, match="a window of arm has 2 frames, so with eval.prompt_frames 2 there is nothing"
+    ):
         evaluate(params, MODEL, TABLE, TOKENIZER, [batch], EVAL)
     batch["real"] = np.arange(FRAMES) < np.array([5, 1, 5, 5])[:, None]
-    with pytest.raises(ConfigError, match="has 1 frames, so with eval.context recorded there is none .*at least 2"):
+    with pytest.raises(ConfigError, match="has 1 frames, so with eval.context recorded there is nothing .*at least 2"):
         evaluate(params, MODEL, TABLE, TOKENIZER, [batch], replace(EVAL, context="recorded"))
 
 

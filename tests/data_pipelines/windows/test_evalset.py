@@ -34,6 +34,10 @@ def test_spacing_allows_overlap_when_asked(store):
     assert counts == [6, 12, 24]  # two episodes of 15 model frames
 
 
+def test_windows_are_whole_where_the_prompt_fills_them(store, manifest):
+    assert freeze_manifest(store, store.names, 4, 5, 0, prompt=4) == manifest
+
+
 def test_fewer_windows_are_a_subset_of_more(store):
     few, more = (freeze_manifest(store, store.names, 4, n, seed=0) for n in (2, 4))
     for a, b in zip(few.datasets, more.datasets, strict=True):

@@ -206,6 +206,22 @@ def test_a_window_that_ends_before_the_prompt_has_no_error_of_predicted_actions(
         protocol.make_predictor(CONFIG, TABLE, replace(config, prompt_frames=9), "policy")
 
 
+@pytest.mark.parametrize("frames", [1, 3])
+def test_a_policy_is_judged_after_a_prompt_that_fills_the_window(frames, monkeypatch):
+    """The last chunk follows the last frame, so there is one to judge."""
+    config = shallow_config(frames=frames)
+    (batch,) = make_batches(config, names=("arm",), each=4)
+    batch["real"] = np.ones((4, frames), bool)
+    monkeypatch.setattr(protocol, "predict_next_actions", lambda model, tokens, actions, *_: actions)
+    settings = replace(EVAL, prompt_frames=frames)
+    found = evaluate(
+        declare_model(config, TABLE).init(0), config, TABLE, TOKENIZER, [batch], settings, setting="policy"
+    )
+    np.testing.assert_array_equal(found.windows.metrics["action_error"], 0)
+    with pytest.raises(ConfigError, match="a window of arm has .* there is nothing to predict"):
+        module._check_lengths(batch | {"real": np.arange(frames) < np.array([[frames - 1]] * 4)}, settings, "policy")
+
+
 @pytest.mark.parametrize("setting", ["policy", "inverse"])
 def test_what_was_trained_for_actions_alone_is_judged_by_them_alone(params, setting):
     """Its frames were said to have a perplexity and a PSNR, of a head that nothing had trained."""
