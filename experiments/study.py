@@ -209,7 +209,7 @@ class Study:
             f"rate, in frames per second, must be positive, or null for the native rate, got {self.rate}",
         )
         require(
-            self.eval.prompt_frames < self.model.frames + (not self.train.masking.predicts_frames),
+            self.eval.prompt_frames < self.model.frames + (self.train.masking.setting == "policy"),
             f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of model.frames "
             f"{self.model.frames}; use fewer",
         )

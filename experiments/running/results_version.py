@@ -35,6 +35,7 @@ OF_SOME = {
     "what rounding leaves is no scale of actions": {"train.action_scale": "quantiles"},
     "frames of what predicts none are not judged: a policy": {"train.masking.setting": "policy"},
     "frames of what predicts none are not judged: inverse dynamics": {"train.masking.setting": "inverse"},
+    "inverse dynamics is not asked for what follows the last frame": {"train.masking.setting": "inverse"},
     "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
     "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
     "the average of a robot's weights goes on in steps without it": {"train.ema_decay": lambda decay: decay > 0},

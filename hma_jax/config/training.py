@@ -212,9 +212,9 @@ def check_objective(model: ModelConfig, masking: MaskingConfig) -> None:
         f"{model.conditioning!r} has none; choose one with concat",
     )
     require(
-        model.frames > 1 or not masking.predicts_frames,
-        f"train.masking.setting {setting!r} predicts frames from earlier ones, so with model.frames 1 there is none "
-        "to predict; set model.frames to at least 2",
+        model.frames > 1 or setting == "policy",
+        f"with model.frames 1 no frame follows another, so train.masking.setting {setting!r} has nothing to predict; "
+        "set model.frames to at least 2",
     )
     require(
         model.diffusion is None or not masking.own_past,

@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.images import Decode, Decoder, Sample, image_metrics, make_clips
 from hma_jax.evaluation.lpips import load_lpips
-from hma_jax.evaluation.protocol import Predicted, make_predictor, predicts_frames
+from hma_jax.evaluation.protocol import Predicted, make_predictor
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable, join
 from hma_jax.model.embodiments import EmbodimentTable
@@ -159,7 +159,7 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: Setting) 
     """Raises ConfigError for a window without a frame to compare, or, of what predicts none, without an action."""
     if "real" not in batch:
         return
-    least = config.first_predicted + predicts_frames(setting)
+    least = config.first_predicted + (setting != "policy")  # whose last chunk follows the last frame
     real = np.where(batch["valid"], np.sum(batch["real"], axis=1), least)
     row = int(np.argmin(real))
     if config.context == "generated":

@@ -12,8 +12,8 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
 * controllability again, where a batch has other episodes' actions: action-nats, retrieval and counterfactual PSNR
   (`controllability`);
 * policy, where the model was trained to predict actions: squared error of every chunk after the
-  prompt, given the true frames and actions before it (inverse dynamics: all frames and no
-  action), against that of the mean action.
+  prompt, given the true frames and actions before it (inverse dynamics: of every chunk that leads to
+  a frame of the window, given all frames and no action), against that of the mean action.
 
 A model trained on passive video is shown no action anywhere. One that was trained for actions alone is not asked for
 frames.
@@ -47,7 +47,7 @@ from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
 from hma_jax.model.readout import choose_likeliest
 from hma_jax.objective.losses import frame_diffusion_loss
-from hma_jax.objective.masking import hidden_at_inference
+from hma_jax.objective.masking import followed, hidden_at_inference
 
 Batch = dict[str, jax.Array]
 """Arrays by name:
@@ -130,7 +130,7 @@ def make_predictor(
         "use fewer",
     )
     require(
-        config.prompt_frames <= model.frames or not predicts_actions(model, setting),
+        config.prompt_frames <= model.frames - (setting == "inverse") or not predicts_actions(model, setting),
         f"eval.prompt_frames {config.prompt_frames} leaves no action to evaluate in a window of {model.frames} "
         "frames; use fewer",
     )
@@ -272,26 +272,27 @@ def _policy_errors(
     """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live action value, of the
     model and of always giving the mean; nan where no value is live, as of a robot without actions, and where the window
     ends before the prompt does. `finite` says whether the error is a number wherever there is one."""
-    decode, first = config.decode, config.prompt_frames - 1
+    decode, first, judged_BT = config.decode, config.prompt_frames - 1, real_BT
     if causally:
         predicted = predict_next_actions(model, tokens, actions_BTU, embodiment_B, key_B, decode)
     else:
-        hidden = jnp.ones(tokens.shape[:2], bool)
+        everything = jnp.ones(tokens.shape[:2], bool)
         predicted = predict_actions(
-            model, tokens, actions_BTU, embodiment_B, hidden, key_B, decode, causally=False, real_BT=real_BT
+            model, tokens, actions_BTU, embodiment_B, everything, key_B, decode, causally=False, real_BT=real_BT
         )
+        judged_BT = followed(everything if real_BT is None else real_BT)
     mean_BU, std_BU = statistics
     alive_BU = std_BU > 0
     truth, guess = (normalise(x, mean_BU[:, None], std_BU[:, None])[:, first:] for x in (actions_BTU, predicted))
 
     def mean(error_BTU: jax.Array) -> jax.Array:
         of_window = error_BTU.mean(1)
-        if real_BT is not None:
-            real = real_BT[:, first:, None]
-            of_window = jnp.sum(error_BTU * real, 1) / jnp.sum(real, 1)
+        if judged_BT is not None:
+            judged = judged_BT[:, first:, None]
+            of_window = jnp.sum(error_BTU * judged, 1) / jnp.sum(judged, 1)
         return jnp.sum(of_window * alive_BU, -1) / alive_BU.sum(-1)
 
     error, of_mean = mean((guess - truth) ** 2), mean(truth**2)
-    some = alive_BU.any(-1) if real_BT is None else alive_BU.any(-1) & real_BT[:, first:].any(1)
+    some = alive_BU.any(-1) if judged_BT is None else alive_BU.any(-1) & judged_BT[:, first:].any(1)
     metrics = {"action_error": error, "action_error_of_mean": of_mean, "action_gain": of_mean - error}
     return metrics | {"finite": jnp.isfinite(error) | ~some}

@@ -8,10 +8,11 @@ settings of paper section 3.1 differ only in which frames' tokens are masked and
     passive   masked          all                       tokens
     full      masked          some, by a random rate    tokens and hidden actions
     policy    none            from a random frame on    hidden actions
-    inverse   none            all                       hidden actions; attention is not causal
+    inverse   none            all                       hidden actions but the last; attention is not causal
 
 With causal alignment no frame is shown the chunk that follows it, so that all of them can be
-predicted, not only the hidden ones. A robot without recorded actions has all of them hidden and
+predicted, not only the hidden ones. For inverse dynamics the chunk of a window's last frame is no
+target: no frame shows where it led. A robot without recorded actions has all of them hidden and
 none predicted; one whose video is no target has no token masked. Each trains what it can.
 """
 
@@ -150,6 +151,11 @@ def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Arr
     return jnp.zeros(frames, bool)
 
 
+def followed(real_T: jax.Array) -> jax.Array:
+    """bool [..., T], frames that are no padding -> those of them that another one follows."""
+    return jnp.concatenate([real_T[..., 1:], jnp.zeros_like(real_T[..., :1])], axis=-1)
+
+
 def hidden_at_inference(
     table: EmbodimentTable, setting: Setting, embodiment_B: jax.Array, frames: int
 ) -> jax.Array | None:
@@ -210,4 +216,7 @@ def mask_batch(
         return mask_example(jax.random.fold_in(key, row), window, config, masking, actions, video)
 
     masked = jax.vmap(one)(jnp.arange(len(tokens)), tokens, has_actions, has_video)
+    if masking.setting == "inverse":
+        outcome_seen = followed(jnp.ones_like(masked.hidden_T) if real_BT is None else real_BT)
+        masked = masked._replace(action_targets_T=masked.action_targets_T & outcome_seen)
     return masked if real_BT is None else masked.without_padding(real_BT)

@@ -108,6 +108,8 @@ def test_targets_stand_in_real_frames_alone():
     np.testing.assert_array_equal(masked.targets_TS, everything.targets_TS & REAL[..., None])
     np.testing.assert_array_equal(masked.action_targets_T, everything.action_targets_T & REAL)
     assert masked.targets_TS.sum() < everything.targets_TS.sum()
+    arguments = (*arguments[:4], MaskingConfig(setting="inverse"), TABLE, jnp.asarray(REAL))
+    np.testing.assert_array_equal(mask(*arguments).action_targets_T.sum(1), LENGTHS - 1)
     declared, params = lively_params(MODEL)
     sums = jax.jit(make_sums(declared, TABLE, MODEL, masking))
     found = [sums(params, spoilt(batch, other) | {"valid": LENGTHS > 0}, 0) for other in (7, 8)]

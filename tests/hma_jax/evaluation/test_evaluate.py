@@ -206,6 +206,24 @@ def test_a_window_that_ends_before_the_prompt_has_no_error_of_predicted_actions(
         protocol.make_predictor(CONFIG, TABLE, replace(config, prompt_frames=9), "policy")
 
 
+@pytest.mark.parametrize("short", [False, True])
+def test_inverse_dynamics_is_not_judged_by_what_follows_the_last_frame(short, monkeypatch):
+    """No frame shows where that chunk led; its error was part of the mean."""
+    (batch,) = make_batches(CONFIG, each=2)
+    lengths = np.array([2, 3, 4, 6]) if short else np.full(4, CONFIG.frames)
+    wrong = np.arange(CONFIG.frames) >= lengths[:, None] - 1
+    monkeypatch.setattr(protocol, "predict_actions", lambda _, __, actions, *_a, **_k: actions + wrong[..., None])
+    inputs = (CONFIG, batch["tokens"], batch["actions"], batch["embodiment"], None, EVAL, False)
+    statistics = [np.asarray(x)[batch["embodiment"]] for x in TABLE.statistics()]
+    real = np.arange(CONFIG.frames) < lengths[:, None]
+    found = protocol._policy_errors(*inputs, statistics, real if short else None)
+    np.testing.assert_array_equal(found["action_error"], [np.nan if short else 0, 0, 0, 0])
+    assert found["finite"].all() and found["action_error_of_mean"][1:].all()
+    settings = replace(EVAL, prompt_frames=CONFIG.frames)
+    with pytest.raises(ConfigError, match="eval.prompt_frames 6 leaves no action to evaluate"):
+        protocol.make_predictor(CONFIG, TABLE, settings, "inverse")
+
+
 @pytest.mark.parametrize("frames", [1, 3])
 def test_a_policy_is_judged_after_a_prompt_that_fills_the_window(frames, monkeypatch):
     """The last chunk follows the last frame, so there is one to judge."""
