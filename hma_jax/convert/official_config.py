@@ -182,7 +182,8 @@ def _root(vocab: int | None, factors: int, where: str) -> int:
 
 
 def read_masking(config: Mapping[str, Any]) -> MaskingConfig:
-    """How the release would go on training. Raises ConfigError where it would train nothing."""
+    """How the release would go on training, but for the hidden actions of the continuous variant
+    (`masking.hide_actions`). Raises ConfigError where it would train nothing."""
     full = {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
     fields = {field: full[official] for official, field in MASKING_FIELDS.items()}
     states, actions = (bool(full[f"jointly_predict_{what}"]) for what in ("states", "actions"))

@@ -140,10 +140,14 @@ def mask_tokens(u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array,
 
 
 def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Array:
-    """bool [T]: the chunks of one example that are hidden from the model."""
+    """bool [T]: the chunks of one example that are hidden from the model.
+
+    DIFFERS: with `full`, every step by itself, by a rate of the example, as in the release's discrete variant; its
+    continuous one hides all chunks from a random frame on (reference section 2.4).
+    """
     if masking.setting in ("passive", "inverse"):
         return jnp.ones(frames, bool)
-    if masking.setting == "full":  # as the release: a rate per example, then every step by itself
+    if masking.setting == "full":
         u = jax.random.uniform(key, (frames + 1,), jnp.float32)
         return u[1:] < u[0]
     if masking.setting == "policy":
