@@ -187,9 +187,10 @@ def from_actions(x: jax.Array, w: jax.Array) -> jax.Array:
 
 
 def to_actions(x: jax.Array, w: jax.Array) -> jax.Array:
-    """x [..., in] times w [in, U] -> [..., U]; more columns do not change a bit of the others."""
-    columns = jnp.moveaxis(_in_chunks(w, 1), 1, 0)
-    y = jnp.moveaxis(jax.lax.map(lambda chunk: jnp.matmul(x, chunk), columns), 0, -2)
+    """x [..., in] times w [in, U] -> [..., U], in float32 at least; more columns do not change a bit of the others."""
+    columns, dtype = jnp.moveaxis(_in_chunks(w, 1), 1, 0), jnp.promote_types(x.dtype, jnp.float32)
+    y = jax.lax.map(lambda chunk: jnp.matmul(x, chunk, preferred_element_type=dtype), columns)
+    y = jnp.moveaxis(y, 0, -2)
     return y.reshape(*x.shape[:-1], -1)[..., : w.shape[1]]
 
 

@@ -100,9 +100,12 @@ class Denoiser(nnx.Module):
         return shifted(from_actions(x, self.into.kernel.astype(x.dtype)), self.into.bias.get_value())
 
     def _out(self, x: jax.Array) -> jax.Array:
-        """[..., F] -> [..., 2 C]."""
+        """[..., F] -> [..., 2 C], in float32 at least."""
         w = self.out.astype(x.dtype)
-        both = jnp.stack([to_actions(x, w[:, k]) for k in (0, 1)], -2) if self.of_actions else contract(x, w)
+        if self.of_actions:
+            both = jnp.stack([to_actions(x, w[:, k]) for k in (0, 1)], -2)
+        else:
+            both = contract(x, w, dtype=jnp.promote_types(x.dtype, jnp.float32))
         y = shifted(both, self.out_bias.get_value())
         return y.reshape(*y.shape[:-2], -1)
 

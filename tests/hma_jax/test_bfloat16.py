@@ -56,5 +56,26 @@ def test_gradients_in_bfloat16_are_those_in_float32_within_its_rounding(diffusio
     assert not off
 
 
+@pytest.mark.parametrize("diffusion", [None, LATENTS], ids=["ids", "latents"])
+def test_what_heads_predict_is_not_rounded_to_bfloat16(diffusion):
+    """A denoiser's noise is added up over the steps of a sampler, and an action goes to a robot as it is."""
+    config = model_config(diffusion=diffusion)
+    declared = declare_model(config, TABLE, ExecutionConfig("bfloat16"))
+    z, x = (np.random.default_rng(n).normal(size=(2, 3, n)).astype(np.float32) for n in (config.width, 2))
+    robots = np.arange(2)
+
+    @jax.jit
+    def predicted(params, z_BTD, x_BTC):
+        model, time = declared.merge(params), jnp.zeros((2, 3), jnp.int32)
+        if diffusion is None:
+            return [model.action_head(z_BTD.astype(jnp.bfloat16), robots)]
+        x_BTU = jnp.resize(x_BTC, (2, 3, TABLE.action_width))
+        return model.denoiser(x_BTC, time, z_BTD), model.action_head(x_BTU, time, z_BTD, robots)
+
+    for y in predicted(lively_params(config)[1], z, x):
+        live = y[y != 0]
+        assert y.dtype == np.float32 and np.mean(live == live.astype(jnp.bfloat16).astype(np.float32)) < 0.1
+
+
 def apart(g: np.ndarray, exact: np.ndarray) -> float:
     return float(np.linalg.norm(g - exact) / np.linalg.norm(exact))

@@ -90,6 +90,13 @@ def test_in_bfloat16_many_action_values_are_summed_as_in_one_product():
     assert from_actions(x, w).dtype == jnp.bfloat16 and chunked < 1.1 * whole
 
 
+def test_actions_are_not_rounded_to_the_type_of_what_predicts_them():
+    x, w = drawn(0, 4, 350, dtype="bfloat16"), drawn(1, 350, 7, dtype="bfloat16")
+    y = jax.jit(to_actions)(x, w)
+    assert y.dtype == jnp.float32
+    np.testing.assert_allclose(y, np.asarray(x, np.float64) @ np.asarray(w, np.float64), rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("entries", [5, 3000], ids=["multiplied", "scattered"])
 def test_looking_up_has_the_gradient_of_a_take(entries: int):
     ids = np.random.default_rng(0).integers(0, entries, (3, 4))
