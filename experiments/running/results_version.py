@@ -39,6 +39,7 @@ OF_SOME = {
     "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
     "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
     "the average of a robot's weights goes on in steps without it": {"train.ema_decay": lambda decay: decay > 0},
+    "the average soon forgets the initial weights": {"train.ema_decay": lambda decay: decay > 0},
 }
 """Changes that alter the numbers of a few trials only: those whose fields have such values, or values that such a
 function is true of. They are part of the names of these trials, and all others stay finished."""

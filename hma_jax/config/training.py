@@ -184,7 +184,8 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
     only: tuple[str, ...] = ()  # train only these robots' own parameters; []: train everything
-    ema_decay: float = 0.0  # decay of a moving average of the weights, which is kept too; 0: none
+    # Decay of a moving average of the weights, which is kept too; 0: none. In the first steps it decays faster.
+    ema_decay: float = 0.0
     action_scale: ActionScale = "deviation"  # how actions of new robots are normalised
 
     def __post_init__(self):

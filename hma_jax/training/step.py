@@ -120,7 +120,7 @@ def make_train_step(
         )  # fmt: skip
         params = robots.put(state.params, new, specs, active)
         opt_state = put_adam(state.opt_state, adam, specs, active)
-        ema = update_average(state.ema, params, config.ema_decay) if config.ema_decay else None
+        ema = update_average(state.ema, params, config.ema_decay, state.step) if config.ema_decay else None
         metrics = loss_metrics(total, counts, masking, discrete=not model.diffusion)
         metrics |= {"grad_norm": norm, "learning_rate": rate}
         metrics |= {FINITE + "gradient": jnp.isfinite(norm), FINITE + "update": all_finite(new)}
