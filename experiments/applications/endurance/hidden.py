@@ -6,7 +6,8 @@ Expected: within the model's window what was hidden comes back as often as what 
           it comes back less often; in small models the less the longer it was hidden (docs/endurance.md).
 
 Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
-after the start. Beside each stands a control: an object that is seen all the time, judged as long after the start.
+after the start. Beside each stands a control: an object that is seen all the time, judged as long after a start of as
+many frames.
 Writes DIR/NAME_hidden.csv, a row per event.
 """
 
@@ -80,11 +81,11 @@ def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.rand
     controls: list[Event] = []
     for event in hidden:
         for episode in rng.permutation(len(share)):
-            start, stop = START_FRAMES - 1, START_FRAMES + event.lag
+            stop = event.start + event.lag + 1
             whole = (share[episode, :stop] >= WHOLE_SHARE).all(0)
             points = [p for p in range(tools, share.shape[2]) if whole[p]]
             if points and lengths[episode] >= stop:
-                controls.append(Event("control", int(episode), start, points[0], 0, event.lag))
+                controls.append(Event("control", int(episode), event.start, points[0], 0, event.lag))
                 break
     return hidden + controls
 

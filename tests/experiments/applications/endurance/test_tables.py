@@ -132,4 +132,4 @@ def test_events_are_of_what_vanishes_and_comes_back():
     hidden = [e for e in events if e.kind == "hidden"]
     assert [(e.episode, e.start, e.gone, e.lag) for e in hidden] == [(0, 5, 5, 6)]
     (control,) = [e for e in events if e.kind == "control"]
-    assert (control.episode, control.lag) == (3, 6)
+    assert (control.episode, control.start, control.lag) == (3, 5, 6), "the model has seen as many frames of it"
