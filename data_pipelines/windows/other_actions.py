@@ -34,7 +34,7 @@ class OtherWindows:
 
     def __init__(self, store: TokenStore, slicers: dict[str, WindowSlicer], frames: int, rate: float | None, seed: int):
         self._store, self._slicers, self._frames, self._rate, self._seed = store, slicers, frames, rate, seed
-        self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray]] = {}
+        self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray, np.ndarray]] = {}
         # Copied: a view would keep the whole record, which may hold hundreds of frames.
         self._actions = lru_cache(CACHED_EPISODES)(lambda name, split, i: store.episode(name, split, i).actions.copy())
 
@@ -63,17 +63,19 @@ class OtherWindows:
 
     def _of(self, name: str, split: str, real: int, seed: int, own: int, count: int) -> list[OtherWindow]:
         """The first `count` windows of at least `real` frames that are not of episode `own`, in the order of choice."""
-        windows, of_window = self._windows(name, split)
-        at = np.flatnonzero((of_window >= real) & (windows.episode_idx != own))
-        episode, h = windows.episode_idx[at], hash64(at, stream_seed(seed, split))
-        by_episode = np.lexsort((h, episode))
-        first = np.searchsorted(episode[by_episode], episode[by_episode])  # where each one's episode begins
-        rank = np.empty(len(at), np.int64)
-        rank[by_episode] = np.arange(len(at)) - first
-        return [OtherWindow(split, *windows.locate(int(i))) for i in at[np.lexsort((h, rank))[:count]]]
+        windows, episode_idx, real_of = self._windows(name, split)
+        at = np.flatnonzero((real_of >= real) & (episode_idx != own))
+        h, found = hash64(at, stream_seed(seed, split)), np.zeros(0, np.int64)  # no two of one hash
+        while len(found) < count and len(at):
+            begins = np.flatnonzero(np.diff(episode_idx[at], prepend=-1))
+            smallest = np.minimum.reduceat(h, begins)  # of each episode that has one left; only these are sorted
+            first = h == np.repeat(smallest, np.diff(begins, append=len(at)))
+            found = np.append(found, at[first][np.argsort(smallest)])
+            at, h = at[~first], h[~first]
+        return [OtherWindow(split, *windows.locate(int(i))) for i in found[:count]]
 
-    def _windows(self, name: str, split: str) -> tuple[WindowSet, np.ndarray]:
-        """The windows of a split, and the real frames of each."""
+    def _windows(self, name: str, split: str) -> tuple[WindowSet, np.ndarray, np.ndarray]:
+        """The windows of a split, and of each its episode and its real frames."""
         if (name, split) not in self._sets:
             if split == "val":
                 found = val_windows(
@@ -81,7 +83,8 @@ class OtherWindows:
                 )
             else:
                 found = train_windows(self._store, name, self._frames, rate=self._rate)
-            steps = np.asarray(self._store.manifest(name).split(split).steps, np.int64)[found.episode_idx]
+            episode_idx = found.episode_idx
+            steps = np.asarray(self._store.manifest(name).split(split).steps, np.int64)[episode_idx]
             real = found.slicer.max_real(steps - found.start.astype(np.int64) * found.slicer.frame_step)
-            self._sets[name, split] = found, np.asarray(real)
+            self._sets[name, split] = found, episode_idx, np.asarray(real)
         return self._sets[name, split]

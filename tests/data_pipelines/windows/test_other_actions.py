@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.windows.counterfactual import CounterfactualFrames
 from data_pipelines.windows.evalset import eval_batches, freeze_manifest
-from data_pipelines.windows.other_actions import OtherWindows
+from data_pipelines.windows.other_actions import OtherWindow, OtherWindows
 from data_pipelines.windows.slicer import make_slicer
-from data_pipelines.windows.windows import WindowSet
+from data_pipelines.windows.windows import WindowSet, val_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -78,6 +81,26 @@ def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monke
     again = OtherWindows(store, {name: make_slicer(store, name, 4, 2.0)}, 4, 2.0, 1)
     orders = [(others, 0, 0), (others, 0, 4), (others, 0, 8), (again, 0, 0)]
     assert len({tuple(by.choose(name, episode, start, 5)) for by, episode, start in orders}) == 4
+
+
+def test_of_each_episode_the_smallest_hash_comes_first_and_no_others_are_sorted(tmp_path, monkeypatch):
+    """At its native rate an episode has a thousand windows, and they are chosen for every frozen window."""
+    store = small_store(tmp_path, lengths=(20, 13) * 6, min_val=6, max_val_fraction=0.5)
+    (name,) = store.names
+    windows = val_windows(store, name, 4, 2, rate=2.0)
+    seed = stream_seed(0, "other actions", name, store.manifest(name).val.episodes[2], 1)
+    order = np.argsort(hash64(np.arange(len(windows)), stream_seed(seed, "val")))
+    seen, rounds = Counter(), {}
+    for episode, start in map(windows.locate, order.tolist()):
+        rounds.setdefault(seen[episode], []).append(OtherWindow("val", episode, start))
+        seen[episode] += 1
+    sizes = []
+    for sort in ("argsort", "lexsort"):
+        real = getattr(np, sort)
+        monkeypatch.setattr(np, sort, lambda x, real=real: sizes.append(np.shape(x)[-1]) or real(x))
+    others = OtherWindows(store, {name: make_slicer(store, name, 4, 2.0)}, 4, 2.0, 0).choose(name, 2, 1, 12)
+    assert others == [w for n in sorted(rounds) for w in rounds[n] if w.episode != 2][:12]
+    assert len(seen) == 6 and sizes and max(sizes) == 5
 
 
 def test_fewer_than_asked_for_are_marked(tmp_path):
