@@ -19,7 +19,7 @@ from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources import lerobot_dataset
+from data_pipelines.sources import lerobot
 from data_pipelines.sources.lerobot import LeRobotSource
 from data_pipelines.sources.open import find_format, open_source, source_name
 from data_pipelines.sources.rlds import location
@@ -86,7 +86,7 @@ def test_frames_of_a_record_are_decoded_from_a_video_that_is_opened_once(tmp_pat
             yield video
         closed.append(path)
 
-    monkeypatch.setattr(lerobot_dataset, "open_video", counted)
+    monkeypatch.setattr(lerobot, "open_video", counted)
     dataset = open_source(write_lerobot(tmp_path / "toy", "v3.0"))
     frames = dataset.record(1, ["steps/observation/top"])["steps/observation/top"]
     assert [number(frames[t]) for t in (0, 3, 8, 2)] == [24, 27, 32, 26] and len(opened) == 1
@@ -404,6 +404,22 @@ def test_a_video_with_a_damaged_index_is_damage_whatever_ffmpeg_calls_it(tmp_pat
     else:
         with pytest.raises(EpisodeError, match=f"{clip.name}: .*{message}"):
             source.episode(0, TOP.image_key, ())
+
+
+def test_a_video_slower_than_its_rows_is_refused(tmp_path):
+    """Row 1, of 0.1 s, was given the frame of 0.2 s, which shows what its action did."""
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1")
+    clip = sorted(root.rglob("*.mp4"))[0]
+    write_video(clip, range(0, 12, 2), 5)
+    source = open_source(root)
+    for read in (
+        lambda: source.episode(0, TOP.image_key, TOP.action_keys),
+        lambda: list(LeRobotSource(root).read(0)),
+    ):
+        with pytest.raises(EpisodeError, match=f"{clip.name}: 5 frames per second, but by fps .* 10 rows"):
+            read()
+    write_video(clip, range(24), 20)
+    assert [number(image) for image in source.episode(0, TOP.image_key, ()).images] == list(range(0, 24, 2))
 
 
 def test_a_disk_that_fails_is_no_damage_of_a_video(tmp_path, monkeypatch):
