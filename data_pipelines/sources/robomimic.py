@@ -60,7 +60,8 @@ class RobomimicSource:
             if "data" not in file:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
-            self.units = _demonstrations(self.path, file, settings.filter_key)
+            self.masks = _demonstrations(self.path, file, settings.filter_key)  # of each demonstration
+            self.units = list(self.masks)
             self.layout, self.cameras, self.unsupported_images = self._read_layout(
                 file["data"][self.units[0]], settings.camera
             )
@@ -250,23 +251,29 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
     return float(rate)
 
 
-def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:
-    """Names in the order of their numbers."""
+def _demonstrations(path: Path, file: Any, filter_key: str | None) -> dict[str, str]:
+    """Names in the order of their numbers, each with the one of the masks `filter_key` that names it, or ""."""
     names = [name for name in file["data"] if re.fullmatch(r"demo_\d+", name)]
     if not names:
         raise DataError(f"{path}: no demonstration 'data/demo_*' in it.")
-    if filter_key is not None:
-        masks = sorted(file["mask"]) if "mask" in file else []
-        if filter_key not in masks:
-            raise ConfigError(f"{path}: no mask {filter_key!r}; it has {', '.join(masks) or 'none'}.")
-        chosen = [n.decode() if isinstance(n, bytes) else str(n) for n in file["mask"][filter_key][()]]
+    wanted = [] if filter_key is None else filter_key.split("+")
+    of = {} if wanted else dict.fromkeys(names, "")
+    masks = sorted(file["mask"]) if wanted and "mask" in file else []
+    for mask in wanted:
+        if mask not in masks:
+            raise ConfigError(f"{path}: no mask {mask!r}; it has {', '.join(masks) or 'none'}.")
+        chosen = [n.decode() if isinstance(n, bytes) else str(n) for n in file["mask"][mask][()]]
         missing = sorted(set(chosen) - set(names))
         if missing:
-            raise DataError(f"{path}: mask/{filter_key} names {missing[0]!r}, which 'data' does not have.")
+            raise DataError(f"{path}: mask/{mask} names {missing[0]!r}, which 'data' does not have.")
         if not chosen:
-            raise DataError(f"{path}: mask/{filter_key} names no demonstration.")
+            raise DataError(f"{path}: mask/{mask} names no demonstration.")
+        for name in chosen:
+            if (other := of.setdefault(name, mask)) != mask:
+                raise DataError(
+                    f"{path}: mask/{other} and mask/{mask} both name {name!r}. Choose masks that share none."
+                )
         for name, following in pairwise(sorted(chosen)):
             if name == following:
-                raise DataError(f"{path}: mask/{filter_key} names {name!r} twice. Correct the mask.")
-        names = chosen
-    return sorted(names, key=lambda name: int(name.removeprefix("demo_")))
+                raise DataError(f"{path}: mask/{mask} names {name!r} twice. Correct the mask.")
+    return dict(sorted(of.items(), key=lambda item: int(item[0].removeprefix("demo_"))))

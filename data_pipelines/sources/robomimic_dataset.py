@@ -37,7 +37,8 @@ BLOCK = 16
 
 
 class RobomimicDataset(EpisodeSource):
-    """The demonstrations of a robomimic HDF5 file: all of them as split `train`, or those of a mask.
+    """The demonstrations of a robomimic HDF5 file: all of them as split `train`, or those of a mask,
+    or of several (`train+valid`).
 
     Raises DataError for a file of another layout or without images, ConfigError for an unknown mask.
     """
@@ -57,8 +58,11 @@ class RobomimicDataset(EpisodeSource):
         self.name = dataset_name(self._read)
         self._demos = list(self._read.units)
         self.features = self._read.layout.flat_features(self._read.unsupported_images)
-        numbers = [int(name.removeprefix("demo_")) for name in self._demos]
-        self.runs = tuple(EpisodeRun(self.location.name, number, 1) for number in numbers)
+        several = "+" in split
+        self.runs = tuple(
+            EpisodeRun(self.location.name, int(name.removeprefix("demo_")), 1, mask if several else "")
+            for name, mask in self._read.masks.items()
+        )
         with self._read.open() as file:
             self._lengths = np.asarray([self._length(file, i) for i in range(len(self._demos))], np.int32)
         self._bytes = self.location.stat().st_size

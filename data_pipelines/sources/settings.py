@@ -30,7 +30,7 @@ class RobomimicSettings:
     camera: Cameras = ()
     """Cameras to keep, such as agentview. (default: all)"""
     filter_key: str | None = None
-    """Take only the demonstrations of this mask (filter key)."""
+    """Take only the demonstrations of this mask (filter key), or of several, such as train+valid."""
     hz: Annotated[float | None, UNSET] = None
     """Control rate in Hz. (default: the file's own, or 20)"""
     short_side: int | None = None

@@ -9,6 +9,7 @@ import pickle
 import re
 import shutil
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +185,21 @@ def test_robomimic_is_read_where_it_lies(tmp_path):
         assert [number(image) for image in backward] == [46, 24, 45]
     some = open_source(path, "valid")
     assert some.episode(0, VIEW.image_key, ()).steps == 23 and some.ids.tolist() == [open_source(path).ids[1]]
+
+
+def test_the_masks_of_a_robomimic_file_can_say_what_is_held_out(tmp_path):
+    def share(file):
+        file["mask/half"] = np.array([b"demo_9", b"demo_10"])
+
+    path = write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4), change=share)
+    spec = replace(VIEW, split="train+valid", val_split="valid")
+    manifest = tokenize_dataset(spec, path, FakeTokenizer(), tmp_path / "store", frame_step=1)
+    assert (manifest.train.steps, manifest.val.steps) == ((5, 4), (7,))
+    assert open_source(path, "train+valid").ids.tolist() == open_source(path).ids.tolist()
+    with pytest.raises(DataError, match="mask/train and mask/half both name 'demo_9'"):
+        open_source(path, "train+half")
+    with pytest.raises(ConfigError, match="no mask 'test'; it has half, train, valid"):
+        open_source(path, "train+test")
 
 
 def test_what_is_lost_of_a_robomimic_file_does_not_say_where_it_lies(tmp_path):
