@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from pathlib import Path
 
-from hma_jax.runtime.locks import Held, Lock, exclusive
+from hma_jax.runtime.locks import Held, Lock, exclusive, find_held
 
 MIN_WAIT, MAX_WAIT = 0.1, 5.0
 """Seconds between two checks whether another process has finished; each wait is 1.5 times the one before."""
@@ -72,13 +72,7 @@ def lock_file(output: Path) -> Path:
 
 def find_held_lock(directory: Path) -> Held | None:
     """A lock in `directory` that a running process holds, as the error that says so; None if there is none."""
-    for path in sorted(directory.glob("*.lock")):
-        try:
-            with exclusive(path, lease=True, remove=True):
-                pass
-        except Held as held:
-            return held
-    return None
+    return next(filter(None, map(find_held, sorted(directory.glob("*.lock")))), None)
 
 
 def backoff() -> Iterator[float]:

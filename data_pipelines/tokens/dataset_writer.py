@@ -67,9 +67,10 @@ def write_dataset(
     root = Path(store_root)
     final = root / plan.spec.name
     try:
-        others = _find_others(root, plan, parts)
-        if overwrite:
-            _remove_others(final, plan, others)
+        if overwrite or _published(final, plan) is None:  # a finished one is in nobody's way
+            others = _find_others(root, plan, parts)
+            if overwrite:
+                _remove_others(final, plan, others)
         maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(skipped), max_skipped)
         pauses = backoff()
         while True:

@@ -141,11 +141,7 @@ def _open(path: Path, lease: bool) -> tuple[int, bool]:
     while True:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
-            locked = _flock(fd)
-            holder = read_holder(path)
-            if locked is None or lease and _leased(path, holder, locked):
-                held = Held(f"{path} is held by {holder or 'another process'}; wait for it or stop it", holder)
-                raise held
+            locked = _lock(fd, path, lease)
             # Whoever held it may have removed the file after it was opened here.
             if _same_file(fd, path):
                 kept, fd = fd, -1
@@ -155,10 +151,41 @@ def _open(path: Path, lease: bool) -> tuple[int, bool]:
                 os.close(fd)
 
 
-def _flock(fd: int) -> bool | None:
+def find_held(path: Path) -> Held | None:
+    """That a running process holds the lease `path`, as the error that says so. Nothing is written to the lock file.
+
+    None if nobody does, or if it is another user's and cannot be told. Raises OSError if it cannot be read now.
+    """
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            _lock(fd, path, lease=True, kind=fcntl.LOCK_SH)  # NFS gives no other for a file that is open for reading
+        finally:
+            os.close(fd)
+    except Held as held:
+        return held
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
+    return None
+
+
+def _lock(fd: int, path: Path, lease: bool, kind: int = fcntl.LOCK_EX) -> bool:
+    """Locks the open file: whether the file system took the lock. Raises Held, OSError."""
+    locked = _flock(fd, kind)
+    if locked is None or lease:
+        holder = read_holder(path)
+        if locked is None or _leased(path, holder, locked):
+            raise Held(f"{path} is held by {holder or 'another process'}; wait for it or stop it", holder)
+    return locked
+
+
+def _flock(fd: int, kind: int) -> bool | None:
     """True: locked; None: another holds it; False: the file system takes no locks."""
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(fd, kind | fcntl.LOCK_NB)
         return True
     except OSError as error:
         return None if error.errno in TAKEN else False

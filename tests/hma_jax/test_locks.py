@@ -14,7 +14,7 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime import locks
-from hma_jax.runtime.locks import Held, Holder, exclusive
+from hma_jax.runtime.locks import Held, Holder, exclusive, find_held
 
 
 def hold(path: Path, ready) -> None:
@@ -78,6 +78,26 @@ def test_a_lease_of_another_machine_holds_until_it_expires(tmp_path: Path):
     with exclusive(path, lease=True) as lock:
         assert not lock.lost()
     assert [p.name for p in tmp_path.iterdir()] == ["lock"]
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EROFS])
+def test_whether_a_lease_is_held_is_seen_without_writing_and_of_another_user_s_where_it_can_be(
+    tmp_path: Path, monkeypatch, code: int
+):
+    path = tmp_path / "lock"
+    leave(path, age=locks.EXPIRES + 5)
+    before = path.read_text(), path.stat().st_mtime
+    assert find_held(path) is None and (path.read_text(), path.stat().st_mtime) == before
+    leave(path, age=0)
+    assert "process 7 on other" in str(find_held(path))
+
+    def refuse(*arguments, **options):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    assert find_held(path) is None  # the file system's time is not known
+    with exclusive(path):
+        assert find_held(path).holder.process == os.getpid()
 
 
 def test_a_lease_from_a_clock_that_was_ahead_is_over_as_well(tmp_path: Path):

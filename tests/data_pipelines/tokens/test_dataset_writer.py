@@ -217,6 +217,13 @@ def test_a_dataset_that_is_being_made_with_other_settings_is_refused_before_anyt
     assert set(tmp_path.glob(".toy.*")) == {work, locks_of(work)}
 
 
+def test_a_finished_dataset_is_given_although_another_is_being_made_with_other_settings(rlds, tmp_path):
+    work = begin(rlds, tmp_path, keep_frames="all")
+    made = run(rlds, tmp_path)
+    with lock_output(locks_of(work) / "00007"):  # by a process that is alive
+        assert run(rlds, tmp_path) == made
+
+
 def test_overwriting_removes_what_was_made_otherwise(rlds, undisturbed, tmp_path):
     work = begin(rlds, tmp_path, keep_frames="none")
     run(rlds, tmp_path, keep_frames="all")
