@@ -32,6 +32,7 @@ from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, locks_of
 from data_pipelines.tokens.row_sample import merge_samples
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, stable_hash
+from hma_jax.runtime.files import IO_ERRNOS
 from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
@@ -87,6 +88,8 @@ def write_dataset(
                 return None
             time.sleep(next(pauses))
     except OSError as error:
+        if error.errno in IO_ERRNOS:
+            raise
         raise ConfigError(
             f"{final}: the token store cannot be written there ({error.strerror or error}). "
             "Choose a directory on a disk with space where you may write."

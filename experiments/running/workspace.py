@@ -17,7 +17,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held, Holder, Lock, exclusive, read_holder
-from hma_jax.runtime.outputs import unwritable
+from hma_jax.runtime.outputs import writing_to
 
 LOCK = ".lock"
 
@@ -164,16 +164,15 @@ class Workspace:
         """
         with ExitStack() as stack:
             try:
-                self.root.mkdir(parents=True, exist_ok=True)
-                held_lock = stack.enter_context(exclusive(self.root / lock))
+                with writing_to(self.root):
+                    self.root.mkdir(parents=True, exist_ok=True)
+                    held_lock = stack.enter_context(exclusive(self.root / lock))
             except Held as held:
                 raise Busy(
                     f"another command is using {self.root} ({held.who}); wait until it has finished, or choose "
                     "another --out",
                     held.holder,
                 ) from None
-            except OSError as error:
-                raise unwritable(self.root, error) from error
             yield held_lock
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.files import naming, sync, sync_tree
 from hma_jax.runtime.locks import Held, exclusive
-from hma_jax.runtime.outputs import unwritable
+from hma_jax.runtime.outputs import writing_to
 
 
 def require_free(directory: Path) -> None:
@@ -36,15 +36,14 @@ def atomic_directory(directory: Path) -> Iterator[Path]:
     temporary, lock = (directory.with_name(f".{directory.name}.{kind}") for kind in ("tmp", "lock"))
     with ExitStack() as stack:
         try:
-            directory.parent.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(exclusive(lock, remove=True))
-            require_free(directory)
-            shutil.rmtree(temporary, ignore_errors=True)
-            temporary.mkdir()
+            with writing_to(directory):
+                directory.parent.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(exclusive(lock, remove=True))
+                require_free(directory)
+                shutil.rmtree(temporary, ignore_errors=True)
+                temporary.mkdir()
         except Held as held:
             raise ConfigError(f"{directory} is being written ({held.who}); choose another output directory") from None
-        except OSError as error:
-            raise unwritable(directory, error) from error
         stack.callback(shutil.rmtree, temporary, ignore_errors=True)
         with naming(directory):
             yield temporary

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+IO_ERRNOS = frozenset(
+    getattr(errno, name)
+    for name in (
+        "EIO ESTALE ETIMEDOUT EREMOTEIO ENXIO ENODEV EAGAIN EBUSY EINTR EMFILE ENFILE ENOMEM ENETDOWN "
+        "ENETUNREACH ECONNRESET ECONNABORTED ECONNREFUSED ENOTCONN EHOSTDOWN EHOSTUNREACH"
+    ).split()
+    if hasattr(errno, name)
+)
+"""errno values that report a failing disk, network or operating system, and never damaged contents."""
 
 
 def sync(path: Path) -> None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from hma_jax.config import ConfigError
+from hma_jax.runtime.files import IO_ERRNOS
 
 
 def make_directory(directory: Path, option: str | None = "--out") -> None:
@@ -15,19 +18,24 @@ def make_directory(directory: Path, option: str | None = "--out") -> None:
 
     Raises ConfigError otherwise; `option` is what the user chose it with, None where it is what the command is about.
     """
-    try:
+    with writing_to(directory, option):
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=directory):
             pass
+
+
+@contextmanager
+def writing_to(directory: Path, option: str | None = "--out") -> Iterator[None]:
+    """An OSError of the block becomes a ConfigError that `directory` cannot be made or written in: which directory
+    above it, or which file, is in the way. That of a disk that fails stays: another choice is no help against it."""
+    try:
+        yield
     except OSError as error:
-        raise unwritable(directory, error, option) from error
-
-
-def unwritable(directory: Path, error: OSError, option: str | None = "--out") -> ConfigError:
-    """That `directory` cannot be made or written in: which directory above it, or which file, is in the way."""
-    there = next(p for p in (directory, *directory.parents) if os.path.exists(p))
-    what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
-    advice = f"{f'choose another {option}, in' if option else 'copy it to'} a directory where you may write"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        advice = "make room on its disk"
-    return ConfigError(f"cannot write to {directory}: {what} ({error.strerror}); {advice}")
+        if error.errno in IO_ERRNOS:
+            raise
+        there = next(p for p in (directory, *directory.parents) if os.path.exists(p))
+        what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
+        advice = f"{f'choose another {option}, in' if option else 'copy it to'} a directory where you may write"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            advice = "make room on its disk"
+        raise ConfigError(f"cannot write to {directory}: {what} ({error.strerror}); {advice}") from error

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import IO_ERRNOS
 from hma_jax.runtime.locks import Held, Lock, exclusive
 
 NAME, EVALUATION = ".lock", ".evaluation.lock"
@@ -47,7 +48,8 @@ def require_plain(directory: Path) -> None:
 @contextmanager
 def locked_run(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
     """Makes `run_dir` and holds it: to train in it or, with EVALUATION, to write the evaluation of its model.
-    Raises RunBusy naming the process that holds it already, and ConfigError if it cannot be written."""
+    Raises RunBusy naming the process that holds it already, ConfigError if it cannot be written, and OSError if its
+    disk fails."""
     require(
         not is_address(run_dir),
         f"a run directory must be on a file system, got the address {run_dir}; mount the bucket, or choose a disk "
@@ -64,6 +66,8 @@ def locked_run(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
                 held.holder,
             ) from None
         except OSError as error:
+            if error.errno in IO_ERRNOS:
+                raise
             raise ConfigError(
                 f"cannot write to the run directory {run_dir}: {error.strerror}; choose another output directory "
                 "or fix its permissions"

@@ -13,8 +13,11 @@ from pathlib import Path
 import pytest
 
 from hma_jax.config import ConfigError
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.runtime import locks
 from hma_jax.runtime.locks import Held, Holder, exclusive, find_held
+from hma_jax.runtime.outputs import make_directory
+from hma_jax.training.run_lock import locked_run
 
 
 def hold(path: Path, ready) -> None:
@@ -164,6 +167,38 @@ def test_a_lease_that_cannot_be_read_is_not_taken_for_free(tmp_path: Path, monke
     unreadable(monkeypatch, tmp_path / "lock")
     with pytest.raises(OSError, match=os.strerror(errno.ESTALE)), exclusive(tmp_path / "lock", lease=True):
         pass
+
+
+def test_a_lock_without_a_lease_is_had_whoever_held_it(tmp_path: Path, monkeypatch):
+    unreadable(monkeypatch, tmp_path / "lock")
+    with exclusive(tmp_path / "lock"):
+        pass
+
+
+def make(directory: Path) -> None:
+    with atomic_directory(directory):
+        pass
+
+
+def lock(directory: Path) -> None:
+    with locked_run(directory):
+        pass
+
+
+@pytest.mark.parametrize("write", [make_directory, make, lock])
+def test_a_disk_that_does_not_answer_is_no_wrong_choice_of_a_directory(write, tmp_path: Path, monkeypatch):
+    """Refused as one, the trial would not be tried again."""
+
+    def fail(self: Path, *arguments, **options):
+        raise OSError(code, os.strerror(code), str(self))
+
+    monkeypatch.setattr(Path, "mkdir", fail)
+    code = errno.EACCES
+    with pytest.raises(ConfigError, match="choose another"):
+        write(tmp_path / "out" / "run")
+    code = errno.ESTALE
+    with pytest.raises(OSError, match=os.strerror(errno.ESTALE)):
+        write(tmp_path / "out" / "run")
 
 
 def test_a_lease_is_renewed_while_it_is_held_and_given_back_at_the_end(tmp_path: Path, monkeypatch):

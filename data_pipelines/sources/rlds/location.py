@@ -7,7 +7,6 @@ memory://, ...) are `upath.UPath` objects, of the extra `remote`.
 
 from __future__ import annotations
 
-import errno
 import functools
 import os
 import random
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
 
 from data_pipelines.errors import DataError, UnreachableError
 from hma_jax.config import ConfigError
+from hma_jax.runtime.files import IO_ERRNOS
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -31,16 +31,6 @@ T = TypeVar("T")
 
 RETRY_WAITS = (0.1, 0.5, 2.0, 6.0)
 """Seconds to wait before each retry of a failed read, with a random factor of 0.5 to 1.5."""
-
-IO_ERRNOS = frozenset(
-    getattr(errno, name)
-    for name in (
-        "EIO ESTALE ETIMEDOUT EREMOTEIO ENXIO ENODEV EAGAIN EBUSY EINTR EMFILE ENFILE ENOMEM ENETDOWN "
-        "ENETUNREACH ECONNRESET ECONNABORTED ECONNREFUSED ENOTCONN EHOSTDOWN EHOSTUNREACH"
-    ).split()
-    if hasattr(errno, name)
-)
-"""errno values that report a failing disk, network or operating system, and never damaged contents."""
 
 PERMANENT_ERRORS = (PermissionError, IsADirectoryError, NotADirectoryError)
 """Errors that retrying does not cure."""
