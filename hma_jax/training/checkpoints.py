@@ -14,7 +14,6 @@ import json
 import logging
 import math
 import os
-import re
 import shutil
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -32,6 +31,7 @@ from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
     CheckpointError,
     agree_on_latest,
+    error_code,
     find_damage,
     hush_orbax,
     list_steps,
@@ -265,9 +265,6 @@ def _size(count: int) -> str:
 
 def _reason(error: Exception) -> str:
     """One line: the operating system's message, if there is one."""
-    code = re.search(r"os_error_code='(\d+)'", str(error))
-    if code:
-        return os.strerror(int(code[1]))
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
+    if code := error_code(error):
+        return os.strerror(code)
     return " ".join(f"{type(error).__name__}: {error}".split())[:160]

@@ -30,10 +30,11 @@ class Damaged(Exception):
 class ReadError(OSError):
     """A file cannot be read now: a shared disk does not answer, or too many files are open. It may be whole."""
 
-    def __init__(self, path: Path, error: OSError):
-        super().__init__(
-            f"{path} cannot be read now ({error.strerror}), so it is not known whether it is damaged. Run the same "
-            "command again when its disk answers; if it never does, remove the checkpoint to continue from an earlier one"
+    @classmethod
+    def of(cls, path: Path, reason: str) -> ReadError:
+        return cls(
+            f"{path} cannot be read now ({reason}), so it is not known whether it is damaged. Run the same command again "
+            "when its disk answers; if it never does, remove the checkpoint to continue from an earlier one"
         )
 
 
@@ -56,7 +57,7 @@ def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[in
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise ReadError(path, error) from error
+        raise ReadError.of(path, error.strerror) from error
     except ValueError as error:
         raise Damaged(path, f"cannot be read ({error})") from error
     rows = [row for row in _rows(path, text) if chosen(row[0])]
@@ -86,7 +87,7 @@ def _compare(path: Path, size: int, digest: str) -> None:
     except (FileNotFoundError, NotADirectoryError) as error:
         raise Damaged(path, f"cannot be read ({error.strerror})") from error
     except OSError as error:
-        raise ReadError(path, error) from error
+        raise ReadError.of(path, error.strerror) from error
 
 
 def _files(checkpoint: Path) -> Iterator[tuple[str, Path]]:

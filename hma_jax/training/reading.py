@@ -7,7 +7,10 @@ items that are asked for are read and checked.
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,17 +44,20 @@ def agree_on_latest(directory: Path) -> int | None:
 
 @contextmanager
 def raised_in_all(name: str) -> Iterator[None]:
-    """A CheckpointError that any of several processes raises in the block, which all go through, is raised in all."""
-    own: CheckpointError | None = None
+    """The first CheckpointError or ReadError that any of several processes raises in the block, which all go through,
+    is raised in all."""
+    own: CheckpointError | ReadError | None = None
     try:
         yield
-    except CheckpointError as error:
+    except (CheckpointError, ReadError) as error:
         own = error
-    errors = all_gather(name, "" if own is None else str(own))
-    if own is not None:
+    told = "" if own is None else f"{type(own).__name__}: {own}"
+    first = next(filter(None, all_gather(name, told)), "")
+    if own is not None and told == first:
         raise own
-    if any(errors):
-        raise CheckpointError(next(filter(None, errors)))
+    if first:
+        kind, _, message = first.partition(": ")
+        raise {"CheckpointError": CheckpointError, "ReadError": ReadError}[kind](message)
 
 
 def find_damage(checkpoint: Path) -> Damaged | None:
@@ -103,7 +109,8 @@ def has_item(checkpoint: Path, name: str) -> bool:
 
 @contextmanager
 def _reading(checkpoint: Path) -> Iterator[None]:
-    """Turns damage, and whatever Orbax raises for it (types of four libraries), into a CheckpointError."""
+    """Turns damage, and whatever Orbax raises for it (types of four libraries), into a CheckpointError; what the system
+    says of a disk, into a ReadError."""
     hush_orbax()
     try:
         yield
@@ -115,6 +122,9 @@ def _reading(checkpoint: Path) -> Iterator[None]:
     except ReadError:
         raise
     except Exception as error:
+        code = error_code(error)
+        if code not in (None, errno.ENOENT, errno.ENOTDIR):
+            raise ReadError.of(checkpoint, os.strerror(code)) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise CheckpointError(
             f"the checkpoint {checkpoint} cannot be read ({reason[:160]}); if its files are damaged, remove this "
@@ -122,15 +132,28 @@ def _reading(checkpoint: Path) -> Iterator[None]:
         ) from error
 
 
+def error_code(error: Exception) -> int | None:
+    """The operating system's number, which the storage library of Orbax gives in words."""
+    found = re.search(r"os_error_code='(\d+)'", str(error))
+    return int(found[1]) if found else error.errno if isinstance(error, OSError) else None
+
+
 def _advice(checkpoint: Path) -> str:
     earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
-    whole = [step for step in earlier if find_damage(checkpoint.parent / str(step)) is None]
+    whole = [step for step in earlier if _is_whole(checkpoint.parent / str(step))]
     if not whole:
         return "there is no undamaged checkpoint before it: train again in a new output directory"
     return (
         f"that of step {whole[-1]} is undamaged: to continue from there, train with --skip-damaged (in Python "
         "LoopOptions(skip_damaged=True)), or remove this directory"
     )
+
+
+def _is_whole(checkpoint: Path) -> bool:
+    try:
+        return find_damage(checkpoint) is None
+    except ReadError:  # nobody knows now
+        return False
 
 
 def hush_orbax() -> None:

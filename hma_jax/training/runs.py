@@ -20,6 +20,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params, path_name
 from hma_jax.runtime.devices import default_device
+from hma_jax.training.hashes import ReadError
 from hma_jax.training.reading import (
     CheckpointError,
     agree_on_latest,
@@ -132,7 +133,8 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
 
     The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint
     while it is read, a newer one is taken. With several processes all call this, and read the same one. Raises
-    CheckpointError if there is no checkpoint, or it is damaged or foreign, and ConfigError for an average that the run
+    CheckpointError if there is no checkpoint, or it is damaged or foreign, ReadError if it cannot be read now, and
+    ConfigError for an average that the run
     does not keep, and for weights called otherwise.
     """
     require_choice(weights, get_args(Weights), "weights")
@@ -145,7 +147,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     while True:
         try:
             return _read_run(run_dir, directory / str(step), weights)
-        except CheckpointError:
+        except (CheckpointError, ReadError):  # of what another host removed, NFS says that it cannot be read
             read, step = step, agree_on_latest(directory)
             if step in (None, read):
                 raise

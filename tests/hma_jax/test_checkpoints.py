@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
-from hma_jax.training import hashes
+from hma_jax.training import hashes, reading
 from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
 from hma_jax.training.hashes import NAME, Damaged, ReadError, verify, write_list
 from hma_jax.training.loop import LoopOptions
@@ -106,6 +106,56 @@ def test_a_file_that_cannot_be_read_now_is_not_taken_for_damaged(name: str, run_
             fit_toy(run_dir, 8, options=SKIP)
     assert list_steps(run_dir / "checkpoints") == [4, 6] and not (run_dir / "damaged").exists()
     assert fit_toy(run_dir, 8, options=SKIP).resumed_from == 6
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (OSError(errno.ESTALE, os.strerror(errno.ESTALE)), ReadError),
+        (ValueError("NOT_FOUND: [os_error_code='24' source locations='..']"), ReadError),
+        (FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)), CheckpointError),
+        (ValueError("DATA_LOSS: not a zarr"), CheckpointError),
+    ],
+)
+def test_what_the_system_says_when_arrays_are_read_is_not_taken_for_damage_either(error, kind, run_dir, monkeypatch):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(reading.ocp, "load_checkpointables", fail)
+    with pytest.raises((ReadError, CheckpointError), match=str(run_dir / "checkpoints" / "6")) as refused:
+        fit_toy(run_dir, 8)
+    assert refused.type is kind
+
+
+def test_the_damage_is_told_where_the_checkpoint_before_it_cannot_be_read_now(run_dir: Path, monkeypatch):
+    earlier, later = (run_dir / "checkpoints" / step / "params" / "_METADATA" for step in "46")
+    flip(later)
+    compare = hashes._compare
+
+    def fail(path: Path, *row) -> None:
+        if path == earlier:
+            raise ReadError(f"{path} cannot be read now")
+        compare(path, *row)
+
+    monkeypatch.setattr(hashes, "_compare", fail)
+    with pytest.raises(CheckpointError, match="6 is damaged: params/_METADATA .*no undamaged checkpoint before it"):
+        fit_toy(run_dir, 8)
+
+
+@pytest.mark.parametrize("kind", [CheckpointError, ReadError])
+def test_what_one_of_several_processes_cannot_read_ends_all_of_them_alike(kind, monkeypatch):
+    told: list[str] = []
+
+    def all_gather(name: str, own: str) -> list[str]:
+        told.append(own)
+        return [told[0], own]
+
+    monkeypatch.setattr(reading, "all_gather", all_gather)
+    for own in ([kind("the first file")], [], [CheckpointError("another")], [ReadError("another")]):
+        with pytest.raises((CheckpointError, ReadError)) as raised, reading.raised_in_all("name"):
+            for error in own:
+                raise error
+        assert (raised.type, str(raised.value)) == (kind, "the first file")
 
 
 @pytest.mark.parametrize("item", ["params", "opt_state", "_CHECKPOINT_METADATA"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import pickle
@@ -23,6 +24,7 @@ from hma_jax.config.json import to_dict
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import inference_params
 from hma_jax.training import reading, runs
+from hma_jax.training.hashes import ReadError
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
 from hma_jax.training.runs import describe_run, load_model, load_run, modernise
@@ -59,10 +61,12 @@ def equal(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+@pytest.mark.parametrize("code", [errno.ENOENT, errno.ESTALE])
 def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_newer_one(
-    averaged, tmp_path, monkeypatch
+    code, averaged, tmp_path, monkeypatch
 ):
-    """Training and evaluating go together; it was said to be damaged, or no run of this project."""
+    """Training and evaluating go together; it was said to be damaged, or no run of this project. NFS says ESTALE of
+    what another host removed."""
     shutil.copytree(averaged[0], tmp_path / "run")
     old, new = (tmp_path / "run" / "checkpoints" / step for step in "23")
 
@@ -70,6 +74,8 @@ def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_ne
         if old.is_dir():
             os.replace(shutil.copytree(old, tmp_path / "3"), new)
             shutil.rmtree(old)
+            if code == errno.ESTALE:
+                raise ReadError(f"{old} cannot be read now")
         return read_description(checkpoint)
 
     monkeypatch.setattr(runs, "read_description", replaced)
@@ -82,7 +88,7 @@ def test_several_processes_read_the_step_that_process_0_sees_and_another_one_tog
     shutil.copytree(averaged[0], tmp_path / "run")
     for step in "345":
         shutil.copytree(tmp_path / "run" / "checkpoints" / "2", tmp_path / "run" / "checkpoints" / step)
-    latest, removed = iter("34"), iter(["the checkpoint is removed"])
+    latest, removed = iter("34"), iter(["CheckpointError: the checkpoint is removed"])
     monkeypatch.setattr(reading, "broadcast_from_writer", lambda *_: next(latest), raising=False)
     monkeypatch.setattr(
         reading, "all_gather", lambda name, own: [next(removed, "") if name == "parameters" else "", own]
