@@ -52,26 +52,29 @@ class _Refused(ConfigError):
     """Not wrapped by what reports damaged files."""
 
 
-class _Ignored:
-    """Stands for any object of a trainer: takes whatever a pickle does to it, and keeps nothing of it."""
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> _Ignored:
-        del args, kwargs
-        return super().__new__(cls)
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        del args, kwargs
-
-    def __setstate__(self, state: Any) -> None:
-        del state
-
-    def __setitem__(self, key: Any, value: Any) -> None:
+class _TakesItems(type):
+    def __setitem__(cls, key: Any, value: Any) -> None:
         del key, value
 
-    def append(self, item: Any) -> None:
+
+class _Ignored(metaclass=_TakesItems):
+    """Stands for any class of a trainer and for its objects: what a pickle makes of it is itself again, since it may be
+    a class (`getattr` gives nested ones), and whatever else is done to it leaves nothing."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> type[_Ignored]:
+        del args, kwargs
+        return cls
+
+    @classmethod
+    def __setstate__(cls, state: Any) -> None:
+        del state
+
+    @classmethod
+    def append(cls, item: Any) -> None:
         del item
 
-    def extend(self, items: Any) -> None:
+    @classmethod
+    def extend(cls, items: Any) -> None:
         del items
 
 
@@ -98,20 +101,25 @@ class _Reader(pickle.Unpickler):
             "read. Save only the tensors, best as model.safetensors"
         )
 
-    def persistent_load(self, pid: Any) -> _Storage | _Ignored:
+    def persistent_load(self, pid: Any) -> _Storage | type[_Ignored]:
         kind, storage_type, key, _, _ = pid
         if storage_type is _Ignored:
-            return _Ignored()
+            return _Ignored
         if kind != "storage" or not isinstance(storage_type, _StorageType) or not isinstance(key, str):
             raise pickle.UnpicklingError(f"unknown kind of data {kind!r}")
         return _Storage(storage_type.dtype, key)
 
     def _rebuild(
-        self, storage: _Storage | _Ignored, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *rest: Any
-    ) -> Stored | _Ignored:
+        self,
+        storage: _Storage | type[_Ignored],
+        offset: int,
+        shape: tuple[int, ...],
+        stride: tuple[int, ...],
+        *rest: Any,
+    ) -> Stored | type[_Ignored]:
         del rest  # gradients and hooks
-        if isinstance(storage, _Ignored):
-            return storage
+        if storage is _Ignored:
+            return _Ignored
         numbers = (offset, *shape, *stride)
         if not all(type(n) is int and n >= 0 for n in numbers) or len(shape) != len(stride):
             raise pickle.UnpicklingError(f"a tensor of shape {shape} and strides {stride} from {offset}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import enum
 import functools
 import io
 import os
@@ -60,7 +61,7 @@ class Writer(pickle._Pickler):
         return super().save(obj, save_persistent_id)
 
     def save_reduce(self, func, args, state=None, *rest, obj=None, **more):
-        if isinstance(func, Global):
+        if isinstance(func, (Global, Call)):
             self.save(func)
             self.save(args)
             self.write(pickle.REDUCE)
@@ -133,6 +134,26 @@ def test_an_official_checkpoint_may_be_a_torch_file(name, tmp_path):
     assert (tmp_path / "b" / "model.safetensors").read_bytes() == (tmp_path / "expected.safetensors").read_bytes()
 
 
+class Outer:
+    """Of what is pickled as `getattr` of it in protocol 2."""
+
+    class Inner:
+        pass
+
+    class Kind(enum.Enum):
+        FIRST = 1
+
+    @classmethod
+    def made(cls) -> Outer:
+        return cls()
+
+    def method(self) -> None:
+        pass
+
+    def __reduce__(self):
+        return Outer.made, ()
+
+
 def test_what_a_trainer_keeps_is_passed_over_whatever_it_is(tmp_path):
     """In protocol 2, which torch writes, built-in types are of `__builtin__`, and bytes come out of a call of one."""
     besides = {
@@ -142,6 +163,8 @@ def test_what_a_trainer_keeps_is_passed_over_whatever_it_is(tmp_path):
         "numpy": [np.float64(1.5), np.arange(3), np.dtype("int8")],
         "others": [tmp_path, argparse.Namespace(lr=1), functools.partial(max, 3)],
         "torch": [Call(Global("torch", "device"), "cpu"), Storage("ComplexFloatStorage", "9", 1)],
+        "nested": [Outer.Inner(), Outer.Kind.FIRST, Outer.made, Outer().method, Outer()],
+        "instance called": Call(Call(Global("cloud", "make"), "Model"), 1),
         "made": rebuild(Storage("ComplexFloatStorage", "9", 1), (1,), (1,)),
     }
     state, elements = state_dict({"w": np.arange(3, dtype=np.float32)})
