@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.errors import DataError, UnreachableError
+from data_pipelines.errors import DataError, UnreachableError, without_advice
 from data_pipelines.names import quote, safe_join
-from data_pipelines.sources.convertible import Episode, Layout, UnitError, choose
+from data_pipelines.sources.convertible import Episode, Layout, Skipped, UnitError, choose
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_meta, read_meta
 from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retry
@@ -85,7 +85,9 @@ class LeRobotSource:
             "short_side": self.short_side,
         }
 
-    def read(self, unit: int) -> Iterator[Episode]:
+    def read(self, unit: int) -> Iterator[Episode | Skipped]:
+        if unit == 0 and self.meta.lost_why:
+            yield from [Skipped(without_advice(self.meta.lost_why))] * (self.meta.stated - len(self.units))
         entry = self.meta.episodes[unit]
         where = f"{entry.data}: episode {entry.index}"
         table = self.rows(entry, [TASK, SUCCESS, REWARD, *self.vectors.values()])

@@ -74,6 +74,8 @@ def test_episodes_that_the_meta_folder_has_lost_are_left_out_on_request(tmp_path
     out = said(capsys)
     assert "2 episodes at 10 Hz" in out and "left out 1 x: " in out and "total_episodes in info.json is 3." in out
     assert "--skip-damaged" not in out
+    (metadata,) = tmp_path.glob("*/1.0.0/metadata.json")
+    assert list(json.loads(metadata.read_text())["left_out"].values()) == [1]
 
 
 def test_what_is_left_out_is_told(tmp_path, capsys):

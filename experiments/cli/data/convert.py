@@ -71,12 +71,9 @@ def lerobot(
         destination: Where the dataset is written.
         settings: What is taken from the dataset.
     """
-    from data_pipelines.errors import without_advice
     from data_pipelines.sources.lerobot import LeRobotSource
 
     opened = LeRobotSource(source, settings, may_lose=destination.skip_damaged)
-    if lost := opened.meta.lost_why:
-        say(f"left out {opened.meta.stated - len(opened.units):,} x: {without_advice(lost)}")
     _convert(opened, destination, source.absolute().name, opened.unsupported_images)
 
 
