@@ -320,4 +320,5 @@ def _stop_requests() -> Iterator[_Stop]:
             leave_stop_pending(event.exit)
     finally:
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as SIGHUP is from the first one on
+                signal.signal(number, handler)
