@@ -8,9 +8,10 @@ import numpy as np
 import optax
 import pytest
 
-from hma_jax.config import ConfigError, MupConfig, OptimizerConfig, TrainConfig
+from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, MupConfig, OptimizerConfig, TrainConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec, Use, is_spec
+from hma_jax.training import optimizer
 from hma_jax.training.optimizer import (
     Presence,
     apply_update,
@@ -21,8 +22,9 @@ from hma_jax.training.optimizer import (
     make_schedule,
     muon_direction,
 )
+from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
-from tests.tiny import TABLE, lively_params, shallow_config
+from tests.tiny import TABLE, lively_params, random_batch, shallow_config
 
 USES = get_args(Use)
 CONFIG = OptimizerConfig(learning_rate=1e-2, weight_decay=0.1)
@@ -146,6 +148,17 @@ def test_muon_moves_every_matrix_by_as_much_in_every_direction_and_all_else_as_a
     ahead = jax.jit(lambda x: muon_direction(x, specs[at], 1.0))(0.95 * momentum + 0.05 * second[at])
     was, moved = (np.asarray(jax.tree.leaves(tree)[at]) for tree in (muon, again))
     np.testing.assert_allclose((was - moved) / 1e-2 - 0.1 * was, ahead, atol=2e-4)
+
+
+def test_a_step_shares_out_matrices_of_the_size_that_the_mesh_s_settings_say(monkeypatch):
+    config = shallow_config()
+    declared = declare_model(config, TABLE, ExecutionConfig(mesh=MeshConfig(min_shard_size=7)))
+    train = TrainConfig(steps=1, batch=8, optimizer=MUON)
+    state = init_state(declared, TABLE, 0)
+    sizes = []
+    monkeypatch.setattr(optimizer, "muon_direction", lambda momentum, *rest: sizes.append(rest[-1]) or momentum)
+    jax.eval_shape(make_train_step(declared, TABLE, config, train), state, random_batch(0, config))
+    assert set(sizes) == {7}
 
 
 def test_under_mup_muon_s_updates_keep_their_spectral_norm_at_every_width():
