@@ -102,13 +102,15 @@ def check_sources(study: Study, sources: Sequence[Source]) -> dict[str, EpisodeS
 
 def check_entries(study: Study, data: Sequence[str]) -> None:
     """Of `check_sources` on the user's directories what takes no time, for a dry run: whether their entries fit the
-    fields that their files declare. The records of RLDS are not looked for."""
+    fields that their files declare; says which rates are not reached. The records of RLDS are not looked for."""
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.open import find_format
     from data_pipelines.sources.rlds.schema import FEATURES, check_fields, read_metadata, resolve_version
     from data_pipelines.tokens.tokenize_job import resolve_frame_step
 
-    for spec, path in find_sources(study, data):
+    sources = find_sources(study, data)
+    say_unreached_rates(study, sources)
+    for spec, path in sources:
         resolve_frame_step(spec, study.store.frame_step, study.rate)
         keys = (spec.image_key, spec.action_keys, spec.action_dims)
         for place in path.places if isinstance(path, Parts) else (path,):
@@ -118,6 +120,14 @@ def check_entries(study: Study, data: Sequence[str]) -> None:
                 check_fields(split.name, version / FEATURES, split.features, *keys)
             else:
                 open_source((spec, place), study.store).check_keys(*keys)
+
+
+def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
+    """Names the datasets that were recorded at a lower rate than frames are asked for at."""
+    asked = ((spec, spec.rate or study.rate) for spec, _ in sources)
+    slow = [f"{s.name} ({s.hz:g} Hz, not {rate:g})" for s, rate in asked if rate and rate > s.rate_for(1)]
+    if slow:
+        say(f"note: a rate above that of the recording is not reached, every frame is taken: {few(slow)}")
 
 
 def open_source(source: Source, settings: StoreConfig) -> EpisodeSource:

@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, may_replace, require_same
-from experiments.preparing.sources import Source, group_by_dataset, open_source, source_of
+from experiments.preparing.sources import (
+    Source,
+    group_by_dataset,
+    open_source,
+    say_unreached_rates,
+    source_of,
+)
 from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
@@ -88,14 +94,6 @@ def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
                 f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "
                 "if the files are right, correct the entry"
             )
-
-
-def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
-    """Names the datasets that were recorded at a lower rate than frames are asked for at."""
-    asked = ((spec, spec.rate or study.rate) for spec, _ in sources)
-    slow = [f"{s.name} ({s.hz:g} Hz, not {rate:g})" for s, rate in asked if rate and rate > s.rate_for(1)]
-    if slow:
-        say(f"note: a rate above that of the recording is not reached, every frame is taken: {few(slow)}")
 
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:

@@ -67,6 +67,7 @@ def test_a_dry_run_says_what_the_default_preset_is_made_for(data, capsys, tmp_pa
     assert "trains a model of" in model and "with all trajectories of each dataset" in model
     (model,) = said_by(capsys, "train", "--dry-run", *data, *out, "--trajectories", "7")
     assert "with at most 7 trajectories" in model
+    assert "large (4 Hz, not 5)" in said_by(capsys, "train", "--dry-run", *data, *out, "--set", "rate=5")[0]
 
 
 @pytest.mark.parametrize("command", ["study", "sweep width", "train"])
