@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from data_pipelines.publishing.output_lock import backoff
 from experiments.preparing.sources import Source, check_sources
+from experiments.progress import say
 from experiments.running.workspace import Busy, Workspace
 from experiments.study import Study
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
 
-if TYPE_CHECKING:
-    from data_pipelines.sources.source import EpisodeSource
-
 FILE = ".asked.json"
 
+WRITTEN_WITHIN = 60.0
+"""Seconds for which one that joins waits for the file of a process that has just taken the directory, on a shared disk
+too; who has written none by then is at another command."""
 
-def asked_for(
-    study: Study, sources: Sequence[Source], opened: Mapping[str, EpisodeSource], tokenizer: Path | None
-) -> dict[str, Any]:
+ENTRIES, RECORDINGS = "entries", "recordings"
+
+Asked = dict[str, Any]
+
+
+def asked_for(study: Study, sources: Sequence[Source], tokenizer: Path | None) -> Asked:
     """What tokens and windows depend on, under the names that --set has; a `tokenizer` that is given, by its directory,
-    is known by its identity. `opened`: the sources by name, as `check_sources` gives them."""
+    is known by its identity. The recordings are not known before the sources were opened."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     return {
@@ -33,45 +40,84 @@ def asked_for(
         "model.frames": study.model.frames,
         "eval": {name: getattr(study.eval, name) for name in ("seed", "windows_per_dataset", "prompt_frames")},
         "--tokenizer": load_tokenizer(tokenizer, expect=study.tokenizer).identity if tokenizer else "not given",
-        "data": {
-            spec.name: {"entry": to_dict(spec.facts()), "recordings": opened[spec.name].fingerprint()}
-            for spec, _ in sources
-        },
+        ENTRIES: {spec.name: to_dict(spec.facts()) for spec, _ in sources},
+        RECORDINGS: None,
     }
 
 
-def write_asked(
-    study: Study,
-    workspace: Workspace,
-    sources: Sequence[Source],
-    opened: Mapping[str, EpisodeSource],
-    tokenizer: Path | None,
-) -> None:
-    """For those that join while the directory is held."""
+def with_recordings(asked: Asked, study: Study, sources: Sequence[Source]) -> Asked:
+    """The same with fingerprints of the recordings. Raises what `check_sources` raises, and takes as long."""
+    opened = check_sources(study, sources)
+    return asked | {RECORDINGS: {name: source.fingerprint() for name, source in opened.items()}}
+
+
+def write_asked(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Path | None) -> None:
+    """For those that join while the directory is held; raises what `check_sources` raises. Sources without an index
+    take hours to open, so what is known before that is written before it."""
+    asked = asked_for(study, sources, tokenizer)
+    _write(workspace, asked)
+    _write(workspace, with_recordings(asked, study, sources))
+
+
+def _write(workspace: Workspace, asked: Asked) -> None:
     holder = workspace.holder
     if holder is not None:
-        written = {"holder": holder.token, "asked": asked_for(study, sources, opened, tokenizer)}
-        write_file(workspace.root / FILE, json.dumps(written))
+        write_file(workspace.root / FILE, json.dumps({"holder": holder.token, "asked": asked}))
 
 
 def require_same_asked(
     study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Path | None, busy: Busy
 ) -> None:
     """Raises Busy if the process that holds the directory was asked for something else, where it says so, and as
-    `check_sources` does."""
-    try:
-        written = json.loads((workspace.root / FILE).read_text())
-    except FileNotFoundError:  # another command
-        return
-    if busy.holder is None or written["holder"] != busy.holder.token:
-        return
-    there, here = written["asked"], asked_for(study, sources, check_sources(study, sources), tokenizer)
-    both = there["data"].keys() & here["data"].keys()  # the others are told by `datasets`
-    for one in (there, here):
-        one["data"] = {name: one["data"][name] for name in both}
-    if lines := diff(there, here):
+    `check_sources` does. Waits for what that process has still to find out."""
+    here = asked_for(study, sources, tokenizer)
+    if there := _wait_for_asked(workspace, busy):
+        _require_same(there | {RECORDINGS: None}, here, busy)
+    here = with_recordings(here, study, sources)
+    if there := _wait_for_asked(workspace, busy, opened=True):
+        _require_same(there, here, busy)
+
+
+def _require_same(there: Asked, here: Asked, busy: Busy) -> None:
+    if ENTRIES not in there:
+        raise Busy(f"{busy}. The work cannot be shared, since that one is of an earlier version", busy.holder)
+    both = there[ENTRIES].keys() & here[ENTRIES].keys()  # the others are told by `datasets`
+    if lines := diff(_of(both, there), _of(both, here)):
         raise Busy(
             f"{busy}. The work cannot be shared, since that one was asked for something else (there -> here):\n  "
             + "\n  ".join(lines),
             busy.holder,
         )
+
+
+def _of(names: Collection[str], asked: Asked) -> Asked:
+    some = {key: {name: asked[key][name] for name in names} for key in (ENTRIES, RECORDINGS) if asked[key]}
+    return asked | some
+
+
+def _wait_for_asked(workspace: Workspace, busy: Busy, *, opened: bool = False) -> Asked | None:
+    """What the holder of the directory was asked for, if so asked with the recordings that it has `opened`; None if it
+    is at another command, or has ended."""
+    began, announced = time.monotonic(), False
+    for pause in backoff():
+        asked = _read(workspace)
+        if asked is None and time.monotonic() - began > WRITTEN_WITHIN:
+            return None
+        if asked is not None and (not opened or asked.get(RECORDINGS) is not None):
+            return asked
+        with suppress(Busy), workspace.locked():
+            return None
+        if not announced:
+            say(f"waiting until {busy.who} says what it was asked for, or ends")
+            announced = True
+        time.sleep(pause)
+
+
+def _read(workspace: Workspace) -> Asked | None:
+    """Of the process that holds the directory; None if it has written nothing."""
+    holder = workspace.holder
+    try:
+        written = json.loads((workspace.root / FILE).read_text())
+    except FileNotFoundError:
+        return None
+    return written["asked"] if holder is not None and written["holder"] == holder.token else None

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -21,9 +22,9 @@ from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli import tokenize as cli_tokenize
 from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
-from experiments.preparing import sources
+from experiments.preparing import asked, pipeline, sources
 from experiments.preparing.asked import write_asked
-from experiments.preparing.store import say_unreached_rates
+from experiments.preparing.sources import say_unreached_rates
 from experiments.progress import Eta
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting
@@ -52,6 +53,14 @@ def whole(data, tokenizer, tmp_path_factory):
     out = tmp_path_factory.mktemp("whole")
     assert main(["tokenize", *SMOKE, "--out", str(out), *data, *tokenizer, "--batch", "3", "--threads", "1"]) == 0
     return made(out)
+
+
+@pytest.fixture(autouse=True)
+def soon():
+    """Most tests hold the directory as another command does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asked, "WRITTEN_WITHIN", 0.2)
+        yield
 
 
 def made(out: Path) -> dict[str, bytes]:
@@ -102,9 +111,10 @@ def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does
     assert "sharing the work with process" in capsys.readouterr().out
 
 
-def test_who_joins_leaves_the_windows_to_a_living_holder_that_has_frozen_them(data, tokenizer, tmp_path):
-    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
+def test_who_joins_leaves_the_windows_to_a_living_holder_that_has_frozen_them(data, tokenizer, tmp_path, capsys):
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer, "--set", "rate=50"]
     assert main(arguments) == 0
+    assert "note: a rate above that of the recording is not reached" in capsys.readouterr().out
     before = (tmp_path / "eval_manifest.json").stat().st_mtime_ns
     with Workspace(tmp_path).locked():
         assert main(arguments) == 0
@@ -132,31 +142,54 @@ def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, 
     with Workspace(tmp_path).locked():
         assert main([*arguments, *data[:2]]) == 2
         assert f"datasets: 2 -> 1, without {BASE.name}" in capsys.readouterr().err.replace("\n", " ")
-        write_asked(setting.study, setting.workspace, found, sources.check_sources(setting.study, found), None)
+        write_asked(setting.study, setting.workspace, found, None)
         assert main([*arguments, *data, *tokenizer, "--set", "store.min_val=1", "--set", "model.frames=3"]) == 2
         message = capsys.readouterr().err
         assert "cannot be shared" in message and "--tokenizer: 'not given' -> '" in message
         assert "store.min_val: 2 -> 1" in message and "model.frames: " in message
+        told = json.loads((tmp_path / asked.FILE).read_text())
+        del told["asked"]["entries"]
+        (tmp_path / asked.FILE).write_text(json.dumps(told))
+        assert main([*arguments, *data]) == 2 and "of an earlier version" in capsys.readouterr().err
     assert not (tmp_path / "tokens").exists()
 
 
 def test_who_has_other_recordings_or_entries_of_the_same_names_does_not_join(
     data, tokenizer, tmp_path, capsys, monkeypatch
 ):
-    """It tokenised them for hours before it was refused."""
+    """Not even while the holder opens its datasets, which takes hours without an index."""
+    opening, opened, check = threading.Event(), threading.Event(), asked.check_sources
+
+    def check_slowly(*arguments):
+        if not opening.is_set():  # the holder
+            opening.set()
+            assert opened.wait(60)
+        return check(*arguments)
+
+    monkeypatch.setattr(asked, "check_sources", check_slowly)
+    monkeypatch.setattr(asked, "WRITTEN_WITHIN", 60.0)
+    ended = threading.Event()
+    monkeypatch.setattr(pipeline, "adopt_tokenizer", lambda *_: ended.wait(60) and stop())
     monkeypatch.setattr(cli_tokenize, "_freeze", lambda *_: stop())
-    setting = make_setting(StudyArguments("smoke", tmp_path, tuple(data[1:]), tokenizer=Path(tokenizer[1])))
-    found = sources.find_sources(setting.study, setting.data)
     other = str(write_rlds(tmp_path / "other", ARM, LENGTHS[::-1]))
     (tmp_path / "my.toml").write_text(to_toml(replace(BASE, hz=BASE.hz + 1)))
-    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), "--data", other, data[2], *tokenizer]
-    with Workspace(tmp_path).locked():
-        opened = sources.check_sources(setting.study, found)
-        write_asked(setting.study, setting.workspace, found, opened, setting.tokenizer)
-        assert main([*arguments, "--registry", str(tmp_path / "my.toml")]) == 2
-        message = capsys.readouterr().err
-        assert "cannot be shared" in message and f"data.{ARM.name}.recordings: " in message
-        assert f"data.{BASE.name}.entry.hz: {BASE.hz} -> {BASE.hz + 1}" in message
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *tokenizer]
+    with ThreadPoolExecutor(1) as pool:
+        holder = pool.submit(main, [*arguments, *data])
+        try:
+            assert opening.wait(60)
+            assert main([*arguments, *data, "--set", "store.min_val=1"]) == 2
+            message = capsys.readouterr().err
+            assert "cannot be shared" in message and "store.min_val: 2 -> 1" in message
+            threading.Timer(0.5, opened.set).start()
+            assert main([*arguments, "--data", other, data[2]]) == 2
+            assert f"recordings.{ARM.name}: " in capsys.readouterr().err
+            assert main([*arguments, *data, "--registry", str(tmp_path / "my.toml")]) == 2
+            assert f"entries.{BASE.name}.hz: {BASE.hz} -> {BASE.hz + 1}" in capsys.readouterr().err
+        finally:
+            opened.set()
+            ended.set()
+        assert isinstance(holder.exception(60), Stopped)
     assert not (tmp_path / "tokens").exists()
 
 
