@@ -12,8 +12,7 @@ from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import find_accelerators
 from experiments.running.trial import Trial
 from experiments.setting import Setting
-from experiments.study import Study, most_trajectories
-from experiments.sweeps.episodes import count_trained_on
+from experiments.study import Study, count_trained_on, most_trajectories
 from experiments.sweeps.sweep import Sweep
 from experiments.words import counted, few, in_thousands
 
@@ -57,13 +56,13 @@ def say_points(setting: Setting, sweeps: Sequence[Sweep]) -> None:
     """A line on the axis trajectories where it has fewer points on the user's datasets than in the preset, and on the
     axis datasets where it has only one; none where the user chose them."""
     study, planned = setting.study, {sweep.name for sweep in sweeps}
-    chosen = {one.partition("=")[0].strip() for one in setting.arguments.set}
-    caps, names, most = study.trajectory_counts, study.dataset_names(), most_trajectories(study.dataset_names())
+    chosen = setting.arguments.chosen()
+    caps, names, most = study.trajectory_counts, study.dataset_names(), most_trajectories(study)
     dropped = [cap for cap in get_preset(setting.arguments.preset).trajectory_counts if cap not in caps]
     if "trajectories" in planned and "trajectory_counts" not in chosen and dropped and most:
         others = f"; for other points: --set trajectory_counts={_parts(most)}" if most > 1 else ""
         say(
-            f"note: by the registry no dataset has more than {most:,} trajectories, so the axis trajectories has "
+            f"note: by the registry no dataset has more than {most:,} trajectories to train on, so the axis trajectories has "
             f"{_listed(caps)}, without {_listed(dropped)}, which would train on the same{others}"
         )
     if "datasets" in planned and "dataset_counts" not in chosen and len(study.dataset_counts) == 1 and len(names) > 1:

@@ -21,7 +21,7 @@ from experiments.program import PROGRAM
 from experiments.progress import say
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
-from experiments.study import Study, on_tokenizer, on_user_data
+from experiments.study import Study, on_tokenizer, on_user_data, without_equal_caps
 from experiments.words import few
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.run_lock import is_address
@@ -83,6 +83,10 @@ class StudyArguments:
             registry=whole(self.registry),
             tokenizer=whole(self.tokenizer),
         )
+
+    def chosen(self) -> tuple[str, ...]:
+        """The settings that --set changes, each once."""
+        return tuple(dict.fromkeys(one.partition("=")[0].strip() for one in self.set))
 
     def words(self) -> list[str]:
         """The arguments that give this."""
@@ -161,6 +165,8 @@ def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Set
 
         study = on_tokenizer(study, load_config(arguments.tokenizer))
     study = override(study, arguments.set, model)
+    if (data or arguments.mixture) and "trajectory_counts" not in arguments.chosen():
+        study = without_equal_caps(study)
     say_unmatched(arguments.registry, study.all_names())
     if arguments.mesh is not None:
         sizes = dict(zip(("data", "fsdp", "tensor"), arguments.mesh, strict=True))

@@ -10,9 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, check_bounds
+from data_pipelines.sampling.splits import (
+    MAX_VAL,
+    MAX_VAL_FRACTION,
+    MIN_VAL,
+    VAL_FRACTION,
+    check_bounds,
+    count_held_out,
+)
 from hma_jax.config import (
     AnyTokenizerConfig,
     EvalConfig,
@@ -28,6 +35,9 @@ from hma_jax.config import (
     require,
 )
 from hma_jax.config.base import require_seed
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
 
 SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
@@ -267,21 +277,37 @@ class Study:
 
 
 def on_user_data(study: Study, names: Sequence[str]) -> Study:
-    """The same study on the user's datasets: numbers of datasets beyond what there is are cut to it. Of numbers of
-    trajectories that no dataset has, only the last is left: with the others a trial would be trained on the same."""
+    """The same study on the user's datasets: numbers of datasets beyond what there is are cut to it."""
     counts = tuple(sorted({min(c, len(names)) for c in study.dataset_counts} | {len(names)}))
+    return replace(study, datasets=tuple(names), dataset_counts=counts, unseen=())
+
+
+def without_equal_caps(study: Study) -> Study:
+    """The same study, where of numbers of trajectories that no dataset has to train on only the last is left: with the
+    others a trial would be trained on the same."""
     *caps, last = study.trajectory_counts
-    if most := most_trajectories(names):
-        caps = [cap for cap in caps if cap < most]
-    return replace(study, datasets=tuple(names), dataset_counts=counts, trajectory_counts=(*caps, last), unseen=())
+    most = most_trajectories(study) or last
+    return replace(study, trajectory_counts=(*(cap for cap in caps if cap < most), last))
 
 
-def most_trajectories(names: Sequence[str]) -> int | None:
-    """Trajectories of the largest of these datasets, as the registry says; None where it does not say it of all."""
+def most_trajectories(study: Study) -> int | None:
+    """Training trajectories of the largest dataset, as the registry says; where it does not say how many are held out,
+    with those. None where it does not say it of all."""
     from data_pipelines.registry import find_spec
 
-    counts = [spec.episodes if (spec := find_spec(name)) else 0 for name in names]
+    specs = [find_spec(name) for name in study.dataset_names()]
+    counts = [count_trained_on(spec, study.store) or spec.episodes if spec else 0 for spec in specs]
     return max(counts) if all(counts) else None
+
+
+def count_trained_on(spec: DatasetSpec, settings: StoreConfig) -> int | None:
+    """Trajectories that the registry says a dataset has, less those that are held out by hash, as if none was damaged
+    and joined datasets were one. None where it does not say how many there are, or how many are in the split that is
+    held out."""
+    if not spec.episodes or spec.val_split:
+        return None
+    bounds = settings.val_fraction, settings.min_val, settings.max_val, settings.max_val_fraction
+    return spec.episodes - count_held_out(spec.episodes, *bounds)
 
 
 def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:

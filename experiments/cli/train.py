@@ -337,9 +337,10 @@ def _require_no_tokenizer_training(setting: Setting, replace: Step | None) -> No
 
 def _say_swept(setting: Setting) -> None:
     """Names the settings that were given and only sweeps have."""
-    paths = dict.fromkeys(one.partition("=")[0].strip() for one in setting.arguments.set)
     first, *more = setting.study.seeds
-    names = {path: "seeds beyond the first" if path == "seeds" and more else path for path in paths}
+    names = {
+        path: "seeds beyond the first" if path == "seeds" and more else path for path in setting.arguments.chosen()
+    }
     without = [name for path, name in names.items() if name != "seeds" and path.split(".")[0] in SWEPT]
     if without:
         say(f"note: one model is trained, of seed {first}; without effect: {', '.join(without)}")

@@ -12,16 +12,12 @@ Expected outcome: perplexity falls and flattens where only the largest robots st
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from experiments.program import run_sweep
-from experiments.study import StoreConfig, Study
+from experiments.study import Study, count_trained_on
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
 from experiments.words import counted, few
 from hma_jax.config import require
-
-if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
 
 
 def plan(study: Study) -> Sweep:
@@ -82,18 +78,6 @@ def count_episodes(study: Study, cap: int | None) -> int:
     episodes |= known
     most = study.trajectory_counts[-1]
     return sum(min(episodes[name], most, cap or most) for name in study.dataset_names())
-
-
-def count_trained_on(spec: DatasetSpec, settings: StoreConfig) -> int | None:
-    """Trajectories that the registry says a dataset has, less those that are held out by hash, as if none was damaged
-    and joined datasets were one. None where it does not say how many there are, or how many are in the split that is
-    held out."""
-    from data_pipelines.sampling.splits import count_held_out
-
-    if not spec.episodes or spec.val_split:
-        return None
-    bounds = settings.val_fraction, settings.min_val, settings.max_val, settings.max_val_fraction
-    return spec.episodes - count_held_out(spec.episodes, *bounds)
 
 
 if __name__ == "__main__":

@@ -125,8 +125,8 @@ def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):
     words = ("study", "--dry-run", *data, "--out", str(tmp_path / "out"))
     caps, counts = said_by(capsys, *words)[1:]
     assert caps == (
-        "note: by the registry no dataset has more than 8 trajectories, so the axis trajectories has 4 and 500, without "
-        "32, which would train on the same; for other points: --set trajectory_counts=2,4,8"
+        "note: by the registry no dataset has more than 6 trajectories to train on, so the axis trajectories has 4 and "
+        "500, without 32, which would train on the same; for other points: --set trajectory_counts=2,3,6"
     )
     assert counts == (
         "note: the axis datasets has one point, with all 2 datasets; for more, all judged on 1 dataset: --set "

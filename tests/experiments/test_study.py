@@ -14,7 +14,7 @@ from experiments.presets import ACCELERATOR, CPU, PAPER, PRESETS, SMOKE, get_pre
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.setting import Preset
-from experiments.study import on_user_data
+from experiments.study import on_user_data, without_equal_caps
 from experiments.sweeps import datasets, trajectories, width
 from experiments.sweeps.sweep import reference_trial, unique_trials
 from hma_jax.config import ConfigError, MeshConfig
@@ -23,6 +23,7 @@ from hma_jax.model.hma import declare_model
 from hma_jax.training.optimizer import learning_rate_multiplier
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
+from tests.data_pipelines.fakes import make_spec
 from tests.tiny import TABLE, random_batch
 
 PLANS = (datasets.plan, trajectories.plan, width.plan)
@@ -108,14 +109,19 @@ def test_user_data_cuts_the_counts():
     assert on_user_data(CPU, list("abcdefg")).dataset_counts == (5, 7)
 
 
-def test_caps_that_would_train_on_the_same_data_are_no_points_of_their_own():
+def test_caps_that_would_train_on_the_same_data_are_no_points_of_their_own(monkeypatch):
     """The last one stays what it is: every trial is trained with it, and an entry's count may be too small."""
-    study = on_user_data(ACCELERATOR, ["bridge_dataset", "droid_sample"])  # 25 and 7
-    assert study.trajectory_counts == (10, 1000)
-    assert reference_trial(study, 0).max_trajectories == 1000
-    assert on_user_data(ACCELERATOR, ["droid_sample"]).trajectory_counts == (1000,)
-    for name in ("droid", "bridge_data_v2"):  # many, and an unknown number
-        assert on_user_data(ACCELERATOR, ["droid_sample", name]).trajectory_counts == ACCELERATOR.trajectory_counts
+    sizes = {"bridge_dataset": 105, "droid_sample": 7}  # 100 and 5 to train on
+    monkeypatch.setattr("data_pipelines.registry.find_spec", lambda n: replace(make_spec(n), episodes=sizes.get(n, 0)))
+
+    def caps(*names: str, **store: int) -> tuple[int, ...]:
+        study = on_user_data(replace(ACCELERATOR, store=replace(ACCELERATOR.store, **store)), names)
+        return without_equal_caps(study).trajectory_counts
+
+    assert caps("bridge_dataset", "droid_sample") == (10, 30, 1000)
+    assert caps("bridge_dataset", max_val=2) == (10, 30, 100, 1000)
+    assert caps("droid_sample") == (1000,)
+    assert caps("droid_sample", "of_unknown_size") == ACCELERATOR.trajectory_counts
 
 
 def test_the_widths_of_a_sweep_do_not_bound_a_single_model():
