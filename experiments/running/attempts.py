@@ -26,6 +26,7 @@ from typing import Any
 
 from data_pipelines.publishing.output_lock import OutputLock, find_held_lock, lock_output
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
+from experiments.running.shared_disk import patient
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
 
@@ -137,8 +138,8 @@ def _signal(code: int) -> int:
 
 def read_states(ids: Sequence[str], trials: Path, ledger: Ledger) -> dict[str, State]:
     """The state of each trial. A result on disk is the truth; the ledger may lag behind it."""
-    recorded = ledger.states()
-    return {id: _state(trials / id, recorded.get(id)) for id in ids}
+    recorded = patient(ledger.states)
+    return {id: patient(_state, trials / id, recorded.get(id)) for id in ids}
 
 
 def _state(directory: Path, record: dict[str, Any] | None) -> State:

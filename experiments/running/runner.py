@@ -33,6 +33,7 @@ from experiments.running.attempts import (
 )
 from experiments.running.launchers.base import Launcher
 from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
+from experiments.running.shared_disk import patient
 from hma_jax.config import ConfigError
 from hma_jax.runtime.files import write_file
 
@@ -147,7 +148,7 @@ class _Run:
         chosen = self._runnable()[:room]
         if not chosen or time.monotonic() < self.relaunch_at:
             return
-        directories = [self._prepare(job, state) for job, state in chosen]
+        directories = [patient(self._prepare, job, state) for job, state in chosen]
         now = time.monotonic()
         try:
             handles = self.launcher.launch(directories)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.running import runner, trial_main
+from experiments.running import attempts, ledger, runner, shared_disk, trial_main
 from experiments.running.attempts import attempt, read_states
 from experiments.running.children import child_environment
 from experiments.running.launchers.local import LocalLauncher
@@ -142,6 +142,22 @@ def test_a_shared_disk_that_does_not_answer_once_stops_no_sweep(tmp_path, monkey
     monkeypatch.setattr(Path, "read_text", sometimes)
     states = run(tmp_path, [job("a", "full disk"), job("b")], workers=2)
     assert failed and {state.event for state in states.values()} == {"finished"}
+
+
+@pytest.mark.parametrize(("module", "name"), [(ledger, "naming"), (runner, "write_file"), (attempts, "is_alive")])
+def test_nor_does_one_that_takes_no_line_job_or_lock_once(tmp_path, monkeypatch, module, name):
+    act, failed = getattr(module, name), []
+
+    def sometimes(*arguments):
+        if not failed:
+            failed.append(name)
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+        return act(*arguments)
+
+    monkeypatch.setattr(shared_disk, "WAITS", (0.01,))
+    monkeypatch.setattr(module, name, sometimes)
+    assert run(tmp_path, [job("a")])["a"].event == "finished" and failed
+    assert events(tmp_path, "a") == ["running", "finished"]
 
 
 def test_progress_that_cannot_be_written_ends_no_trial(tmp_path):

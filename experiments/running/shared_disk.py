@@ -1,0 +1,31 @@
+"""A shared disk that does not answer for a while, as when its server starts anew."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from data_pipelines.sources.rlds.location import IO_ERRNOS
+
+WAITS = (1.0, 2.0, 4.0, 8.0, 15.0)
+"""Seconds before each further try."""
+
+T = TypeVar("T")
+
+log = logging.getLogger(__name__)
+
+
+def patient(act: Callable[..., T], *arguments: object) -> T:
+    """What `act` returns, which may be done twice. Raises OSError: that of a disk that fails, such as ESTALE, after the
+    last try only."""
+    for wait in WAITS:
+        try:
+            return act(*arguments)
+        except OSError as error:
+            if error.errno not in IO_ERRNOS:
+                raise
+            log.warning("%s; trying again in %.0f s", error, wait)
+        time.sleep(wait)
+    return act(*arguments)
