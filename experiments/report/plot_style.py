@@ -70,11 +70,15 @@ STYLE = {
 
 
 def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
-    """Those of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity), or the
-    usual ones while none has finished. Errors of actions are drawn where no frames are predicted."""
+    """Those of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity), as
+    `choose_metrics` says."""
     measured = {r.metric for r in rows if r.sweep in sweeps}
-    available = [m for m in LABELS if EXP_OF.get(m, m) in measured]
-    return [m for m in available if m != "action_error"] or available or USUAL
+    return choose_metrics([m for m in LABELS if EXP_OF.get(m, m) in measured], USUAL)
+
+
+def choose_metrics(measured: list[str], usual: list[str]) -> list[str]:
+    """Errors of actions are shown where no frames are predicted; the `usual` ones while nothing is measured."""
+    return [m for m in measured if m != "action_error"] or measured or usual
 
 
 def drawn_curve(
@@ -120,7 +124,7 @@ def save(figure: plt.Figure, path: Path) -> None:
 
 class LogTicks(Locator):
     """Three to nine ticks: at the fewest round numbers of each decade, or evenly spaced ones, that have one near each
-    end of the axis."""
+    end of the axis; on a long one at every second decade, or third, ..."""
 
     DECADES = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 5), (1, 1.5, 2, 3, 4, 5, 7))
     NEAR = 0.2  # of the length of the axis
@@ -132,8 +136,10 @@ class LogTicks(Locator):
         low, high = sorted((vmin, vmax))
         powers = [10.0**e for e in range(math.floor(math.log10(low)), math.ceil(math.log10(high)))]
         decades = ([m * power for power in powers for m in (*subs, 10)] for subs in self.DECADES)
+        sparse = ([p for p in powers if round(math.log10(p)) % n == 0] for n in range(2, len(powers) // 2))
         even = (MaxNLocator(nbins=n, steps=(1, 2, 2.5, 5, 10), min_n_ticks=3) for n in range(6, 9))
-        each = (sorted({*ticks}) for ticks in (*decades, *(place.tick_values(low, high) for place in even)))
+        linear = (place.tick_values(low, high) for place in even if high < 10 * low)
+        each = (sorted({*ticks}) for ticks in (*decades, *sparse, *linear))
         each = ([t for t in ticks if low <= t <= high] for ticks in each)
         each = [ticks for ticks in each if 3 <= len(ticks) <= 9]
 
@@ -141,7 +147,7 @@ class LogTicks(Locator):
             """The longer part beyond the outermost ticks, of the length of the axis."""
             return math.log(max(ticks[0] / low, high / ticks[-1])) / math.log(high / low)
 
-        return next((ticks for ticks in each if bare(ticks) <= self.NEAR), min(each, key=bare))
+        return next((ticks for ticks in each if bare(ticks) <= self.NEAR), None) or min(each, key=bare)
 
 
 def plain_number(value: float) -> str:

@@ -15,6 +15,7 @@ from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.optima import Optimum
 from experiments.report.pieces import pm, table
 from experiments.report.plot_families import ROLES
+from experiments.report.plot_style import USUAL, choose_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.words import counted
@@ -115,9 +116,9 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
 
 
 def _columns(sweep: Sweep, rows: Sequence[Row], role: str = POINT) -> dict[str, dict[float, CurvePoint]]:
-    """{metric: {x: point}} of the metrics that there are; of errors of actions where no frames are predicted."""
+    """{metric: {x: point}} of the metrics that there are, as `choose_metrics` says."""
     measured = {r.metric for r in rows if r.sweep == sweep.name}
-    metrics = [m for m in HEADINGS if m in measured and m != "action_error"] or ["action_error"]
+    metrics = choose_metrics([m for m in HEADINGS if m in measured], [HELD_OUT_LOSS, *USUAL])
     return {m: {p.x: p for p in curve(rows, sweep.name, m, role, robots_vary=sweep.robots_vary)} for m in metrics}
 
 

@@ -117,7 +117,17 @@ def test_a_curve_s_table_has_its_controls():
     )
 
 
-@pytest.mark.parametrize(("low", "high"), [(27, 66), (33, 72), (26.4, 95), (1.04, 1.6), (0.011, 0.9), (2, 9)])
+def test_a_table_without_a_finished_trial_has_the_columns_of_frames():
+    from experiments.sweeps.width import plan
+
+    said = describe(plan(CPU_FULL), [], [], AxisStatistics())
+    assert "perplexity</th>" in said and "error of actions" not in said
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(27, 66), (33, 72), (26.4, 95), (1.04, 1.6), (0.011, 0.9), (2, 9), (1e-10, 1), (2e-13, 30), (1e-40, 1e4)],
+)
 def test_a_log_axis_has_a_tick_near_each_of_its_ends(low, high):
     """The best variants stood left of the first one."""
     ticks, near = LogTicks().tick_values(low, high), (high / low) ** 0.2
