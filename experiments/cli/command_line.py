@@ -80,7 +80,7 @@ def repeat_option(arguments: Sequence[str]) -> str:
             continue
         given = [*itertools.takewhile(lambda word: not word.startswith("-"), arguments[n + 1 :])]
         settings = [word for word in given if re.match(r"[\w.]+=", word)]
-        if len(given) > 1 and "=" not in given[0]:
+        if len(given) > 1 and "=" not in given[0] and given[0].split(".")[-1] != "help":  # which takes no value
             settings = [f"{given[0]}={given[1]}"]
         elif len(settings) < 2:
             continue

@@ -122,6 +122,7 @@ def test_a_mistyped_option_is_answered_by_its_own_command(columns, monkeypatch, 
         ("train --set train.steps 10", "--set train.steps=10"),
         ("study --launcher-set gpus=8 cpus=64", "--launcher-set gpus=8 --launcher-set cpus=64"),
         ("sweep width --set tau=1 wide", None),
+        ("evaluate --set model.help runs/x --stepz 3", None),
         ("train --preset cpu --out DIR more=1", None),
     ],
 )
