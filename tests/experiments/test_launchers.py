@@ -273,7 +273,7 @@ def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_pat
     assert (copy.directory, copy.cache) == (attempt.directory, attempt.cache)
 
 
-@pytest.mark.parametrize(("grace", "to_save"), [(600, 590), (12, 6)])
+@pytest.mark.parametrize(("grace", "to_save"), [(600, 590), (12, 20), (0, 20)])
 def test_a_trial_has_the_grace_of_its_job_to_save(tmp_path, monkeypatch, grace, to_save):
     pytest.importorskip("submitit", reason="needs the extra `slurm`")
     fake, submitted = FakeSlurm(tmp_path / "slurm", monkeypatch), []

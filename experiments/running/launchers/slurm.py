@@ -40,6 +40,10 @@ OVER = ASKED_TO_STOP | {COMPLETED, "BOOT_FAIL", "DEADLINE", "FAILED", "NODE_FAIL
 REQUEUE = 10.0
 """Seconds of a job's `grace` that submitit gets to put it back into the queue; the trial has the others to save."""
 
+LEAST_TO_SAVE = 20.0
+"""Seconds that a trial gets to save, however short `grace` is: before a pre-emption, of which SIGUSR2 tells too, the
+time is the partition's. If the job is over before them, the runner submits the trial again."""
+
 LINGER = 30.0
 """Seconds for a job's last words to reach this machine through a shared disk."""
 
@@ -103,7 +107,7 @@ class SlurmLauncher(Launcher):
         executor: Any = None,
     ):
         self._root, self._command = root, command
-        self._grace = max(settings.grace - REQUEUE, settings.grace / 2)
+        self._grace = max(settings.grace - REQUEUE, LEAST_TO_SAVE)
         self._executor = executor or _make_executor(root / "slurm", workers, settings)
         self._polled = -math.inf
         self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
