@@ -28,6 +28,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -120,14 +121,26 @@ def goal_image(task: Task, seed: int, size: int, stride: int) -> np.ndarray:
 
 
 def expert_end(task: Task, seed: int, stride: int) -> Environment:
-    """Where an expert without noise is that has twice the time of an episode, of `stride` actions a frame."""
+    """Where an expert without noise is that has twice the time of an episode."""
     spec = noisy(task, 0.0)
     world, seen = World(spec, [seed]), Environment(spec)
     expert = make_expert(world, 0)
-    for _ in range(2 * task.frames * stride):
+    for _ in range(count_expert_actions(task, stride)):
         world.step(expert.act().astype(np.float64))
     seen.set_state(world.state)
     return seen
+
+
+def count_expert_actions(task: Task, stride: int) -> int:
+    """`stride`: actions of a frame."""
+    return 2 * task.frames * stride
+
+
+def pinned(settings: Settings, stride: int) -> dict[str, Any]:
+    """The settings, and what earlier versions had fewer of for models with several actions a frame: an outcome of
+    theirs is one of another goal."""
+    more = {"expert_actions": count_expert_actions(settings.make_task(), stride)} if stride > 1 else {}
+    return asdict(settings) | more
 
 
 def run_planner(search: Search, model: Model, robot: Robot, settings: Settings, seed: int, size: int) -> dict:
@@ -271,7 +284,7 @@ def main() -> None:
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = settings.start_seeds()
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
-    pin_settings(out, run, simulator, asdict(settings))
+    pin_settings(out, run, simulator, pinned(settings, robot.stride))
     (out / "trials").mkdir(exist_ok=True)
     places = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
     wanted = [way for way in WAYS if way in wanted or all(path.exists() for path in places[way])]  # tables are of all

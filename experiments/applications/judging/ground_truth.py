@@ -77,14 +77,16 @@ class SimulatedTruth:
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
-        return {}
+        """Demonstrations that are longer than asked for were not so in earlier versions."""
+        frames = self._demonstrated_frames()
+        return {"demonstrated_frames": frames} if frames != self.config.demonstration_frames else {}
+
+    def _demonstrated_frames(self) -> int:
+        asked, task = self.config.demonstration_frames, self.config.task
+        return max(asked, task.frames) if task.hold > asked // 2 else asked  # or too few are left to reach the goal in
 
     def demonstrations(self) -> Demonstrations:
-        config, task = self.config, self.config.task
-        frames = config.demonstration_frames
-        if task.hold > frames // 2:  # too few would be left to reach the goal in
-            frames = max(frames, task.frames)
-        task = replace(task, frames=frames)
+        config, task = self.config, replace(self.config.task, frames=self._demonstrated_frames())
         with self._step(f"record {config.demonstrations} demonstrations"):
             made = record(
                 task,

@@ -83,8 +83,9 @@ def test_demonstrations_are_as_long_as_the_task_where_little_is_left_of_them_to_
     task = find_task("gripper_wood", frames=lasts, hold=hold)
     robot = SimpleNamespace(name="gripper_wood", action_dim=4, stride=1)
     learned = SimpleNamespace(tokenizer=SimpleNamespace(image_size=8))
-    made = SimulatedTruth(replace(ASKED, task=task), robot, learned, step).demonstrations()
-    assert made.actions.shape[1] == frames
+    truth = SimulatedTruth(replace(ASKED, task=task), robot, learned, step)
+    assert truth.demonstrations().actions.shape[1] == frames
+    assert truth.about() == ({} if frames == ASKED.demonstration_frames else {"demonstrated_frames": frames})
 
 
 @pytest.mark.parametrize("kind", ["cloned", "diffusion"])
