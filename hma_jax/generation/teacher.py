@@ -5,41 +5,50 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import DecodeConfig
+from hma_jax.config import DecodeConfig, require
+from hma_jax.config.base import require_shapes
 from hma_jax.generation.decoding import Frame, decode_frame
 from hma_jax.generation.rollout import fold_in
+from hma_jax.model.given import Array, as_frames, require_keys, require_known
 from hma_jax.model.hma import HMA, Outputs, causal_mask
 from hma_jax.model.teacher_forcing import teacher_forced_pass
 
 
 def next_frame_outputs(
     model: HMA,
-    frames: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
-    hidden_BT: jax.Array | None = None,
+    frames: Array,
+    actions_BTU: Array,
+    embodiment_B: Array,
+    hidden_BT: Array | None = None,
 ) -> jax.Array:
     """`Outputs.predictions` for frames 1 .. T-1, each wholly masked after its true past: [B, T - 1, S, Q, V] or
     [B, T - 1, S, D].
+
+    Raises ConfigError for a window that is longer than the model's, for other shapes that do not fit the model or each
+    other, and for unknown ids and robots as `rollout`.
     """
+    frames = _checked_window(model, frames, actions_BTU, embodiment_B, hidden_BT)
     return _fully_masked_pass(model, frames, actions_BTU, embodiment_B, hidden_BT).predictions
 
 
 def next_frames(
     model: HMA,
-    frames: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
+    frames: Array,
+    actions_BTU: Array,
+    embodiment_B: Array,
     key_B: jax.Array,
     decode: DecodeConfig,
-    hidden_BT: jax.Array | None = None,
+    hidden_BT: Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """(predictions, frames): those of `next_frame_outputs`, and frames 1 .. T-1 [B, T - 1, S (, C)] decoded from them,
     each after its true past.
 
     Frame t is drawn from fold_in(key, t), as in `rollout`. M passes over T - 1 masked frames and
-    one over the true ones, where the official evaluation makes M (T - 1) over the window.
+    one over the true ones, where the official evaluation makes M (T - 1) over the window. Raises ConfigError as
+    `next_frame_outputs`.
     """
+    frames = _checked_window(model, frames, actions_BTU, embodiment_B, hidden_BT)
+    require_keys(key_B, len(frames))
     count = frames.shape[1] - 1
     out = _fully_masked_pass(model, frames, actions_BTU, embodiment_B, hidden_BT, cache_frames=count)
     actions = model.align(actions_BTU)[:, 1:]
@@ -66,12 +75,34 @@ def next_frames(
     return out.predictions, _by_window(filled, count)
 
 
+def _checked_window(
+    model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, hidden_BT: Array | None
+) -> Array:
+    """`frames` in the type that the model takes; ConfigError if they, or what comes with them, are not the model's."""
+    batch_time, most = frames.shape[:2], model.config.frames
+    wanted = {
+        "frames": (*batch_time, *model.config.frame_shape),
+        "chunks": (*batch_time, model.table.action_width),
+        "robots": batch_time[:1],
+    }
+    if hidden_BT is not None:
+        wanted["hidden"] = batch_time
+    found = {"frames": frames, "chunks": actions_BTU, "robots": embodiment_B, "hidden": hidden_BT}
+    require_shapes("next frames are predicted of", found, wanted)
+    require(
+        2 <= frames.shape[1] <= most,
+        f"next frames are predicted in windows of 2 to {most} frames, got {frames.shape[1]}; cut longer episodes",
+    )
+    require_known(model.config, model.table, frames, actions_BTU, embodiment_B)
+    return as_frames(model.config, frames)
+
+
 def _fully_masked_pass(
     model: HMA,
-    frames: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
-    hidden_BT: jax.Array | None,
+    frames: Array,
+    actions_BTU: Array,
+    embodiment_B: Array,
+    hidden_BT: Array | None,
     cache_frames: int = 0,
 ) -> Outputs:
     """`teacher_forced_pass` with frames 1 .. T-1 wholly masked."""

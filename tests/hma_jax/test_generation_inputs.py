@@ -1,4 +1,4 @@
-"""What rollouts and sessions take, and what they refuse in words."""
+"""What rollouts, sessions and teacher forcing take, and what they refuse in words."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig
-from hma_jax.generation import advance, rollout, start
+from hma_jax.generation import advance, next_frame_outputs, next_frames, rollout, start
 from tests.tiny import TABLE, lively_params, model_config, shallow_config
 
 
@@ -113,3 +113,37 @@ def test_a_session_goes_on_by_no_chunk_that_is_not_finite():
 
     with pytest.raises(ConfigError, match="the actions are not finite"):
         jax.eval_shape(go_on, params)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": np.zeros((2, 8, 9), np.int32), "actions": np.zeros((2, 8, 14))}, "windows of 2 to 6 frames, got 8"),
+        ({"frames": np.zeros((2, 1, 9), np.int32), "actions": np.zeros((2, 1, 14))}, "windows of 2 to 6 frames, got 1"),
+        ({"actions": np.zeros((2, 4, 7))}, r"next frames are predicted of chunks \(2, 4, 14\), got \(2, 4, 7\)"),
+        ({"robots": np.zeros(1, np.int32)}, r"of robots \(2,\), got \(1,\)"),
+        ({"hidden": np.zeros((2, 3), bool)}, r"of hidden \(2, 4\), got \(2, 3\)"),
+        ({"frames": np.full((2, 4, 9), 64)}, "got ids from 64 to 64, but the model allows 0 to 63"),
+        ({"frames": np.zeros((2, 4, 9))}, "this model's frames are int32, got float64"),
+        ({"robots": np.full(2, 99)}, "got robots from 99 to 99, but the model allows 0 to 2"),
+        ({"actions": np.full((2, 4, 14), np.nan)}, "the actions are not finite"),
+        ({"keys": jax.random.split(jax.random.key(0), 3)}, "2 keys are needed"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_next_frames_are_predicted_of_nothing_that_the_model_does_not_know(changes, message):
+    """A window longer than the model's, or an unknown robot, gave predictions that were not finite and ids of 0."""
+    declared, params = lively_params(shallow_config())
+    given = dict(
+        frames=np.zeros((2, 4, 9), np.int32),
+        actions=np.zeros((2, 4, 14), np.float32),
+        robots=np.zeros(2, np.int32),
+        keys=jax.random.split(jax.random.key(0), 2),
+        hidden=None,
+    )
+    *window, keys, hidden = (given | changes).values()
+    with pytest.raises(ConfigError, match=message):
+        jax.eval_shape(lambda p: next_frames(declared.merge(p), *window, keys, DecodeConfig(), hidden), params)
+    if "keys" not in changes:
+        with pytest.raises(ConfigError, match=message):
+            jax.eval_shape(lambda p: next_frame_outputs(declared.merge(p), *window, hidden), params)
