@@ -39,9 +39,9 @@ DEAF = "the model was trained without actions (train.masking.setting passive), s
 
 
 def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any) -> Simulator:
-    """The learned simulator of a run, with robots and starts: those that lie beside it (`simulator.folder`), otherwise
-    those of the study's directory that the run is in, which may be one of its trials. `options` are those of
-    `Simulator.load`.
+    """The learned simulator of a run, with robots and starts: those that are given, otherwise those that lie beside it
+    (`simulator.folder`) or else of the study's directory that the run is in, which may be one of its trials. `options`
+    are those of `Simulator.load`.
 
     Raises ConfigError where there is no run, or nothing to start from, unless the caller has its own starts.
     """
@@ -51,10 +51,10 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
         options["tokenizer"] = study.tokenizer
     simulator = Simulator.load(run, **options)
     if not (run / ROBOTS).exists():
-        simulator.update_robots(describe_robots(simulator, study))
+        simulator.update_robots((*describe_robots(simulator, study), *(options.get("robots") or ())))
     if own_starts:
         return simulator
-    if not (run / STARTS).exists():
+    if not simulator.starts and not (run / STARTS).exists():
         simulator.starts = find_starts(simulator, study)
     require(
         bool(simulator.starts),

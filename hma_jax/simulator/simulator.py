@@ -95,15 +95,18 @@ class Simulator:
         weights: Weights = "auto",
         **options: Any,
     ) -> Simulator:
-        """Of a training run, with what lies beside it (`folder`); `options` are the constructor's.
+        """Of a training run, with what lies beside it (`folder`); `options` are the constructor's. None is as if it was
+        not given, and robots that are not among those given stay as they are described there.
 
         Raises ConfigError where there is no run, one that predicts no frames, or not the tokenizer that it was trained
         with.
         """
         run = Path(run)
         model = load_model(run, execution, weights)
-        found = {"robots": find_robots(run, model.table), "starts": find_starts(run), "decode": find_decode(run)}
-        return cls(model, find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None), **(found | options))
+        given = {name: value for name, value in options.items() if value is not None}
+        found = {"starts": find_starts(run), "decode": find_decode(run)} | given
+        found["robots"] = (*find_robots(run, model.table), *given.get("robots", ()))  # of one name the last counts
+        return cls(model, find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None), **found)
 
     # --- What there is -----------------------------------------------------------------------------
 

@@ -22,8 +22,9 @@ from experiments.running.workspace import Workspace
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
-from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode
+from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, save_decode, save_robots
 from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import Start
 from tests.experiments.applications.runs import TABLE, make_run
 
 
@@ -77,6 +78,28 @@ def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
     trial = shutil.copytree(run, study / "trials" / "0a" / "run")
     assert Workspace.of_run(trial) == Workspace(study) and Workspace.of_run(study / "model") == Workspace(study)
     assert dict(load_simulator(trial).robots) == dict(load_simulator(run).robots)
+
+
+def test_one_robot_that_is_given_leaves_the_others_and_what_is_not_given_as_they_lie_beside_the_run(run, tmp_path):
+    """All lost what robots.json says of them, and `decode=None` was another way to decode than decode.json's."""
+    study = shutil.copytree(run.parent, tmp_path / "study")
+    known = Simulator.load(study / "model").robots
+    pusher, gripper = (replace(known[name], unit="as recorded") for name in ("pusher_sand", "gripper_wood"))
+    save_robots([pusher, gripper], study / "model" / "robots.json")
+    save_decode(DecodeConfig(3, temperature=0.5), study / "model" / "decode.json")
+    own = replace(pusher, unit="my own")
+    loaded = Simulator.load(study / "model", robots=[own], decode=None, starts=None)
+    assert dict(loaded.robots) == {"pusher_sand": own, "gripper_wood": gripper}
+    assert loaded.decode == DecodeConfig(3, temperature=0.5) and loaded.starts == ()
+
+
+def test_robots_and_starts_that_are_given_are_not_taken_from_the_study(run):
+    pusher = load_simulator(run).robots["pusher_sand"]
+    start = Start("pusher_sand", np.zeros((1, 8, 8, 3), np.uint8), np.zeros((0, 2)))
+    own = replace(pusher, unit="my own")
+    loaded = load_simulator(run, robots=[own], starts=[start])
+    assert loaded.robots["pusher_sand"] == own and loaded.robots["gripper_wood"].keeps
+    assert loaded.starts == (start,)
 
 
 def test_neither_world_is_taken_for_one_that_there_is_not(run):
