@@ -59,11 +59,15 @@ def read_only(images: np.ndarray) -> np.ndarray:
 
 
 def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
-    """`values` as ints. Raises ConfigError for anything else: 0.5 is not truncated to 0."""
+    """`values` as ints. Raises ConfigError for anything else: 0.5 is not truncated to 0, and a mask is no list of
+    numbers."""
     try:
-        return [operator.index(value) for value in values]
-    except TypeError as error:
-        raise ConfigError(f"{what} must be whole numbers, got {values!r}") from error
+        given = list(values)
+        if not any(isinstance(value, bool) for value in given):
+            return [operator.index(value) for value in given]
+    except TypeError:
+        pass
+    raise ConfigError(f"{what} must be whole numbers, got {values!r}")
 
 
 def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:

@@ -92,13 +92,7 @@ class Robot:
 
     def numbers(self, action: ArrayLike) -> np.ndarray:
         """`action` as float32. Raises ConfigError unless it is an array of real numbers."""
-        try:
-            given = np.asarray(action)
-            if given.dtype.kind not in "cSU":  # a cast would drop imaginary parts, and parse text
-                return given.astype(np.float32)
-        except (TypeError, ValueError):  # objects, or lists of different lengths
-            pass
-        raise ConfigError(f"{self.name}: an action is an array of real numbers, got {action!r}")
+        return real_numbers(action, f"{self.name}: an action")
 
     def chunk(self, action: ArrayLike) -> np.ndarray:
         """float32 [stride, A] of one action [A], held for a whole frame, or of a chunk [stride, A].
@@ -136,6 +130,17 @@ class Robot:
             f"{known}, {self.low[d]:g} to {self.high[d]:g}"
             for d in np.flatnonzero(beyond)
         )
+
+
+def real_numbers(values: ArrayLike, what: str) -> np.ndarray:
+    """`values` as float32. Raises ConfigError, which begins with `what`, unless they are an array of real numbers."""
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind not in "cSU":  # a cast would drop imaginary parts, and parse text
+            return given.astype(np.float32)
+    except (TypeError, ValueError):  # objects, or lists of different lengths
+        pass
+    raise ConfigError(f"{what} is an array of real numbers, got {values!r}")
 
 
 def rest_action(low: Sequence[float], high: Sequence[float], mean: Sequence[float]) -> tuple[float, ...]:

@@ -73,6 +73,10 @@ class Simulator:
         )
         differs = token_mismatch(config, tokenizer)
         require(not differs, differs)
+        require(
+            decode is None or isinstance(decode, DecodeConfig),
+            f"decode must be a DecodeConfig, got {type(decode).__name__}",
+        )
         self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
         self.update_robots(robots)
@@ -163,7 +167,8 @@ class Simulator:
         which = chosen_episodes(episodes, len(self))
         each = each_start(starts, len(which))
         if isinstance(seeds, (int, np.integer)):
-            numbers = [seeds + i for i in range(len(which))]
+            [first] = whole_numbers("seeds", [seeds])
+            numbers = [first + i for i in range(len(which))]
         else:
             numbers = whole_numbers("seeds", seeds)
         asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"

@@ -10,6 +10,7 @@ import numpy as np
 
 from hma_jax.config import require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
+from hma_jax.simulator.robots import real_numbers
 
 FILE = "starts.npz"
 
@@ -24,8 +25,8 @@ class Start:
     seed: int | None = None  # with which the robot's true simulator begins the same episode
 
     def __post_init__(self):
-        for name in ("images", "actions"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name)))
+        object.__setattr__(self, "images", np.asarray(self.images))
+        object.__setattr__(self, "actions", real_numbers(self.actions, f"a start of {self.robot}: `actions`"))
         require(
             self.images.dtype == np.uint8 and self.images.ndim == 4 and len(self.images) >= 1,
             f"a start of {self.robot} needs images uint8 [n, H, W, 3], got {self.images.dtype} {self.images.shape}",

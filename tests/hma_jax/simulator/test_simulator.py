@@ -249,10 +249,11 @@ def test_history_bounds_how_far_an_episode_is_taken_back():
 
 def test_a_whole_number_gives_each_episode_a_seed_of_its_own():
     sim, chunk, shown = simulator(episodes=2), chunks_of(1, 1)[0], []
-    for seeds in (4, [4, 5]):
+    for seeds in (255, [255, 256], np.uint8(255)):
         sim.reset(start(1, 2), seeds=seeds)
         shown.append(sim.step([chunk, chunk]))
-    np.testing.assert_array_equal(*shown)
+    for one in shown[1:]:
+        np.testing.assert_array_equal(one, shown[0])
     assert (shown[0][0] != shown[0][1]).any()
 
 
@@ -326,9 +327,16 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
         (lambda sim: sim.reset(start(0, 2), seeds=None), "seeds must be whole numbers, got None"),
         (lambda sim: sim.reset(start(0, 2), episodes=[0, 2]), "numbers below 2"),
         (lambda sim: sim.reset(start(0, 2), episodes=[0.5]), "episodes must be whole numbers"),
+        (lambda sim: sim.reset(start(0, 2), episodes=[True, False]), r"episodes must be whole numbers, got \[True, F"),
+        (lambda sim: sim.reset(start(0, 2), seeds=True), r"seeds must be whole numbers, got \[True\]"),
+        (
+            lambda sim: sim.reset(start(0, 2), seeds=np.uint32(2**32 - 1)),
+            r"seeds must lie in \[0, 2\^32\), got 4294967296",
+        ),
         (lambda sim: sim.rewind(1.5), r"frames must be whole numbers, got \[1.5\]"),
         (lambda sim: sim.branch([1.0, 1.0]), "sources must be whole numbers"),
         (lambda sim: simulator(episodes=1.5), r"episodes must be whole numbers, got \[1.5\]"),
+        (lambda sim: simulator(decode={"unmask_steps": 2}), "decode must be a DecodeConfig, got dict"),
         (lambda sim: simulator(history=1.5), "history must be whole numbers"),
         (lambda sim: sim.max_rewind(-1), r"numbers below 2, got \[-1\]"),
         (lambda sim: sim.last_action(2), r"numbers below 2, got \[2\]"),
@@ -435,7 +443,10 @@ def test_a_window_of_the_model_is_all_of_a_start_that_is_seen():
 
 def test_a_start_may_be_given_as_lists_and_says_what_it_lacks():
     made = Start("arm", np.zeros((2, 1, 1, 3), np.uint8), [[0.0, 1.0]])
-    assert made.actions.shape == (1, 2)
+    assert made.actions.shape == (1, 2) and made.actions.dtype == np.float32
+    for wrong in ([["0.1", "0.2"]], [[object()]], [[1j]], [[0.0], [0.0, 1.0]]):
+        with pytest.raises(ConfigError, match="a start of arm: `actions` is an array of real numbers, got "):
+            Start("arm", made.images, wrong)
     with pytest.raises(ConfigError, match="needs finite actions .* got \\(0,\\)"):
         Start("arm", made.images, [])
 
