@@ -173,8 +173,8 @@ class BaseTokenizer(abc.ABC):
         if self.channels:
             return self._checked_latents(tokens)
         require(
-            tokens.ndim == 2 and tokens.shape[1] == self.tokens,
-            f"the tokenizer decodes ids [B, {self.tokens}], got {list(tokens.shape)}",
+            tokens.dtype.kind in "iu" and tokens.ndim == 2 and tokens.shape[1] == self.tokens,
+            f"the tokenizer decodes ids, integers [B, {self.tokens}], got {tokens.dtype} {list(tokens.shape)}",
         )
         low, high = int(tokens.min(initial=0)), int(tokens.max(initial=0))
         require(

@@ -236,8 +236,13 @@ def test_what_cannot_be_encoded_is_refused(tokenizer):
 
 def test_ids_that_cannot_be_decoded_are_refused(discrete):
     ids = np.zeros((2, 16), np.int32)
-    with pytest.raises(ConfigError, match=r"decodes ids \[B, 16\], got \[2, 9\]"):
-        discrete.decode(ids[:, :9])
+    for given, got in (
+        (ids[:, :9], r"int32 \[2, 9\]"),
+        (ids + 3.7, r"float64 \[2, 16\]"),
+        (ids > 0, r"bool \[2, 16\]"),
+    ):
+        with pytest.raises(ConfigError, match=rf"decodes ids, integers \[B, 16\], got {got}"):
+            discrete.decode(given)
     for wrong in (-1, 64):
         with pytest.raises(ConfigError, match=r"must lie in \[0, 64\)"):
             discrete.decode(ids + wrong)
