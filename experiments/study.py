@@ -215,8 +215,8 @@ class Study:
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")
         require(self.trial_seconds >= 0, f"trial_seconds must not be negative, got {self.trial_seconds:g}")
         require(
-            self.rate is None or self.rate > 0,
-            f"rate, in frames per second, must be positive, or null for the native rate, got {self.rate}",
+            self.rate is None or 0 < self.rate < math.inf,
+            f"rate, in frames per second, must be positive and finite, or null for the native rate, got {self.rate}",
         )
         require(
             self.eval.prompt_frames < self.model.frames + (self.train.masking.setting == "policy"),

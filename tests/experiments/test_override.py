@@ -58,6 +58,7 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("widths=4,8.5", "widths: expected int, got 8.5"),
         ("ablation_seeds=2,1", "ablation_seeds must increase"),
         ("tau=0", "tau must be positive, got 0"),
+        ("rate=Infinity", "rate, in frames per second, must be positive and finite, .* got inf"),
         ("suite.scale=Infinity", "suite.scale must be positive and finite, got inf"),
         ("store.val_fraction=1", r"store.val_fraction must lie in \[0, 1\), got 1"),
         ("store.max_val=1", "store.min_val must lie between 0 and store.max_val, 1, got "),
