@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, training_of, trial_id
 from experiments.study import Study
@@ -153,12 +155,20 @@ def make_sweep(
     """The sweep whose trial at x is `change(reference, x)`, for every seed, plus the control: at the reference, and
     at the ends of a numbered axis if the study wants `end_controls`.
 
-    `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError without `values`, and where
-    the study's reference trial does not stand at `reference_x`: `change` has to leave it there as it is, but for whom
-    it is judged on.
+    `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError without `values` or seeds,
+    and where the study's reference trial does not stand at `reference_x`, one of `values`: `change` has to leave it
+    there as it is, but for whom it is judged on.
     """
     require(len(values) > 0, f"axis {name}: values is empty, so only its control would run; give it positions")
+    values = [x.item() if isinstance(x, np.generic) else x for x in values]  # of an array: settings are JSON
+    require(
+        reference_x in values,
+        f"axis {name}: reference_x {reference_x} is not among the values {tuple(values)}, so its control would have no "
+        "trial beside it; add it",
+    )
+    reference_x = values[values.index(reference_x)]
     seeds = study.seeds if seeds is None else seeds
+    require(len(seeds) > 0, f"axis {name}: seeds is empty; give at least one, or leave it out for the study's")
     unchanged = reference_trial(study, seeds[0], steps)
     changed = change(unchanged, reference_x)
     require(isinstance(changed, Trial), f"axis {name}: change must return a trial, but returned {changed!r}")
@@ -174,7 +184,7 @@ def make_sweep(
         return reference if x == reference_x else change(replace(reference, measure_untrained=False), x)
 
     points = [Point(x, trial(x, seed)) for x in values for seed in seeds]
-    ends = {values[0], values[-1]} if study.designs.end_controls and not labels else set()
+    ends = {min(values), max(values)} if study.designs.end_controls and not labels else set()
     points += [Point(x, control_of(trial(x, seeds[0])), CONTROL) for x in sorted({reference_x, *ends})]
     return Sweep(
         name, axis, scope, tuple(points),

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from experiments.report.draw import draw
 from experiments.running.trial import Trial
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.sweeps.registry import AXES, find_axis, join_axes, keep_axes, plan_sweeps
-from experiments.sweeps.sweep import titles
+from experiments.sweeps.sweep import CONTROL, titles
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
@@ -150,6 +151,18 @@ def plan(study):
 """
 
 
+def test_values_of_an_array_are_numbers_and_the_controls_stand_at_the_ends_of_whatever_order(tmp_path):
+    """An array's were refused as names, and of (3, 1, 10) the least had no control."""
+    path, made = tmp_path / "mine.py", []
+    study = replace(STUDY, designs=replace(STUDY.designs, end_controls=True))
+    for values in ("(3, 1, 10)", "__import__('numpy').array([3, 1, 10])"):
+        path.write_text(OWN.replace("(1, 3)", values).format("replace(trial, tau=x)"))
+        made += plan_sweeps(study, [str(path)])
+    listed, of_array = made
+    assert listed == of_array and {type(p.x) for p in of_array.points} == {int}
+    assert [p.x for p in listed.points if p.role == CONTROL] == [1, 3, 10]
+
+
 def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_path):
     """Its process reads it as a float, and names the trial by that."""
     path = tmp_path / "mine.py"
@@ -172,6 +185,8 @@ def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_pat
         (OWN.format("trial"), "has the same trial at 1 and 3: nothing of it changes there"),
         (OWN.format("None"), "axis own: change must return a trial, but returned None"),
         (OWN.replace("(1, 3)", "()"), "line 5: axis own: values is empty, so only its control would run"),
+        (OWN.replace("(1, 3)", "(1, 10)").format("trial"), r"reference_x 3 is not among the values \(1, 10\)"),
+        (OWN.replace('"it"', '"it", seeds=()').format("trial"), "line 5: axis own: seeds is empty"),
         (
             OWN.replace("study.dataset_names()", "()").format("trial"),
             "trial at 1 is averaged over no robot; list those",
