@@ -171,14 +171,12 @@ class Declared(Generic[M]):
     def init(self, seed: int, shardings: Params | None = None) -> Params:
         """Arrays for every declaration, laid out by `shardings` (default: on the default device).
 
-        Each is a function of (seed, its path) alone, made on the host: adding a parameter does
-        not change the others, nothing is compiled, and a mesh does not matter. One is drawn at a
+        Each is drawn on the host (`draw`): nothing is compiled, and a mesh does not matter. One is drawn at a
         time and placed shard by shard, so that no device ever holds a whole copy of what is split.
         """
 
         def make(path: tuple[Any, ...], spec: ParamSpec, sharding: jax.sharding.Sharding | None = None) -> jax.Array:
-            words = np.frombuffer(hashlib.sha256(path_name(path).encode()).digest(), np.uint32)
-            return place(spec.init(np.random.default_rng([seed, *words.tolist()]), spec.shape), sharding)
+            return place(draw(seed, path, spec), sharding)
 
         given = () if shardings is None else (shardings,)
         return jax.tree.map_with_path(make, self.specs, *given, is_leaf=is_spec)
@@ -228,6 +226,13 @@ def declare(make: Callable[[], M], min_shard_size: int = MeshConfig.min_shard_si
     return Declared(graphdef, nnx.traversals.unflatten_mapping(flat), min_shard_size)
 
 
+def draw(seed: int, path: tuple[Any, ...], spec: ParamSpec) -> np.ndarray:
+    """One array of `Declared.init`, a function of (seed, its path) alone: adding a parameter does not change the
+    others."""
+    words = np.frombuffer(hashlib.sha256(path_name(path).encode()).digest(), np.uint32)
+    return spec.init(np.random.default_rng([seed, *words.tolist()]), spec.shape)
+
+
 def is_spec(leaf: Any) -> bool:
     """For `is_leaf` when mapping over `Declared.specs`."""
     return isinstance(leaf, ParamSpec)
@@ -260,7 +265,7 @@ def inference_params(declared: Declared, params: Params, dtype: str) -> Params:
     are used in float32 (`ParamSpec.precise`), which stay as they are."""
 
     def cast(spec: ParamSpec, x: jax.Array) -> jax.Array:
-        return x if x.ndim < 2 or spec.precise else x.astype(dtype)
+        return x if x.ndim < 2 or spec.precise else x.astype(jnp.dtype(dtype), copy=False)
 
     return jax.tree.map(cast, declared.specs, params, is_leaf=is_spec)
 

@@ -7,6 +7,7 @@ to the old robots' slices; these are zeros, and so are the padded actions that t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,13 +15,13 @@ import numpy as np
 from hma_jax.config import ModelConfig, require
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import EMBODIMENT_AXIS, Params, ParamSpec, is_spec
+from hma_jax.model.params import EMBODIMENT_AXIS, Params, ParamSpec, draw, is_spec
 
 
 def add_embodiments(
     params: Params, model: ModelConfig, table: EmbodimentTable, new: Sequence[Embodiment], seed: int
 ) -> tuple[Params, EmbodimentTable]:
-    """Parameters and table with the `new` robots after those of `table`.
+    """Parameters, in memory of the host, and table with the `new` robots after those of `table`.
 
     Predictions for the old robots do not change by a bit. The new slices are drawn as
     in a model that had the robots from the start, from `seed`. Raises ConfigError for a name that
@@ -31,16 +32,16 @@ def add_embodiments(
     wider = EmbodimentTable((*table.entries, *new))
     declared = declare_model(model, wider)
 
-    def extend(spec: ParamSpec, fresh: np.ndarray, old: jax.Array) -> np.ndarray:
+    def extend(path: tuple[Any, ...], spec: ParamSpec, old: jax.Array | np.ndarray) -> np.ndarray:
         if EMBODIMENT_AXIS not in spec.axes:
             return np.asarray(old)
         # Old slices over the start of every axis; beyond them, in the axis of actions, zeros.
         everywhere = [slice(0, size) for size in old.shape]
         robots = [slice(None)] * old.ndim
         robots[spec.embodiment_axis] = slice(0, table.size)
-        fresh = np.array(fresh)
+        fresh = draw(seed, path, spec)
         fresh[tuple(robots)] = 0
         fresh[tuple(everywhere)] = np.asarray(old)
         return fresh
 
-    return jax.tree.map(extend, declared.specs, declared.init(seed), params, is_leaf=is_spec), wider
+    return jax.tree.map_with_path(extend, declared.specs, params, is_leaf=is_spec), wider

@@ -84,7 +84,8 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
 
 
 def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
-    """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says.
+    """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says, or in memory of the host
+    if it is one of NumPy arrays.
 
     With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing, ReadError if
     one cannot be read now.

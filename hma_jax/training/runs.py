@@ -18,7 +18,7 @@ from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.config.training import PREDICT_FRAMES
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
-from hma_jax.model.params import Declared, Params, inference_params, path_name
+from hma_jax.model.params import Declared, Params, inference_params, path_name, require_params
 from hma_jax.runtime.devices import default_device
 from hma_jax.training.hashes import ReadError
 from hma_jax.training.reading import (
@@ -131,11 +131,11 @@ def require_frames(run: Run, deed: str) -> None:
 def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     """The parameters and description of a run's latest checkpoint; its moments are not read.
 
-    The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint
-    while it is read, a newer one is taken. With several processes all call this, and read the same one. Raises
-    CheckpointError if there is no checkpoint, or it is damaged or foreign, ReadError if it cannot be read now, and
-    ConfigError for an average that the run
-    does not keep, and for weights called otherwise.
+    The parameters lie in memory of the host, as arrays of NumPy: one device may be too small for them. Of a run that
+    is being trained, and removes the checkpoint while it is read, a newer one is taken. With several processes all
+    call this, and read the same one. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign,
+    ReadError if it cannot be read now, and ConfigError for an average that the run does not keep, and for weights
+    called otherwise.
     """
     require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)
@@ -171,11 +171,12 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
         f"{run_dir} keeps no average of its weights (train.ema_decay is 0); use the last weights",
     )
     item = "ema" if averaged and weights != "last" else "params"
-    device = jax.sharding.SingleDeviceSharding(default_device())
-    shapes = declare_model(model, table).shapes()
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), shapes)
+    declared = declare_model(model, table)
+    # Orbax reads into memory of the host what is described by arrays of NumPy; these take none themselves.
+    like = jax.tree.map(lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape), declared.shapes())
     with raised_in_all("parameters"):
-        params = load_items(checkpoint, {item: shapes})[item]
+        params = load_items(checkpoint, {item: like})[item]
+    require_params(declared, params, f"{checkpoint} is not of the model that it describes")
     return Run(
         model,
         from_dict(TrainConfig, described["train"]),
@@ -194,6 +195,11 @@ def load_model(run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig
     `weights` are the last ones, their moving average (`ema`), or the average where the run keeps one
     (`auto`). Raises as `load_run`.
     """
-    run = load_run(run_dir, weights)
+    run = cast_run(load_run(run_dir, weights), execution)
+    return _rebuild(replace(run, params=jax.device_put(run.params, default_device())), execution)
+
+
+def cast_run(run: Run, execution: ExecutionConfig) -> Run:
+    """`run` with its parameters as generation and evaluation use them, where they lie."""
     declared = declare_model(run.model, run.table, execution)
-    return Model(replace(run, params=inference_params(declared, run.params, execution.dtype)), declared, execution)
+    return replace(run, params=inference_params(declared, run.params, execution.dtype))
