@@ -6,7 +6,7 @@ with several it is over seeds and episodes (`bootstrap`), seeds of one name pair
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel
 from experiments.analysis.intervals import NATS, OVERALL, Interval, interval_of, nats_first, overall
 from experiments.analysis.paired import OF_TOKENS, TRUTH, NotComparable, require_same_windows
+from hma_jax.evaluation.controllability import OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
@@ -29,6 +30,7 @@ class Side:
     seeds: Mapping[int, WindowTable]
     tokenizer: str  # "": unknown
     says_seed: bool = True  # False: its seed is unknown, and the key of `seeds` stands in
+    of_study: bool = False  # whether `seeds` are those of a study's reference that are finished
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def compare(a: Side, b: Side) -> list[Difference]:
 
     Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things; of
     retrieval those where the true actions were ranked among another number of others.
-    Raises NotComparable, naming the first window that differs.
+    Raises NotComparable, naming the first window that differs, or that lacks what every window of a sound model has.
     """
     pairs = _pairs(a, b)
     first = pairs[0][0]
@@ -68,8 +70,24 @@ def compare(a: Side, b: Side) -> list[Difference]:
         foreign |= {m for m in shared if m.startswith("retrieval")}
     found = []
     for metric in nats_first(m for m in shared if m not in (*foreign, *NOT_OF_MODELS)):
+        if metric not in OPTIONAL_METRICS:
+            for side, tables in zip((a, b), zip(*pairs, strict=True), strict=True):
+                _require_numbers(side.name, tables, metric, robots)
         found += _of_metric(metric, *_panels(pairs, metric, robots))
     return found
+
+
+def _require_numbers(name: str, tables: Iterable[WindowTable], metric: str, robots: Sequence[str]) -> None:
+    """Raises NotComparable, naming the first window without one: left out, it would favour the model that broke."""
+    for table in tables:
+        own = table.among(robots)
+        lacking = np.flatnonzero(np.isnan(own.metrics[metric]))
+        if len(lacking):
+            robot, episode, start = own.names[lacking[0]]
+            raise NotComparable(
+                f"{name} has no {metric} of window ({robot}, episode {episode}, frame {start}) (and {len(lacking) - 1} "
+                "others): what it predicts there is no number. Compare another model, or train this one again"
+            )
 
 
 def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
@@ -89,8 +107,8 @@ def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> 
 
 
 def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
-    """Of one seed each, whichever these are, or of all seeds that both have."""
-    if len(a.seeds) == len(b.seeds) == 1:
+    """Of all seeds that both have; of two models of one seed each, whichever these are, unless both are of studies."""
+    if len(a.seeds) == len(b.seeds) == 1 and not (a.of_study and b.of_study):
         return [(*a.seeds.values(), *b.seeds.values())]
     shared = [seed for seed in a.seeds if seed in b.seeds]
     if not shared:

@@ -78,7 +78,7 @@ def read_side(path: Path) -> Side:
                 f"{path}: no reference trial of this study ({', '.join(ids.values())}) is finished here; run "
                 f"`{record.command}`, or name two trials"
             )
-        return Side(path.name, seeds, record.provenance.tokenizer)
+        return Side(path.name, seeds, record.provenance.tokenizer, of_study=True)
     if (path / RESULT).exists():
         judged = read_trial(path)
         return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer)

@@ -104,6 +104,9 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
         robots, other_robots = (next(iter(one.seeds.values())).datasets for one in (side, other))
         if left_out := [name for name in robots if name not in other_robots]:
             caption += f" Only {escape(side.name)} was judged on {few(left_out)}: nothing here is of them."
+    if len(a.seeds) == len(b.seeds) == 1 and a.says_seed and b.says_seed and a.seeds.keys() != b.seeds.keys():
+        of_a, of_b = (f"{escape(side.name)} is of seed {next(iter(side.seeds))}" for side in (a, b))
+        caption += f" {of_a}, {of_b}: differences are also those of seeds, which no error counts."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         caption += f" No error of {few(alone)}: one held-out episode."
     explained = {row.metric for row in rows} | set(NOT_OF_MODELS)

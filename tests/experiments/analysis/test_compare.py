@@ -53,6 +53,19 @@ def test_what_some_robots_have_not_is_over_the_others():
     assert rows[OVERALL, "action_nats"].mean == rows[OVERALL, "action_nats"].errors == 0
 
 
+def test_a_model_that_broke_on_some_windows_is_refused():
+    """They were left out of both, and a robot of nothing else vanished from the mean over robots."""
+    a, b = sides()
+    nats = b.seeds[0].metrics["cross_entropy"]
+    broken = with_loss(b.seeds[0], np.where(b.seeds[0].dataset == "r1", np.nan, nats))
+    with pytest.raises(
+        NotComparable, match=r"b has no cross_entropy of window \(r1, episode 100, frame 0\) \(and 47 oth"
+    ):
+        compare(a, replace(b, seeds={0: broken}))
+    other = replace(a, seeds={0: a.seeds[0].among(("r0", "r2"))})
+    assert compare(other, replace(b, seeds={0: broken})), "a robot that is not compared"
+
+
 def test_several_seeds_are_paired_by_name_and_their_scatter_counts():
     a, b = sides(seeds=3)
     rows = {(r.scope, r.metric): r for r in compare(a, b)}

@@ -97,6 +97,23 @@ def test_seeds_of_a_study_that_the_other_has_not_are_left_out_and_it_is_said(tab
     assert "Of the seeds of study (0, 1) only 1 is compared." in said
 
 
+def test_of_other_seeds_two_models_are_compared_and_it_is_said_and_two_studies_are_not(table, tmp_path, capsys):
+    """Of studies with one finished seed each these were paired, whichever they were, without a word."""
+    trials = []
+    for seed, name in enumerate(("one", "two")):
+        workspace = Workspace(tmp_path / name)
+        trials.append(write_trial(workspace.trials, reference_trial(STUDY, seed), table))
+        save_record(workspace, record_of())
+    to = ["--to", str(tmp_path / "c.csv")]
+    assert main(["compare", *(str(tmp_path / n) for n in ("one", "two")), *to]) == 2
+    assert "one has seeds 0 and two 1: none in common" in " ".join(capsys.readouterr().err.split())
+    a, b = trials
+    assert main(["compare", str(a), str(b), *to]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{a.name} is of seed 0, {b.name} is of seed 1: differences are also those of seeds" in said
+    assert main(["compare", str(a), str(a), *to]) == 0 and "also those of seeds" not in capsys.readouterr().out
+
+
 def test_several_seeds_that_are_left_are_compared_in_the_plural(table):
     seeds = under_seeds(table, np.random.default_rng(1), 3, 0.01)
     whole, two = Side("whole", seeds, ""), Side("two", {seed: seeds[seed] for seed in (1, 2)}, "")
