@@ -19,7 +19,7 @@ import numpy as np
 
 from experiments.analysis.fits import FIT_LEVEL, interval
 from experiments.analysis.intervals import HELD_OUT_LOSS
-from experiments.analysis.measured import Position, measure
+from experiments.analysis.measured import NoLevel, Position, measure
 from experiments.analysis.scaling import Curve, fit_curve, noise_near
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
@@ -55,13 +55,14 @@ class Outcome:
     """A prediction and its outcome; `marks` say why it may count for less."""
 
     prediction: Prediction
-    observed: float | None  # None: none of its trials is finished
+    observed: float | None  # None: none of its trials is finished, or nothing says how hard their robots are
     seeds: int
     marks: tuple[str, ...]
 
     @property
     def inside(self) -> bool | None:
-        if self.observed is None:
+        """None before all its trials are finished: the interval is of the mean of them all."""
+        if self.observed is None or self.seeds < len(self.prediction.trials):
             return None
         return self.prediction.low <= self.observed <= self.prediction.high
 
@@ -106,9 +107,11 @@ def predict(
 def compare(
     prediction: Prediction, curves: Sequence[Curve], windows: Mapping[str, WindowTable], hashes: Mapping[str, str]
 ) -> Outcome:
-    """The outcome of a prediction."""
+    """The outcome of a prediction, measured beside what it was made from: where seeds have robots of their own, on the
+    level of these, and not of the seeds that happen to have finished."""
     curve = next((c for c in curves if c.name == prediction.curve), None)
-    finished = [p for p in curve.finished(windows) if p.trial in prediction.trials] if curve else []
+    there = curve.finished(windows) if curve else ()
+    finished = [p for p in there if p.trial in prediction.trials]
     marks = []
     if early := [id for id in prediction.trials if id in prediction.finished or id in prediction.inputs]:
         marks.append(f"made after {', '.join(early)} had run: no prediction")
@@ -116,9 +119,14 @@ def compare(
         marks.append(f"{len(changed)} of the {len(prediction.inputs)} results it was made from changed or are missing")
     if curve is None or not set(prediction.trials) <= {p.trial for p in curve.positions}:
         marks.append("the study does not plan its trials")
-    if finished and len(finished) < len(prediction.trials):
-        marks.append(f"{len(finished)} of its {len(prediction.trials)} trials finished")
-    observed = float(measure(curve.axes, finished, windows, HELD_OUT_LOSS).value.mean()) if finished else None
+    observed = None
+    if curve and finished:
+        beside = [p for p in there if p.trial in prediction.inputs and p not in finished]
+        try:
+            values = measure(curve.axes, [*finished, *beside], windows, HELD_OUT_LOSS).value
+            observed = float(values[: len(finished)].mean())
+        except NoLevel as error:
+            marks.append(str(error))
     return Outcome(prediction, observed, len(finished), tuple(marks))
 
 

@@ -109,7 +109,7 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
     lines = []
     for o in outcomes:
         p = o.prediction
-        observed = "not run yet" if o.observed is None else f"{o.observed:.4f}"
+        observed = f"{o.observed:.4f}" if o.observed is not None else "–" if o.seeds else "not run yet"
         predicted = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
         lines.append([
             html.escape(p.curve), html.escape(p.position), predicted, observed, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",

@@ -251,7 +251,10 @@ def _prediction(outcome: Outcome) -> Check:
     text = f"{p.curve} at {p.position}: predicted {p.mean:.3f} nats ({p.low:.3f} to {p.high:.3f} with {p.level:.0%})"
     if outcome.observed is None:
         verdict: Verdict = "open"
-        text += "; its trials have not run."
+        text += "." if outcome.seeds else "; its trials have not run."
+    elif outcome.inside is None:
+        verdict = "open"
+        text += f"; observed so far {outcome.observed:.3f} ({outcome.seeds} of {counted(len(p.trials), 'trial')})."
     else:
         verdict = "bad" if outcome.marks or not outcome.inside else "good"
         text += f"; observed {outcome.observed:.3f} ({counted(outcome.seeds, 'seed')}), {'inside' if outcome.inside else 'outside'}."

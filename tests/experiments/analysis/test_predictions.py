@@ -12,7 +12,9 @@ import pytest
 
 from experiments.analysis.fits import MIN_POSITIONS, Coefficient
 from experiments.analysis.isoflop import IsoFlop
-from experiments.analysis.predictions import Outcome, Prediction, load_predictions, save_prediction
+from experiments.analysis.measured import Position
+from experiments.analysis.predictions import Outcome, Prediction, compare, load_predictions, save_prediction
+from experiments.analysis.scaling import Curve
 from experiments.cli.main import main
 from experiments.override import override
 from experiments.presets import CPU
@@ -28,6 +30,7 @@ from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import POINT, unique_trials
 from experiments.sweeps.width import plan as plan_width
+from tests.experiments.analysis.test_measured import windows_of
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, finish, judged_study
 
@@ -109,6 +112,25 @@ def test_a_prediction_comes_true(root, capsys):
     draw(Workspace(root), load_record(Workspace(root)))
     page = (root / "report.html").read_text()
     assert "A preregistered prediction holds." in page and "Preregistered predictions" in page
+
+
+def test_a_part_of_what_was_predicted_is_on_the_level_of_all_seeds_and_has_no_verdict():
+    """Where each seed has robots of its own, which one finished first decided whether the prediction held."""
+    x, hard = (1.0, 2.0, 4.0, 8.0), {"a": 1.0, "b": 4.0}
+    places = [Position(f"{robot}{at:g}", "run", seed, (at,), (robot,)) for seed, robot in enumerate(hard) for at in x]
+    tables = {p.trial: windows_of([hard[p.scope[0]] * p.x[0] ** -0.5], p.scope[0], [0]) for p in places}
+    inputs, held = ({p.trial: "" for p in places if (p.x[0] == 8) == last} for last in (False, True))
+    mean = 2 * 8**-0.5  # at the geometric mean of both robots
+    made = Prediction("own", ("steps",), (8.0,), tuple(held), mean, 0.9 * mean, 1.1 * mean, 0.9, "", {}, inputs, ())
+    curve = Curve("own", ("steps",), tuple(places))
+    for lacking, inside in (("", True), ("b8", None), ("a8", None)):
+        there = {id: table for id, table in tables.items() if id != lacking}
+        outcome = compare(made, [curve], there, inputs)
+        assert outcome.observed == pytest.approx(mean) and outcome.inside is inside and not outcome.marks, lacking
+    assert _prediction(outcome).verdict == "open" and "so far 0.707 (1 of 2 trials)" in _prediction(outcome).text
+    alone = {id: tables[id] for id in ("a8", "b1", "b2")}
+    outcome = compare(made, [curve], alone, inputs)
+    assert outcome.observed is None and "every seed was evaluated on other robots" in outcome.marks[-1]
 
 
 def test_nothing_is_predicted_of_a_trial_that_exists(root, capsys):
