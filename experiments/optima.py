@@ -3,12 +3,13 @@
 For learning rates: how far off the rate that is best at the base width is at the others. Only
 points of the grid are compared: an optimum between them is not interpolated. The lowest of several noisy losses is a
 choice with an error of its own: which rates are as good as the best is told from the seeds, and what a choice costs is
-judged on seeds that it was not made by.
+judged on seeds that it was not made by, where there are several.
 """
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -33,17 +34,19 @@ class Optimum:
     role: str
     series: str
     x: float
-    edge: str  # "edge": the best is at an end of what was tried, so that it may lie beyond; or ""
+    edge: str  # "edge": what is as good reaches an end of what was tried, so that the best may lie beyond; or ""
     loss: float
     seed_sem: float  # over seeds, nan for one
-    near_low: float  # the lowest and highest x that seeds do not tell from the best; x itself with one seed
+    near_low: float  # the lowest and highest x that are `as_good` as the best; x itself with one seed
     near_high: float
     moved: float  # steps of the grid from the best x of the base series, downwards negative; nan without one
     transferred_x: float  # the best x of the base series in the same role; nan without one
-    # By how much the loss is higher there than at the best x, both chosen by the other seeds where every point has
-    # several; inf if it diverged, nan if it has no result.
+    # By how much the loss of a seed is higher at the base's best x than at its own curve's, both chosen by the other
+    # seeds where every point has several: the mean over seeds, and the lowest and highest of them. They are not
+    # independent, so no standard error comes of them. inf if transferred_x diverged, nan if it has no result.
     penalty: float
-    penalty_seed_sem: float
+    penalty_low: float
+    penalty_high: float
 
 
 def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
@@ -95,52 +98,73 @@ def _optimum(
     base: CurvePoint | None,
     of_base: Sequence[CurvePoint],
 ) -> Optimum:
-    transferred, moved, penalty, error = math.nan, math.nan, math.nan, math.nan
+    transferred, moved, penalties = math.nan, math.nan, [math.nan]
     diverged_x = diverged(rows, sweep, role, series)
-    near = [p.x for p in points if p.x not in diverged_x and as_good(p, best)]
+    low, high = as_good(points, best, diverged_x)
     if base:
         transferred, grid = base.x, sorted({r.x for r in rows if r.sweep == sweep})
         moved = grid.index(best.x) - grid.index(base.x)
         transferred_point = next((p for p in points if p.x == base.x), None)
         if base.x in diverged_x:
-            penalty = math.inf
+            penalties = [math.inf]
         elif transferred_point:
-            penalty, error = cross_validated_penalty(points, of_base, diverged_x) or difference(transferred_point, best)
+            penalties = (
+                cross_validated_penalties(points, of_base, diverged_x)
+                or _by_seed(transferred_point, best)
+                or [math.nan]
+            )
     return Optimum(
         sweep, metric, role, series, best.x,
-        edge="edge" if best.x in ends(rows, sweep, role, series) else "",
-        loss=best.mean, seed_sem=best.seed_sem, near_low=min(near), near_high=max(near), moved=moved,
-        transferred_x=transferred, penalty=penalty, penalty_seed_sem=error,
+        edge="edge" if ends(rows, sweep, role, series) & {low, high} else "",
+        loss=best.mean, seed_sem=best.seed_sem, near_low=low, near_high=high, moved=moved, transferred_x=transferred,
+        penalty=add_up(penalties) / len(penalties), penalty_low=min(penalties), penalty_high=max(penalties),
     )  # fmt: skip
 
 
-def as_good(point: CurvePoint, best: CurvePoint) -> bool:
-    """Whether seeds do not tell it from the best, with 95 % and one side, paired."""
-    if point.x == best.x:
-        return True
-    mean, error = difference(point, best)
-    seeds = len(point.seeds.keys() & best.seeds.keys())
-    return seeds > 1 and not mean > -stdtrit(seeds - 1, 0.05) * error
+def as_good(points: Sequence[CurvePoint], best: CurvePoint, excluded: set[float]) -> tuple[float, float]:
+    """(lowest, highest x) of the points around `best` that seeds do not tell from it: paired, with 95 % and one side.
+
+    The range ends before the first point that they do tell, that is `excluded`, or has no error. Of a point that
+    scatters more than the curve's median one, the median error counts: where training is about to diverge, seeds
+    scatter so much that no loss could be told from the best.
+    """
+    others = [p for p in points if p.x != best.x and p.x not in excluded]
+    beside = {p.x: difference(p, best) for p in others}
+    usual = statistics.median([error for _, error in beside.values() if math.isfinite(error)] or [math.nan])
+
+    def told(point: CurvePoint) -> bool:
+        mean, error = beside[point.x]
+        seeds = len(_by_seed(point, best))
+        return not math.isfinite(error) or mean > -stdtrit(seeds - 1, 0.05) * min(error, usual)
+
+    apart = excluded | {p.x for p in others if told(p)}
+    below = max((x for x in apart if x < best.x), default=-math.inf)
+    above = min((x for x in apart if x > best.x), default=math.inf)
+    near = [p.x for p in points if below < p.x < above]
+    return min(near), max(near)
 
 
-def cross_validated_penalty(
+def cross_validated_penalties(
     points: Sequence[CurvePoint], of_base: Sequence[CurvePoint], diverged_x: set[float]
-) -> tuple[float, float] | None:
-    """(what a curve loses by the base's best x instead of its own, standard error over seeds): for each seed both are
-    chosen by the other seeds. None with fewer than two seeds that every point of both curves has."""
+) -> list[float]:
+    """What each seed of a curve loses by the base's best x instead of its own curve's, where both are chosen by the
+    other seeds. [] with fewer than two seeds that every point of both curves has."""
     own, base = ({p.x: p.seeds for p in curve if p.x not in diverged_x} for curve in (points, of_base))
     base = {x: seeds for x, seeds in base.items() if x in own}
     shared = set.intersection(*(set(seeds) for seeds in (*own.values(), *base.values()))) if base else set()
     if len(shared) < 2:
-        return None
+        return []
     penalties = []
     for seed in sorted(shared):
         others = shared - {seed}
         best, transferred = (min(c, key=lambda x, c=c: add_up(c[x][s] for s in others)) for c in (own, base))
         penalties.append(own[transferred][seed] - own[best][seed])
-    mean = add_up(penalties) / len(penalties)
-    spread = add_up((d - mean) ** 2 for d in penalties) / (len(penalties) - 1)
-    return mean, math.sqrt(spread / len(penalties))
+    return penalties
+
+
+def _by_seed(a: CurvePoint, b: CurvePoint) -> list[float]:
+    """a minus b of every seed that both have."""
+    return [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
 
 
 def _of(rows: Iterable[Row], sweep: str, role: str, series: str) -> list[Row]:

@@ -257,13 +257,15 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
         f"<p>{_transfer(optima, kind)}</p>"
         + table(head, lines, text=3)
         + (
-            "<p><em>As good</em>: rates that the seeds cannot tell from the best (95 %, paired). <em>Steps moved</em>: how "
-            f"many steps of the grid the best rate is from that of the base {kind} (bold). <em>Penalty</em>: by how much the "
-            f"loss is higher at the best rate of the base {kind}; of the held-out loss, in nats per token. Where all rates "
-            "of both curves have several seeds in common, rates are chosen on all seeds but one and judged on the one left "
-            "out; elsewhere they are judged on the seeds that chose them, which makes the penalty too large. Errors are over "
-            "seeds; the grid is not interpolated. <em>Edge</em>: the best rate is the lowest or the highest tried, so the "
-            "true optimum may lie beyond.</p>"
+            "<p><em>As good</em>: rates around the best that the seeds cannot tell from it (95 %, one side, paired; of a rate "
+            "whose seeds scatter more than those of the curve's median rate, the median error counts). <em>Steps moved</em>: "
+            f"how many steps of the grid the best rate is from that of the base {kind} (bold). <em>Penalty</em>: by how much "
+            f"the loss is higher at the best rate of the base {kind}; of the held-out loss, in nats per token; the mean over "
+            "seeds, and the lowest to the highest of them. Where all rates of both curves have several seeds in common, both "
+            "rates are chosen on all seeds but one and judged on the one left out, so that they may be others than those of "
+            "the table; elsewhere they are judged on the seeds that chose them, which makes the penalty too large. The error "
+            "of the lowest loss is over seeds; the grid is not interpolated. <em>Edge</em>: the best rate, or one as good, "
+            "is the lowest or the highest tried, so the true optimum may lie beyond.</p>"
         )
     )
 
@@ -275,8 +277,9 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
         own = [o for o in optima if o.role == role and o.metric == "cross_entropy" and not math.isnan(o.moved)]
         if own:
             far = max(own, key=lambda o: abs(o.moved))
-            # Whichever lies at an end: what is best beyond it may have moved further than `far`.
-            open_ended = ", some at an end of the grid, so perhaps further" if any(o.edge for o in own) else ""
+            # Whichever reaches an end: what is best beyond it may have moved further than `far`.
+            reaches = ", some at an end of the grid or not told from it, so perhaps further"
+            open_ended = reaches if any(o.edge for o in own) else ""
             steps = counted(round(abs(far.moved)), "step")
             span = counted(round(max(o.moved for o in own) - min(o.moved for o in own)), "step")
             parts.append(
@@ -293,4 +296,7 @@ def _moved(steps: float) -> str:
 def _penalty(optimum: Optimum) -> str:
     if math.isnan(optimum.penalty):
         return "–"
-    return "diverged" if math.isinf(optimum.penalty) else pm(optimum.penalty, optimum.penalty_seed_sem)
+    if math.isinf(optimum.penalty):
+        return "diverged"
+    mean, low, high = (f"{x:z.3f}" for x in (optimum.penalty, optimum.penalty_low, optimum.penalty_high))
+    return (mean if low == high else f"{mean} ({low} to {high})").replace("-", "\u2212")

@@ -242,7 +242,11 @@ def _optima(optima: Sequence[Optimum]) -> list[Check]:
     if not mup:
         return []
     edge = [o.series for o in mup if o.edge]
-    text = f"At an end of the grid for {', '.join(edge)}." if edge else f"On all {len(mup)} curves with muP."
+    text = (
+        f"At an end of the grid, or not told from it, for {', '.join(edge)}."
+        if edge
+        else f"On all {len(mup)} curves with muP."
+    )
     return [Check("The best learning rate lies inside the grid.", "bad" if edge else "good", text)]
 
 

@@ -7,7 +7,8 @@ Command: python -m experiments.sweeps.lr --preset cpu
 Cost: rates x widths x 2 training runs per seed, less those that both ways share at the base width,
     each as small as `transfer` in the study says; `--dry-run` prints it.
 Expected outcome: with muP the optima line up and the penalty stays within the grid's resolution;
-    without it the optimum falls as width grows. An optimum at the grid's end is marked "edge".
+    without it the optimum falls as width grows. An optimum at the grid's end, or not told from
+    it, is marked "edge".
 """
 
 from __future__ import annotations

@@ -2,20 +2,27 @@
 robots, follows from what is kept of them."""
 
 import csv
+import itertools
 import json
+import math
 import re
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from experiments.analysis.compare import Side, overall_difference
 from experiments.analysis.preregistered import FILE, Expected, read_expected
 from experiments.applications.detector import CLOSE_PX
 from experiments.applications.in_place import in_place
 from experiments.report.findings import read_findings
 from experiments.rows import OVERALL, CurvePoint, all_series, curve, difference
+from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
-from experiments.sweeps.sweep import CONTROL, POINT
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import CONTROL, POINT, STANDARD
+from hma_jax.evaluation.windows import FILE as WINDOWS
+from hma_jax.evaluation.windows import WindowTable
 from tests.experiments.committed_findings import (
     ACTING,
     RESULTS,
@@ -50,7 +57,7 @@ def horizon_rows() -> list[str]:
     for x, (robots, trials) in robots_at("cpu-full", "horizon").items():
         follow = [r.follows for r in robots if r.name in ACTING]
         cells = [
-            f"{x:,}", trials, *(f"{points[x].mean:.2f}" for points in curves.values()), *counts(robots),
+            f"{x:,}", trials if trials > 1 else f"{trials} †", *(f"{points[x].mean:.2f}" for points in curves.values()), *counts(robots),
             *(f"{np.mean([f[metric].mean for f in follow]):.2f}" for metric in ("action_nats", "retrieval")),
         ]  # fmt: skip
         lines.append(f"| {' | '.join(map(str, cells))} |")
@@ -71,6 +78,9 @@ def test_the_axis_horizon_is_as_findings_say():
         f"raise the loss on all {follow} robots that have actions; random ones lower PSNR on {changed} |" in readme()
     )
     assert f"PSNR, copying {copying} dB" in page
+    alone = [counts(robots_at("cpu-full", "horizon", seed=seed)[16_000][0])[2] for seed in (0, 1, 2)]
+    said = "Counted so, the single seeds of 16,000 steps have ΔPSNR beyond 2 on {}, {} and {} robots."
+    assert said.format(*alone) in " ".join(page.split())
 
 
 def test_robots_that_do_not_stay_robots_are_as_findings_say():
@@ -135,13 +145,12 @@ def rates_rows() -> list[str]:
         found = [r for r in csv.DictReader(file) if (r["sweep"], r["metric"]) == ("lr", "cross_entropy")]
     lines = []
     for r in found:
-        best, low, high, nats, moved, penalty, error = (
-            float(r[name]) for name in ("x", "near_low", "near_high", "loss", "moved", "penalty", "penalty_seed_sem")
-        )
+        best, low, high, nats, moved = (float(r[name]) for name in ("x", "near_low", "near_high", "loss", "moved"))
+        mean, least, most = (f"{float(r[f'penalty{which}']):z.3f}" for which in ("", "_low", "_high"))
         near = "" if low == high else f"{low:.3g} to {high:.3g}"
         words = {"point": "muP", "standard": "standard"}[r["role"]]
         cells = [words, r["series"].removeprefix("width "), f"{best:.3g}", near, f"{moved:+.0f}" if moved else "0"]
-        lines.append(f"| {' | '.join([*cells, f'{nats:.3f}', f'{penalty:.3f} ± {error:.3f}'])} |")
+        lines.append(f"| {' | '.join([*cells, f'{nats:.3f}', f'{mean} ({least} to {most})'])} |")
     return lines
 
 
@@ -154,7 +163,49 @@ def test_the_axis_lr_is_as_findings_say():
     for line in lines:
         cells = line.strip("| ").split(" | ")
         moved[cells[0]].append(int(cells[4]))
-    assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}  # as README says
+    assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}
+
+
+def test_how_far_the_best_rate_moves_seed_by_seed_is_as_findings_say():
+    page, curves = " ".join(findings().split()), {}
+    for role, width in itertools.product((POINT, STANDARD), (16, 64)):
+        curves[role, width] = curve(rows_of(), "lr", "cross_entropy", role, series=f"width {width}")
+    best = {key: [min(points, key=lambda p: p.seeds[s]).x for s in range(3)] for key, points in curves.items()}
+    down = {
+        role: [round(2 * math.log2(a / b)) for a, b in zip(best[role, 16], best[role, 64], strict=True)]
+        for role in (POINT, STANDARD)
+    }
+    assert down == {POINT: [1, -1, 1], STANDARD: [4, 2, 4]}
+    assert "moves one step down, one up and one down. **Without muP it falls, by two to four steps**" in page
+    assert (
+        "moves by one step of √2 with muP, by two to four without, seed by seed |"
+        in (ROOT / "docs" / "results.md").read_text()
+    )
+    said = "from {:.3g}, {:.3g} and {:.3g} at width 16 to {:.3g}, {:.3g} and {:.3g} at 64."
+    assert said.format(*best[STANDARD, 16], *best[STANDARD, 64]) in page
+    at = {round(p.x, 4): p.seeds for p in curves[STANDARD, 64]}
+    behind = [at[0.0113][s] - at[0.0057][s] for s in range(3)]
+    said = f"by {np.mean(behind):.2f} nats ({min(behind):.2f} to {max(behind):.2f}, seed by seed)"
+    assert said in page, said
+
+
+def test_which_width_is_ahead_at_equal_compute_is_as_findings_say():
+    workspace = Workspace(RESULTS / "cpu-full")
+    record = load_record(workspace)
+    (sweep,) = plan_sweeps(record.study, ("compute",))
+    found: dict[str, dict[float, dict[int, WindowTable]]] = {}
+    for p in sweep.points:
+        if p.role == POINT and p.x in (24, 32):
+            table = WindowTable.load(workspace.trials / trial_id(p.trial, record.provenance) / WINDOWS)
+            found.setdefault(p.series, {}).setdefault(p.x, {})[p.trial.train.seed] = table
+    ahead = [
+        overall_difference(Side("32", of[32], ""), Side("24", of[24], ""), "cross_entropy", sweep.scope)
+        for of in found.values()
+    ]
+    first, second, third, last = (f"{d.mean:.2f} ({d.low:.2f} to {d.high:.2f})" for d in ahead)
+    assert [d.low > 0 for d in ahead] == [False, True, False, False]
+    said = f"significantly only at 3.2 TFLOP: it is ahead of 32 by {first}, {second}, {third} and {last} nats (95 %,"
+    assert said in " ".join(findings().split()), said
 
 
 IDS = {"cross_entropy": 3, "psnr": 2, "action_nats": 2, "delta_psnr": 2}
@@ -250,8 +301,9 @@ def test_what_was_found_is_as_readme_says():
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
     assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
     poor = {p.label: p for p in curve(rows_of(root.name), "newcomers", "cross_entropy")}
-    gained, _ = difference(poor["alone"], poor["all robots"])
+    gained, error = difference(poor["alone"], poor["all robots"])
     assert f"{gained:.2f} if the five have 8 trajectories each" in text
+    assert f"**Training with all robots is worth {gained:.2f} ± {error:.2f} nats**" in findings()
     assert f"best trunk grows as C^{best['a']:.2f}" in text
 
 
