@@ -35,7 +35,7 @@ from experiments.running.launchers.base import Launcher
 from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
 from experiments.running.shared_disk import patient
 from hma_jax.config import ConfigError
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import IO_ERRNOS, write_file
 
 TRIES = 3
 """How often in one command a trial may be lost: it may run out of memory each time."""
@@ -152,8 +152,9 @@ class _Run:
         now = time.monotonic()
         try:
             handles = self.launcher.launch(directories)
-        except ConfigError as error:
-            if not self.launched:  # its settings are wrong
+        except (ConfigError, OSError) as error:
+            passing = isinstance(error, ConfigError) or error.errno in IO_ERRNOS
+            if not self.launched or not passing:  # its settings are wrong, or the disk is full
                 raise
             log.warning("%s; trying again in %.0f s", error, RELAUNCH_SECONDS)  # trials that run already go on
             self.relaunch_at = now + RELAUNCH_SECONDS

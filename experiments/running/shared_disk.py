@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from data_pipelines.sources.rlds.location import IO_ERRNOS
+from hma_jax.runtime.files import IO_ERRNOS
 
 WAITS = (1.0, 2.0, 4.0, 8.0, 15.0)
 """Seconds before each further try."""

@@ -103,15 +103,16 @@ def test_the_reason_is_kept_of_a_trial_that_is_lost_before_it_has_begun(tmp_path
     assert events(tmp_path, "a") == ["lost"] * TRIES
 
 
-def test_trials_that_are_not_taken_again_at_first_end_no_sweep(tmp_path, monkeypatch, caplog):
-    """Slurm's controller restarts, or a limit is reached, while other trials run."""
+@pytest.mark.parametrize("error", [ConfigError("not now"), OSError(errno.ESTALE, "not now")])
+def test_trials_that_are_not_taken_again_at_first_end_no_sweep(tmp_path, monkeypatch, caplog, error):
+    """Slurm's controller restarts, a limit is reached, or a shared disk does not answer, while other trials run."""
     monkeypatch.setattr(runner, "RELAUNCH_SECONDS", 0.05)
     place = fake_trial.launcher(tmp_path, 2)
     launch, refused = place.launch, iter([False, True, True])
 
     def sometimes(directories):
         if next(refused, False):
-            raise ConfigError("Slurm does not take the jobs")
+            raise error
         return launch(directories)
 
     place.launch = sometimes
@@ -119,7 +120,16 @@ def test_trials_that_are_not_taken_again_at_first_end_no_sweep(tmp_path, monkeyp
     states = run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
     assert {state.event for state in states.values()} == {"finished"}
     assert events(tmp_path, "lost") == ["running", "lost", "running", "finished"]
-    assert caplog.text.count("does not take the jobs; trying again") == 2
+    assert caplog.text.count("not now; trying again") == 2
+
+
+def test_a_trial_that_could_not_be_started_keeps_no_slot(tmp_path):
+    place = fake_trial.launcher(tmp_path, 1)
+    with pytest.raises(FileNotFoundError):
+        place.launch([tmp_path / "gone"])
+    assert (
+        run_missing([job("a")], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)["a"].event == "finished"
+    )
 
 
 def test_trials_that_are_never_taken_end_the_sweep(tmp_path):

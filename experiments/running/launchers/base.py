@@ -49,7 +49,8 @@ class Launcher(ABC):
     def launch(self, directories: Sequence[Path]) -> list[Any]:
         """Asks for an attempt at the trial of each directory, and returns a handle for each.
 
-        Raises ConfigError if the place refuses them; none of them then goes on, and all may be asked for again.
+        Raises ConfigError if the place refuses them, and OSError; none of them then goes on, and all may be asked for
+        again.
         """
 
     @abstractmethod

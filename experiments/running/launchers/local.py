@@ -65,7 +65,7 @@ class LocalLauncher(Launcher):
         return children
 
     def _start(self, directory: Path) -> Child:
-        slot = self._free.pop(0)
+        slot = self._free[0]
         with open(directory / OUTPUT, "a") as output:
             process = subprocess.Popen(
                 self._command(directory),
@@ -75,6 +75,7 @@ class LocalLauncher(Launcher):
                 env=child_environment(self._root / "compiled", self._slots[slot]),
                 start_new_session=True,  # Ctrl-C reaches the runner only, which asks them to save
             )
+        self._free.remove(slot)
         return Child(process, slot)
 
     def ended(self, handle: Child) -> AttemptEnd | None:

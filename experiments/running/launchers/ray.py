@@ -82,8 +82,9 @@ class RayLauncher(Launcher):
         return settings.gpus or settings.tpus or None
 
     def launch(self, directories: Sequence[Path]) -> list[Task]:
-        cache = self._root / "compiled"
-        return [Task(d, self._run.remote(Attempt(d, cache, self._command))) for d in directories]
+        # Before any is asked for: making one may raise.
+        attempts = [Attempt(d, self._root / "compiled", self._command) for d in directories]
+        return [Task(attempt.directory, self._run.remote(attempt)) for attempt in attempts]
 
     def ended(self, handle: Task) -> AttemptEnd | None:
         done, _ = self._ray.wait([handle.reference], timeout=0)
