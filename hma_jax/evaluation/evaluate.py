@@ -29,6 +29,7 @@ from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, require_params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh
+from hma_jax.runtime.processes import compiled_by_all
 from hma_jax.runtime.rows import lay_out
 from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain
 
@@ -87,6 +88,7 @@ def evaluate(
     metric_params = lay_out(metric_params, NamedSharding(mesh, PartitionSpec()))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
+        compiled = None
         for batch in batches:
             missing = [name for name in (*REQUIRED_ARRAYS, "dataset", "valid") if name not in batch]
             require(not missing, f"a batch to evaluate lacks {', '.join(missing)}")
@@ -96,7 +98,9 @@ def evaluate(
             arrays = (*REQUIRED_ARRAYS, *(name for name in OPTIONAL_ARRAYS if name in batch))
             on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
             with jax.set_mesh(mesh):
-                found = evaluator(weights, metric_params, on_devices)
+                if compiled is None:
+                    compiled = compiled_by_all("evaluation", evaluator, weights, metric_params, on_devices)
+                found = compiled(weights, metric_params, on_devices)
             yield batch, found
 
     tables: list[WindowTable] = []

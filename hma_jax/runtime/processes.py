@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.runtime import watchdog
 from hma_jax.runtime.exits import Exit, exit_of_interrupt
 
+T = TypeVar("T")
 COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCESS"
 """Environment variables for what is not given otherwise."""
 
@@ -250,6 +251,16 @@ def barrier(name: str) -> None:
     """Waits until all processes have called it. Needed before a program first runs: its collectives wait for processes
     that still compile it, on CPUs for 30 seconds only."""
     all_gather(name, "")
+
+
+def compiled_by_all(name: str, function: Callable[..., T], *arguments: Any) -> Callable[..., T]:
+    """A jitted `function` to be called with such `arguments`; of several processes all call this, and none returns
+    before all have compiled it (`barrier`)."""
+    if jax.process_count() == 1:
+        return function
+    compiled = function.lower(*arguments).compile()
+    barrier(f"compiled/{name}")
+    return compiled
 
 
 def broadcast_from_writer(name: str, text: str) -> str:

@@ -19,6 +19,7 @@ from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
+from hma_jax.runtime.processes import compiled_by_all
 from hma_jax.training.loop import ValidationHook
 from hma_jax.training.state import TrainState
 from hma_jax.training.step import micro_batches
@@ -62,9 +63,11 @@ def make_validation_hook(
         return loss_metrics(sums, counts, masking, discrete=not model.diffusion)
 
     def measure(state: TrainState) -> dict[str, float]:
+        nonlocal compute
         if not held:
             held.extend(_with_valid(batch) for batch in validation.batches())
             require(bool(held), "there is no window to validate on; switch off validation")
+            compute = compiled_by_all("validation", compute, state.params, put_batch(held[0]), np.int32(0))
         values = mean(state.params)
         if state.ema is not None:
             values |= {f"ema_{name}": value for name, value in mean(state.ema).items()}

@@ -10,6 +10,7 @@ import subprocess
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from jax._src.lib import _jax
@@ -128,6 +129,18 @@ def test_a_process_that_waits_for_another_one_stops_when_it_is_asked():
     assert time.monotonic() - began < 5
     client.shutdown()
     service.shutdown()
+
+
+def test_no_process_runs_a_program_before_all_have_compiled_it(monkeypatch):
+    """On CPUs its collectives wait for 30 seconds only."""
+    done = []
+    program = SimpleNamespace(compile=lambda: done.append("compiled") or "program")
+    jitted = SimpleNamespace(lower=lambda *arguments: done.append(arguments) or program)
+    assert processes.compiled_by_all("it", jitted, 1, 2) is jitted and not done
+    monkeypatch.setattr(processes.jax, "process_count", lambda: 2)
+    monkeypatch.setattr(processes, "barrier", done.append)
+    assert processes.compiled_by_all("it", jitted, 1, 2) == "program"
+    assert done == [(1, 2), "compiled", "compiled/it"]
 
 
 class World:
