@@ -76,7 +76,7 @@ class Denoiser(nnx.Module):
         self.blocks = nnx.List([ResBlock(width) for _ in range(config.diffusion.depth)])
         self.modulation = Linear((width, 2 * width), ("W", "F"), init=zeros, role="vector")
         self.out = param((width, 2, channels), ("F", None, axis), zeros, role="vector")
-        self.out_bias = bias((2, channels), (None, axis))
+        self.out_bias = bias((2, channels), (None, axis), precise=True)
 
     def __call__(self, x: jax.Array, time: jax.Array, z: jax.Array) -> jax.Array:
         """x [..., C] noised at `time` given z [..., D] -> float32 [..., 2 C], noise first.

@@ -70,7 +70,7 @@ class EmbodimentLinear(nnx.Module):
         role: Role,
     ):
         self.kernel = param((embodiments, *sizes), ("E", *axes), init, role=role)
-        self.bias = bias((embodiments, sizes[1]), ("E", axes[1]))
+        self.bias = bias((embodiments, sizes[1]), ("E", axes[1]), precise=axes[1] == "U")  # as `to_actions` is
         self.map = find_map(axes)
 
     def __call__(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:

@@ -95,9 +95,9 @@ def param(
     return nnx.Param(jax.ShapeDtypeStruct(shape, jnp.float32), **about, matrix=matrix)
 
 
-def bias(shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
+def bias(shape: tuple[int, ...], axes: tuple[str | None, ...], precise: bool = False) -> nnx.Param:
     """Declares a bias: zero at first, never decayed."""
-    return param(shape, axes, zeros, role="vector", decay=False)
+    return param(shape, axes, zeros, role="vector", decay=False, precise=precise)
 
 
 def zeros(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

@@ -196,7 +196,7 @@ def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
         model = declared.merge(params)
         out = model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"])
         if not config.diffusion:
-            return model.logits(out.predictions, batch["tokens"]), out.actions
+            return model.logits(out.predictions, batch["tokens"]), model.action_head(out.actions, batch["embodiment"])
         times = jnp.full((4, config.frames), 3)
         tokens, actions = batch["tokens"], batch["actions"]
         return (
