@@ -226,7 +226,11 @@ def _find_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> list[Path
     unfinished = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{12}}")
     others = [p for p in sorted(root.glob(f".{name}.*")) if unfinished.fullmatch(p.name) and p != work]
     for other in others:
-        if held := find_held_lock(locks_of(other)):
+        try:
+            held = find_held_lock(locks_of(other))
+        except PermissionError:  # another user's, who keeps its work to itself
+            continue
+        if held:
             raise Held(
                 f"{final}: {held.who} is making this dataset with other settings; wait until it has finished, or stop "
                 "it",

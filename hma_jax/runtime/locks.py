@@ -13,8 +13,9 @@ What is promised depends on the file system, which carries flock or does not:
 * One that does not take flock at all: a warning; with a lease, as between hosts.
 
 A lease is the lock file's time of change, which its holder renews. It is compared with the file system's own
-clock, so the hosts' clocks need not agree. A holder that was stopped for longer than EXPIRES may lose its lease
-to another host and finds out by `Lock.lost`: what a lease protects must be harmless when done twice.
+clock, so the hosts' clocks need not agree; where a directory may only be read, with this host's. A holder that
+was stopped for longer than EXPIRES may lose its lease to another host and finds out by `Lock.lost`: what a lease
+protects must be harmless when done twice.
 """
 
 from __future__ import annotations
@@ -154,22 +155,21 @@ def _open(path: Path, lease: bool) -> tuple[int, bool]:
 def find_held(path: Path) -> Held | None:
     """That a running process holds the lease `path`, as the error that says so. Nothing is written to the lock file.
 
-    None if nobody does, or if it is another user's and cannot be told. Raises OSError if it cannot be read now.
+    None if nobody does. Raises OSError if it cannot be read now.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            _lock(fd, path, lease=True, kind=fcntl.LOCK_SH)  # NFS gives no other for a file that is open for reading
-        finally:
-            os.close(fd)
+        while True:
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                _lock(fd, path, lease=True, kind=fcntl.LOCK_SH)  # NFS gives no other for a file open for reading
+                if _same_file(fd, path):  # as in `_open`
+                    return None
+            finally:
+                os.close(fd)
     except Held as held:
         return held
     except FileNotFoundError:
         return None
-    except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise
-    return None
 
 
 def _lock(fd: int, path: Path, lease: bool, kind: int = fcntl.LOCK_EX) -> bool:
@@ -195,13 +195,24 @@ def _leased(path: Path, holder: Holder | None, locked: bool) -> bool:
     """Whether a lock that this kernel gave belongs to a machine whose locks it may not know of."""
     if holder is None or (locked and holder.locked and holder.machine == machine()):
         return False
+    try:
+        # Either way: a time far ahead is of a clock that was set right since, and nobody renewed the lease after that.
+        return abs(_now(path) - path.stat().st_mtime) < EXPIRES
+    except FileNotFoundError:  # given back meanwhile, or all of it is removed
+        return False
+
+
+def _now(path: Path) -> float:
+    """The file system's time, as of a new file beside `path`; where none may be made, this host's."""
     now = path.with_name(f"{path.name}.{secrets.token_hex(4)}.now")
     try:
         now.touch(exist_ok=False)
-        # Either way: a time far ahead is of a clock that was set right since, and nobody renewed the lease after that.
-        return abs(now.stat().st_mtime - path.stat().st_mtime) < EXPIRES
-    except FileNotFoundError:  # given back meanwhile, or all of it is removed
-        return False
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
+        return time.time()
+    try:
+        return now.stat().st_mtime
     finally:
         now.unlink(missing_ok=True)
 

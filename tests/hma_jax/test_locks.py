@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -98,8 +99,29 @@ def test_whether_a_lease_is_held_is_seen_without_writing_and_of_another_user_s_w
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(Path, "touch", refuse)
-    assert find_held(path) is None  # the file system's time is not known
+    assert "process 7 on other" in str(find_held(path))  # by this host's clock
+    leave(path, age=locks.EXPIRES + 5)
+    assert find_held(path) is None
     with exclusive(path):
+        assert find_held(path).holder.process == os.getpid()
+    with monkeypatch.context() as patch, pytest.raises(OSError, match=os.strerror(code)):
+        patch.setattr(locks.os, "open", refuse)
+        find_held(path)
+
+
+def test_a_lock_that_is_handed_over_while_it_is_looked_at_is_held(tmp_path: Path, monkeypatch):
+    path, flock = tmp_path / "lock", locks.fcntl.flock
+    path.touch()
+
+    def handed_over(fd: int, kind: int) -> None:
+        """The holder ends and removes its file, and the next makes one."""
+        monkeypatch.setattr(locks.fcntl, "flock", flock)
+        path.unlink()
+        stack.enter_context(exclusive(path, lease=True))
+        flock(fd, kind)
+
+    with ExitStack() as stack:
+        monkeypatch.setattr(locks.fcntl, "flock", handed_over)
         assert find_held(path).holder.process == os.getpid()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -222,6 +223,20 @@ def test_a_finished_dataset_is_given_although_another_is_being_made_with_other_s
     made = run(rlds, tmp_path)
     with lock_output(locks_of(work) / "00007"):  # by a process that is alive
         assert run(rlds, tmp_path) == made
+
+
+def test_work_of_another_user_that_may_not_be_seen_is_in_nobody_s_way(rlds, tmp_path, monkeypatch):
+    work = begin(rlds, tmp_path, keep_frames="all")
+    opened = os.open
+
+    def refuse(path, *how, **options):
+        if str(path).startswith(str(locks_of(work))):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return opened(path, *how, **options)
+
+    with lock_output(locks_of(work) / "00007"):
+        monkeypatch.setattr(os, "open", refuse)
+        assert run(rlds, tmp_path)
 
 
 def test_overwriting_removes_what_was_made_otherwise(rlds, undisturbed, tmp_path):
