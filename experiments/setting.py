@@ -20,7 +20,7 @@ from experiments.presets import get_preset
 from experiments.program import PROGRAM
 from experiments.progress import say
 from experiments.running.run_options import UNSET
-from experiments.running.workspace import Workspace
+from experiments.running.workspace import Workspace, find_record
 from experiments.study import Study, on_tokenizer, on_user_data, without_equal_caps
 from experiments.words import few
 from hma_jax.config import ConfigError, ModelConfig
@@ -142,13 +142,14 @@ def command_words(*arguments: str | Path) -> str:
 
 
 def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Setting:
-    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing.
+    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. Of its numbers of
+    trajectories those that would be trained on the same are left out, but for points of the study in the directory.
 
     `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that
     are no datasets.
     """
     arguments = where.anywhere()
-    study, data = get_preset(arguments.preset), arguments.data
+    study, data, workspace = get_preset(arguments.preset), arguments.data, Workspace(arguments.out)
     use_entries(arguments.registry)
     if arguments.mixture is not None:
         from data_pipelines.registry.mixtures import get_mixture
@@ -166,13 +167,24 @@ def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Set
         study = on_tokenizer(study, load_config(arguments.tokenizer))
     study = override(study, arguments.set, model)
     if (data or arguments.mixture) and "trajectory_counts" not in arguments.chosen():
-        study = without_equal_caps(study)
+        study = _with_earlier_caps(without_equal_caps(study), workspace)
     say_unmatched(arguments.registry, study.all_names())
     if arguments.mesh is not None:
         sizes = dict(zip(("data", "fsdp", "tensor"), arguments.mesh, strict=True))
         mesh = replace(study.execution.mesh, **sizes)
         study = replace(study, execution=replace(study.execution, mesh=mesh))
-    return Setting(arguments, study, data, Workspace(arguments.out))
+    return Setting(arguments, study, data, workspace)
+
+
+def _with_earlier_caps(study: Study, workspace: Workspace) -> Study:
+    """The same study with the numbers of trajectories of the one in `workspace`, as an earlier version planned it, if
+    they differ only in such as no dataset has to train on: or that one could not go on."""
+    try:
+        earlier = find_record(workspace)
+    except ConfigError:  # who goes on with it says so
+        return study
+    before = replace(study, trajectory_counts=earlier.study.trajectory_counts) if earlier else study
+    return before if without_equal_caps(before) == study else study
 
 
 def use_entries(registry: Path | None) -> None:

@@ -15,6 +15,7 @@ from experiments import setting as settings
 from experiments.cli import evaluate, tokenize, tokenizer, train
 from experiments.cli.command_line import Commands
 from experiments.cli.main import main
+from experiments.running.workspace import Record, save_record
 from experiments.setting import Setting, StudyArguments, make_setting
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.test_cli_errors import idle_training  # noqa: F401
@@ -129,6 +130,20 @@ def test_the_study_is_the_same_too(where, world, monkeypatch):
     for name in ("tokenize", "train", "study", "sweep width", "tokenizer train"):
         assert asked_by(setting.command(name), monkeypatch) == setting
     assert asked_by(setting.command("evaluate", Path("-run").absolute()), monkeypatch) == setting
+
+
+def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkeypatch, tmp_path):
+    """It was refused as another study, since caps that no dataset reaches in training came to count as equal."""
+    monkeypatch.chdir(world)
+    monkeypatch.setattr("experiments.study.most_trajectories", lambda study: 100)
+    where = StudyArguments("accelerator", tmp_path, (f"bridge/{ARM.name}",))
+    setting = make_setting(where)
+    caps = setting.study.trajectory_counts
+    for earlier, counts in (((10, 30, 100, 1000), (10, 30, 100, 1000)), ((10, 20, 30, 1000), caps), ((10, 30), caps)):
+        save_record(setting.workspace, Record(dataclasses.replace(setting.study, trajectory_counts=earlier)))
+        assert make_setting(where).study.trajectory_counts == counts
+    setting.workspace.record.write_text("damaged")
+    assert make_setting(where).study.trajectory_counts == caps == (10, 30, 1000)
 
 
 def test_a_command_means_the_same_in_another_directory(world, monkeypatch, tmp_path):
