@@ -26,7 +26,7 @@ from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
 from experiments.setting import Setting, short
 from experiments.study import Study
-from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_sweeps
+from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from experiments.words import few
 from hma_jax.config import ConfigError
@@ -67,7 +67,7 @@ def run_study(
     study, workspace = setting.study, setting.workspace
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
-    sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
+    sweeps, sources = plan_asked(study, axes), trial_closure()  # a later change is refused by the trials
     require_trainable(study, sweeps, launcher_options)
     if setting.data:
         say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])

@@ -11,7 +11,7 @@ from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningA
 from experiments.progress import console
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.setting import StudyArguments, make_setting
-from experiments.sweeps.registry import AXES, is_file, plan_sweeps
+from experiments.sweeps.registry import AXES, is_file, plan_asked
 from hma_jax.config import ConfigError, require
 
 
@@ -83,7 +83,7 @@ def _run(
         from experiments.scale import say_points, say_prepared_here, say_scale, say_unused
         from experiments.trainable import check_launched
 
-        sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
+        sweeps, given, trained = plan_asked(setting.study, axes), bool(setting.data), setting.tokenizer is None
         if given:
             check_entries(setting.study, setting.data)
         devices = Devices(check_launched(setting.study, sweeps, launcher_options), launcher_options.at_once)

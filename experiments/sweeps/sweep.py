@@ -156,17 +156,12 @@ def make_sweep(
     at the ends of a numbered axis if the study wants `end_controls`.
 
     `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError without `values` or seeds,
-    and where the study's reference trial does not stand at `reference_x`, one of `values`: `change` has to leave it
-    there as it is, but for whom it is judged on.
+    and where the study's reference trial does not stand at `reference_x`: `change` has to leave it there as it is, but
+    for whom it is judged on.
     """
     require(len(values) > 0, f"axis {name}: values is empty, so only its control would run; give it positions")
     values = [x.item() if isinstance(x, np.generic) else x for x in values]  # of an array: settings are JSON
-    require(
-        reference_x in values,
-        f"axis {name}: reference_x {reference_x} is not among the values {tuple(values)}, so its control would have no "
-        "trial beside it; add it",
-    )
-    reference_x = values[values.index(reference_x)]
+    reference_x = next((x for x in values if x == reference_x), reference_x)
     seeds = study.seeds if seeds is None else seeds
     require(len(seeds) > 0, f"axis {name}: seeds is empty; give at least one, or leave it out for the study's")
     unchanged = reference_trial(study, seeds[0], steps)
