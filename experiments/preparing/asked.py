@@ -70,11 +70,11 @@ def require_same_asked(
 ) -> None:
     """Raises Busy if the process that holds the directory was asked for something else, where it says so, and as
     `check_sources` does. Waits for what that process has still to find out."""
-    here = asked_for(study, sources, tokenizer)
-    if there := _wait_for_asked(workspace, busy):
+    here, began = asked_for(study, sources, tokenizer), time.monotonic()
+    if there := _wait_for_asked(workspace, busy, began):
         _require_same(there | {RECORDINGS: None}, here, busy)
     here = with_recordings(here, study, sources)
-    if there := _wait_for_asked(workspace, busy, opened=True):
+    if there := _wait_for_asked(workspace, busy, began, opened=True):
         _require_same(there, here, busy)
 
 
@@ -95,10 +95,10 @@ def _of(names: Collection[str], asked: Asked) -> Asked:
     return asked | some
 
 
-def _wait_for_asked(workspace: Workspace, busy: Busy, *, opened: bool = False) -> Asked | None:
+def _wait_for_asked(workspace: Workspace, busy: Busy, began: float, *, opened: bool = False) -> Asked | None:
     """What the holder of the directory was asked for, if so asked with the recordings that it has `opened`; None if it
-    is at another command, or has ended."""
-    began, announced = time.monotonic(), False
+    is at another command, which is not waited for again if it was since `began`, or has ended."""
+    announced = False
     for pause in backoff():
         asked = _read(workspace)
         if asked is None and time.monotonic() - began > WRITTEN_WITHIN:

@@ -141,7 +141,9 @@ def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, 
     found = sources.find_sources(setting.study, setting.data)
     with Workspace(tmp_path).locked():
         assert main([*arguments, *data[:2]]) == 2
-        assert f"datasets: 2 -> 1, without {BASE.name}" in capsys.readouterr().err.replace("\n", " ")
+        told = capsys.readouterr()
+        assert f"datasets: 2 -> 1, without {BASE.name}" in told.err.replace("\n", " ")
+        assert told.out.count("waiting until ") == 1, "once for a holder that is at another command"
         write_asked(setting.study, setting.workspace, found, None)
         assert main([*arguments, *data, *tokenizer, "--set", "store.min_val=1", "--set", "model.frames=3"]) == 2
         message = capsys.readouterr().err
