@@ -77,9 +77,10 @@ class SimulatedTruth:
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
-        """Demonstrations that are longer than asked for were not so in earlier versions."""
-        frames = self._demonstrated_frames()
-        return {"demonstrated_frames": frames} if frames != self.config.demonstration_frames else {}
+        """Demonstrations that are longer than asked for were not so in earlier versions, unless none that is shorter
+        can succeed."""
+        frames, asked = self._demonstrated_frames(), self.config.demonstration_frames
+        return {"demonstrated_frames": frames} if frames != asked and self.config.task.hold <= asked else {}
 
     def _demonstrated_frames(self) -> int:
         asked, task = self.config.demonstration_frames, self.config.task
