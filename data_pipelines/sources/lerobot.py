@@ -24,7 +24,7 @@ from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import LeRobotSettings
-from data_pipelines.sources.video import ADVICE, Video, open_video, shrink, stored_jpeg
+from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
 PICTURES = ("video", "image")
 EPISODE, TIME, TASK, SUCCESS, REWARD = "episode_index", "timestamp", "task_index", "next.success", "next.reward"
@@ -158,7 +158,7 @@ class LeRobotSource:
     def _images(self, entry: EpisodeEntry, name: str, times: np.ndarray, where: str) -> list[bytes]:
         if name in entry.videos:
             path, begin = entry.videos[name]
-            with self.open_video(path) as video:
+            with open_video(path, self.hz) as video:
                 return [encode_jpeg(shrink(f, self.short_side)) for f in video.frames(times + begin)]
         self._check_camera(entry, name, where)
         images = []
@@ -166,18 +166,6 @@ class LeRobotSource:
             here = f"{where}: {quote(name)} at row {row}"
             images.append(stored_jpeg(self._image_bytes(value, here), self.short_side, here))
         return images
-
-    @contextmanager
-    def open_video(self, path: Path) -> Iterator[Video]:
-        """Raises UnitError for a video with fewer frames per second than rows: to a row between two of its frames it
-        could give the later one, which shows what the row's action leads to."""
-        with open_video(path) as video:
-            if video.rate < 0.98 * self.hz:
-                raise UnitError(
-                    f"{path}: {video.rate:g} frames per second, but by fps in {self.root / 'meta' / 'info.json'} "
-                    f"{self.hz:g} rows are recorded in each. {ADVICE}"
-                )
-            yield video
 
     def _image_bytes(self, value: Any, where: str) -> bytes:
         """The bytes of an image, which lie in the table or in a file that it names."""

@@ -35,6 +35,7 @@ from data_pipelines.sources.source import (
     decode_frame,
     join_actions,
 )
+from data_pipelines.sources.video import open_video
 from hma_jax.config import require
 
 
@@ -183,7 +184,7 @@ class LeRobotDataset(EpisodeSource):
         """Frames of one camera while `stack` is open."""
         if name in entry.videos:
             path, begin = entry.videos[name]
-            video = stack.enter_context(self._read.open_video(path))
+            video = stack.enter_context(open_video(path, self._read.hz))
             return lambda n: video.at(float(times[n] + begin))
         return lambda n: self._read.image(entry, name, n, where)
 

@@ -55,10 +55,11 @@ MIN_FRAME_BYTES = 4
 
 class Video:
     """An opened video. `rate` in frames per second, `width` and `height` in pixels; `max_frames` is an
-    upper bound on its frames that follows from the file's size, whatever its header claims."""
+    upper bound on its frames that follows from the file's size, whatever its header claims. It is asked for frames
+    `hz` times a second, 0: at any times."""
 
-    def __init__(self, path: Path, container: Any):
-        self._path, self._container = path, container
+    def __init__(self, path: Path, container: Any, hz: float):
+        self._path, self._container, self._hz = path, container, hz
         self._stream = container.streams.video[0]
         self._stream.thread_type = "AUTO"
         self._start = self._stream.start_time or 0
@@ -76,9 +77,10 @@ class Video:
     def at(self, time: float) -> np.ndarray:
         """The frame nearest to `time`, uint8 [H, W, 3], RGB. With ascending times each frame is decoded once.
 
-        Raises UnitError if none is within half a frame interval.
+        Raises UnitError if none is within half a frame interval and half of 1 / `hz`.
         """
-        near = 0.5 / self.rate + 1e-4
+        # Of a video with fewer frames than rows, a row could be given one that shows what the row's action did.
+        near = 0.5 / max(self.rate, self._hz) + 1e-4
         before, after = self._neighbours
         if (
             self._frames is None
@@ -130,8 +132,8 @@ def _is_io_error(error: Exception) -> bool:
 
 
 @contextmanager
-def open_video(path: Path) -> Iterator[Video]:
-    """Raises UnitError for a file that is missing or no video."""
+def open_video(path: Path, hz: float = 0.0) -> Iterator[Video]:
+    """`hz` as of Video. Raises UnitError for a file that is missing or no video."""
     av = require_module("av")
 
     def opened() -> Any:
@@ -147,7 +149,7 @@ def open_video(path: Path) -> Iterator[Video]:
             raise UnitError(f"{path}: it has no video stream. {ADVICE}")
         if container.streams.video[0].codec_context is None:
             raise UnitError(f"{path}: the encoding of its video is not known. {ADVICE}")
-        video = Video(path, container)
+        video = Video(path, container, hz)
         if not video.rate:
             raise UnitError(f"{path}: it has no frame rate. {ADVICE}")
         yield video

@@ -34,15 +34,17 @@ def number(image: np.ndarray) -> int:
     return i
 
 
-def write_video(path: Path, frames: list[int], fps: int, size=(HEIGHT, WIDTH)) -> None:
+def write_video(path: Path, frames: list[int], fps: int, size=(HEIGHT, WIDTH), times: list[int] | None = None) -> None:
+    """`times` in 1 / fps seconds, those without a gap if None."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "8", "g": "10", "preset": "ultrafast"})
         stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
-        for i in frames:
+        for i, time in zip(frames, times or range(len(frames)), strict=True):
             frame = av.VideoFrame.from_ndarray(picture(i, *size), format="rgb24")
+            frame.pts = time
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
