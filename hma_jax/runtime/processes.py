@@ -6,6 +6,7 @@ process is noticed, and how the others end, is in `runtime.watchdog`; docs/hosts
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 import socket
@@ -107,12 +108,15 @@ def own_devices(environment: Mapping[str, str]) -> list[int] | None:
     one GPU whose number is that of the process on its node, elsewhere all.
 
     A process that is alone on its node takes all that it sees, and so does one that sees fewer GPUs than there are
-    processes on the node: they were shared out already, and count from 0 in each.
+    processes on the node, or as many as Slurm was asked for each (`--gpus-per-task`): they were shared out already, and
+    count from 0 in each.
     """
     if "JAX_LOCAL_DEVICE_IDS" in environment:  # the user's choice
         return None
-    visible, neighbours = environment.get("CUDA_VISIBLE_DEVICES"), _processes_on_node(environment)
-    shared_out = visible is not None and len(visible.split(",")) < neighbours
+    neighbours, visible = _processes_on_node(environment), environment.get("CUDA_VISIBLE_DEVICES")
+    seen = math.inf if visible is None else len(visible.split(","))
+    each = environment.get("SLURM_GPUS_PER_TASK", "").rpartition(":")[2]  # such as 2 or h100:2
+    shared_out = seen < neighbours or each == str(seen)  # with --gpu-bind=none each sees all
     return ALL_DEVICES if neighbours == 1 or shared_out else None
 
 
@@ -124,7 +128,8 @@ def _processes_on_node(environment: Mapping[str, str]) -> int:
     for part in environment.get("SLURM_STEP_TASKS_PER_NODE", "0").split(","):  # such as 8(x3),4
         count, _, nodes = part.rstrip(")").partition("(x")
         counts += [int(count)] * int(nodes or 1)
-    return counts[int(environment.get("SLURM_NODEID", "0"))]
+    node = int(environment.get("SLURM_NODEID", "0"))
+    return counts[node] if node < len(counts) else 0
 
 
 def start(asked: Processes) -> None:

@@ -71,10 +71,14 @@ MPI = {"OMPI_COMM_WORLD_LOCAL_RANK": "1"}
         (SLURM | EIGHT, None),  # srun --ntasks-per-node 4 --gpus-per-node 8
         (SLURM | {"CUDA_VISIBLE_DEVICES": "0"}, ALL_DEVICES),  # --gpus-per-task 1
         (SLURM | {"CUDA_VISIBLE_DEVICES": "6,7"}, ALL_DEVICES),  # --gpus-per-task 2
+        # --ntasks-per-node 4 --gpus-per-task h100:4, and --gpus-per-task 2 --gpu-bind none
+        (SLURM | {"SLURM_GPUS_PER_TASK": "h100:4", "CUDA_VISIBLE_DEVICES": "0,1,2,3"}, ALL_DEVICES),
+        (SLURM | {"SLURM_GPUS_PER_TASK": "2"} | EIGHT, None),
         (SLURM | {"SLURM_NODEID": "3"} | EIGHT, ALL_DEVICES),  # --ntasks-per-node 1 --gpus-per-node 8
         (SLURM | {"SLURM_NODEID": "1", "CUDA_VISIBLE_DEVICES": "0,1,2,3"}, ALL_DEVICES),
         (SLURM | {"SLURM_NODEID": "3", "JAX_LOCAL_DEVICE_IDS": "5"} | EIGHT, None),
         (SLURM, None),
+        (SLURM | {"SLURM_NODEID": "4"} | EIGHT, None),  # of which the list says nothing
         (MPI | {"OMPI_COMM_WORLD_LOCAL_SIZE": "1"}, ALL_DEVICES),
         (MPI | {"OMPI_COMM_WORLD_LOCAL_SIZE": "8"} | EIGHT, None),
         ({}, None),
