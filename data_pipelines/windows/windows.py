@@ -4,7 +4,7 @@ Owns which windows exist; `slicer` slices one out of an episode. No record is re
 
 In an episode that is long enough every start counts whose T frames all have whole chunks. A shorter one
 gives padded windows of as many real frames as it has: at least `MIN_TRAIN_FRAMES` to train on, the prompt and one
-more to judge.
+more to judge, or all T where a policy's prompt fills the window.
 DIFFERS: the release has no padded windows, accepts windows whose last chunk runs up to stride - 1 actions
 past the end of the episode, into the next one, drops the last window of a dataset, and keeps
 non-overlapping windows only (reference section 5.6).

@@ -90,8 +90,8 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
     require(
         not lines,
         f"{'; '.join(lines)}. Leave it out of the study (of --data, or with --set datasets=...), or change the "
-        f"settings of windows: rate={study.rate}, eval.prompt_frames={study.eval.prompt_frames} and one more, "
-        f"store.min_val={study.store.min_val}",
+        f"settings of windows: rate={study.rate}, eval.prompt_frames={study.eval.prompt_frames} (held-out windows of at "
+        f"least {min(study.eval.prompt_frames + 1, study.model.frames)} frames), store.min_val={study.store.min_val}",
     )
 
 
