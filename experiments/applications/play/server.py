@@ -8,7 +8,7 @@ import ipaddress
 import json
 import logging
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
@@ -35,17 +35,25 @@ HEARTBEAT = 20.0
 """Seconds between questions whether a silent visitor is still there."""
 
 REQUEST_SECONDS = 30.0
-"""Within which a connection must have sent a whole request, its first or a further one, or it is closed. aiohttp's own
-limit is an hour: a few hundred half requests would take all the connections that the process may have."""
+"""Within which a connection must have sent a whole request, its first or a further one, or it is closed; aiohttp's own
+limit is an hour. The time stands still while an answer is being written, which may be for ever."""
 
 EXTRA_CONNECTIONS = 32
-"""Connections beyond the number of sessions that are accepted; further ones are refused."""
+"""Websockets beyond the number of sessions that are accepted; further ones are refused."""
+
+OTHER_CONNECTIONS = 64
+"""Connections that are no websocket, of which the oldest is closed for one more: so newcomers always get in, and
+connections that send nothing, or read no answer, do not take all the file descriptors of the process."""
+
+BACKLOG = 32
+"""Connections that are accepted at once. So many may come before the first of them counts."""
 
 MAX_DOWNLOADS = 2
 """Of one visitor, one of each kind, that are being made or wait; for more there is 429."""
 
 SESSIONS = web.AppKey("sessions", SessionManager)
-SOCKETS = web.AppKey("sockets", set)
+SOCKETS = web.AppKey("sockets", dict)
+"""Websockets and the transport of each."""
 DOWNLOADS = web.AppKey("downloads", ThreadPoolExecutor)
 """Of one thread: downloads are made one after the other, or they would take the cores from those who drive."""
 REFUSED = web.AppKey("refused", set)
@@ -64,7 +72,7 @@ def make_app(
     (default: all) act at once, until `SESSIONS` is told that more can. It answers at localhost, at IP addresses and at
     `public_names`."""
     app = web.Application(client_max_size=LARGEST_MESSAGE, middlewares=[_refuse_other_names(public_names)])
-    app[SOCKETS], app[REFUSED] = set(), set()
+    app[SOCKETS], app[REFUSED] = {}, set()
     app.cleanup_ctx.append(lambda app: _manage_sessions(app, simulator, truth, max_acting))
     about = json.dumps(describe(simulator, truth))
     page = files("experiments.applications.play").joinpath("page.html").read_text()
@@ -86,12 +94,27 @@ async def serve(app: web.Application, host: str, port: int, ready: Callable[[int
     """Serves until cancelled; `ready` is told the port, which port 0 leaves open. Raises OSError for a taken one."""
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0, keepalive_timeout=REQUEST_SECONDS)
     await runner.setup()
+    requests, sockets = runner.server, app[SOCKETS]
     try:
-        await web.TCPSite(runner, host, port).start()
-        ready(runner.addresses[0][1])
-        await asyncio.Event().wait()
+        listening = await asyncio.get_running_loop().create_server(
+            lambda: _admit(requests, sockets), host, port, backlog=BACKLOG
+        )
+        with contextlib.closing(listening):
+            ready(listening.sockets[0].getsockname()[1])
+            await asyncio.Event().wait()
     finally:
         await runner.cleanup()
+
+
+def _admit(
+    requests: web.Server, sockets: Mapping[web.WebSocketResponse, asyncio.Transport | None]
+) -> web.RequestHandler:
+    """What answers a new connection. Older ones are closed so that OTHER_CONNECTIONS are no websocket."""
+    websockets = set(sockets.values())
+    others = [c.transport for c in requests.connections if c.transport is not None and c.transport not in websockets]
+    for transport in others[: max(0, len(others) + 1 - OTHER_CONNECTIONS)]:  # they are in the order of their arrival
+        transport.abort()  # one who does not read would keep a connection that is closed in peace
+    return requests()
 
 
 async def _manage_sessions(
@@ -193,7 +216,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
         raise web.HTTPServiceUnavailable(text="too many connections")
     socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=HEARTBEAT)
     await socket.prepare(request)
-    sockets.add(socket)
+    sockets[socket] = request.transport
     try:
         visitor = sessions.connect(request.query.get("token"))
         await _serve_connection(sessions, visitor, socket, request.transport)
@@ -201,7 +224,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
         await socket.send_str(json.dumps({"type": "full", "message": "all places are taken; try again later"}))
         await socket.close(code=1013)
     finally:
-        sockets.discard(socket)
+        del sockets[socket]
     return socket
 
 

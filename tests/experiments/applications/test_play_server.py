@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import resource
+import socket
 import threading
 import time
 from copy import copy
@@ -345,9 +346,13 @@ def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch, many
     serving(test)
 
 
-def test_a_request_that_is_never_finished_ends_its_connection_and_a_visitor_who_waits_stays(monkeypatch):
-    """Each kept its connection for an hour: as many as the process may have kept everybody out."""
-    monkeypatch.setattr(server, "REQUEST_SECONDS", 0.3)
+def listening(test, monkeypatch) -> None:
+    """Runs `test(port, player, connections)` against `serve`. The player is in; `connections()` are the open ones."""
+    runners, make = [], server.web.AppRunner
+    monkeypatch.setattr(server.web, "AppRunner", lambda *what, **how: runners.append(make(*what, **how)) or runners[-1])
+
+    def connections():
+        return [c for c in runners[0].server.connections if c.transport is not None]
 
     async def main() -> None:
         sim, ports = simulator(), asyncio.Queue()
@@ -357,20 +362,50 @@ def test_a_request_that_is_never_finished_ends_its_connection_and_a_visitor_who_
         async with ClientSession("http" + f"://127.0.0.1:{port}") as client:
             player = Player(client)
             await player.enter("pusher")
-            for half in (
-                b"",
-                b"GET / HTTP/1.1\r\nHost: localhost\r\n",
-                b"GET /robots HTTP/1.1\r\nHost: localhost\r\n\r\nGET",
-            ):
-                reader, writer = await asyncio.open_connection("127.0.0.1", port)
-                writer.write(half)
-                await asyncio.wait_for(reader.read(), 10)  # to its end
-                writer.close()
+            await test(port, player, connections)
             assert (await ask(player.socket, type="act", action=[0.0, 0.0]))["type"] == "frame"
         serve.cancel()
         await asyncio.gather(serve, return_exceptions=True)
 
     asyncio.run(main())
+
+
+def test_a_request_that_is_never_finished_ends_its_connection_and_a_visitor_who_waits_stays(monkeypatch):
+    """Each kept its connection for an hour: as many as the process may have kept everybody out."""
+    monkeypatch.setattr(server, "REQUEST_SECONDS", 0.3)
+
+    async def test(port, player, _):
+        for half in (
+            b"",
+            b"GET / HTTP/1.1\r\nHost: localhost\r\n",
+            b"GET /robots HTTP/1.1\r\nHost: localhost\r\n\r\nGET",
+        ):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(half)
+            await asyncio.wait_for(reader.read(), 10)  # to its end
+            writer.close()
+
+    listening(test, monkeypatch)
+
+
+def test_answers_that_nobody_reads_keep_no_newcomer_out(monkeypatch):
+    """They keep their connections for ever: aiohttp's limits do not hold while an answer is being written."""
+    monkeypatch.setattr(server, "OTHER_CONNECTIONS", 5)
+
+    async def test(port, player, connections):
+        loop, held = asyncio.get_running_loop(), contextlib.ExitStack()
+        with held:
+            for _ in range(25):
+                connection = held.enter_context(socket.socket())
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+                connection.setblocking(False)
+                await loop.sock_connect(connection, ("127.0.0.1", port))
+                await loop.sock_sendall(connection, b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200)
+            async with ClientSession("http" + f"://127.0.0.1:{port}") as newcomer, newcomer.get("/") as answer:
+                assert "<!doctype html>" in await asyncio.wait_for(answer.text(), 10)
+                assert len(connections()) <= 5 + 1, "those and the visitor's"
+
+    listening(test, monkeypatch)
 
 
 def test_one_who_never_reads_is_let_go_and_others_play_on(monkeypatch):
