@@ -192,7 +192,8 @@ def save_record(workspace: Workspace, record: Record) -> None:
 
 
 def find_record(workspace: Workspace) -> Record | None:
-    """The study that lives there, as this or an earlier version recorded it; None without any.
+    """The study that lives there, as this or an earlier version recorded it; None without any, and where a file is in
+    place of the directory.
 
     Raises ConfigError if its file cannot be read.
     """
@@ -204,7 +205,7 @@ def find_record(workspace: Workspace) -> Record | None:
         if values.get("provenance"):
             values["provenance"] = to_dict(inputs_of(values["provenance"]))
         return from_dict(Record, values)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(

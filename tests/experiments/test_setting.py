@@ -146,6 +146,14 @@ def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkey
     assert make_setting(where).study.trajectory_counts == caps == (10, 30, 1000)
 
 
+def test_a_file_in_place_of_the_directory_is_named_with_data_too(world, monkeypatch, capsys, tmp_path):
+    """Its study.json was looked for, and that it is no directory read as a failure of the disk."""
+    monkeypatch.chdir(world)
+    (tmp_path / "taken").touch()
+    command = ["--preset", "smoke", "--data", f"bridge/{ARM.name}", "--out", str(tmp_path / "taken")]
+    assert main(["tokenize", *command]) == 2 and "is a file" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_command_means_the_same_in_another_directory(world, monkeypatch, tmp_path):
     monkeypatch.chdir(world)
     setting = make_setting(StudyArguments("smoke", Path("out"), (f"bridge/{ARM.name}",), tokenizer=None))
