@@ -67,7 +67,8 @@ def run_study(
     study, workspace = setting.study, setting.workspace
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
-    sweeps, sources = plan_asked(study, axes), trial_closure()  # a later change is refused by the trials
+    sweeps = plan_asked(study, axes, workspace.root)
+    sources = trial_closure()  # a later change is refused by the trials
     require_trainable(study, sweeps, launcher_options)
     if setting.data:
         say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])

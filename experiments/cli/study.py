@@ -83,7 +83,8 @@ def _run(
         from experiments.scale import say_points, say_prepared_here, say_scale, say_unused
         from experiments.trainable import check_launched
 
-        sweeps, given, trained = plan_asked(setting.study, axes), bool(setting.data), setting.tokenizer is None
+        sweeps = plan_asked(setting.study, axes, setting.workspace.root)
+        given, trained = bool(setting.data), setting.tokenizer is None
         if given:
             check_entries(setting.study, setting.data)
         devices = Devices(check_launched(setting.study, sweeps, launcher_options), launcher_options.at_once)

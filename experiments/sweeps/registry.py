@@ -78,14 +78,16 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
     return importlib.import_module(f"experiments.sweeps.{axis}").plan
 
 
-def plan_asked(study: Study, axes: Sequence[str]) -> list[Sweep]:
-    """The sweeps along `axes` that are asked for now. Raises ConfigError as `plan_sweeps` does, and for one without a
-    point at its reference, which a study of an earlier version may have."""
+def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
+    """The sweeps along `axes` that are asked for now, of a study in `root`. Raises ConfigError as `plan_sweeps` does,
+    and for a new one without a point at its reference. Of those that the study keeps the files, some were accepted by
+    earlier versions."""
     sweeps = plan_sweeps(study, axes)
     for axis, sweep in zip(axes, sweeps, strict=True):
         values = tuple(dict.fromkeys(p.x for p in sweep.points if p.role != CONTROL))
+        kept = is_file(axis) and Path(axis).resolve().parent == (root / KEPT).resolve()
         require(
-            sweep.reference_x is None or sweep.reference_x in values,
+            kept or sweep.reference_x is None or sweep.reference_x in values,
             f"{axis}: reference_x {sweep.reference_x} is not among the values {values}, so its control would have no trial "
             "beside it; add it",
         )
