@@ -83,11 +83,18 @@ class LeRobotSource:
             "files": sizes,
             "cameras": list(self.cameras),
             "short_side": self.short_side,
+            # Conversions by earlier versions do not count these, so they are other ones.
+            **({"lost": self._lost} if self._lost else {}),
         }
 
+    @property
+    def _lost(self) -> int:
+        """Episodes that the meta folder does not list, though it should."""
+        return self.meta.stated - len(self.units) if self.meta.lost_why else 0
+
     def read(self, unit: int) -> Iterator[Episode | Skipped]:
-        if unit == 0 and self.meta.lost_why:
-            yield from [Skipped(without_advice(self.meta.lost_why))] * (self.meta.stated - len(self.units))
+        if unit == 0:
+            yield from [Skipped(without_advice(self.meta.lost_why))] * self._lost
         entry = self.meta.episodes[unit]
         where = f"{entry.data}: episode {entry.index}"
         table = self.rows(entry, [TASK, SUCCESS, REWARD, *self.vectors.values()])
