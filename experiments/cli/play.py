@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from data_pipelines.true_simulator import TrueSimulator
     from hma_jax.simulator.robots import Robot
 
+EVERYWHERE = ("0.0.0.0", "::")
+"""Addresses that stand for all of this computer's, none of which a browser can be sent to."""
+
 
 def play(
     run: Annotated[Positional[Path], arg(metavar="RUN")] = DRIVEN,
@@ -112,8 +115,9 @@ def play(
     )
 
     def ready(actual: int) -> None:
-        shown = "localhost" if host == "127.0.0.1" else host
-        say(f"drive it at http://{shown}:{actual} (end with Ctrl-C)")
+        shown = "localhost" if host in ("127.0.0.1", *EVERYWHERE) else host
+        others = ", from other computers at this one's address" if host in EVERYWHERE else ""
+        say(f"drive it at http://{_place(shown, actual)}{others} (end with Ctrl-C)")
         if visitors > 1:  # in the background: until programs for several visitors are compiled, these take turns
             compiling.start()
 
@@ -125,7 +129,12 @@ def play(
         raise
     except OSError as error:
         raise ConfigError(
-            f"cannot listen on {host}:{port}: {error.strerror}; choose another --host or --port"
+            f"cannot listen on {_place(host, port)}: {error.strerror}; choose another --host or --port"
         ) from error
     finally:
         ended.set()
+
+
+def _place(host: str, port: int) -> str:
+    """As in a URL, where an IPv6 address stands in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -106,6 +106,28 @@ def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(
         assert deaf == known[0]["deaf"] == (setting == "passive")
 
 
+@pytest.mark.parametrize(
+    ("host", "said"),
+    [
+        ("127.0.0.1", "localhost:8765 (end"),
+        ("::1", "[::1]:8765 (end"),
+        ("::", "localhost:8765, from other computers at this one's address (end"),
+        ("0.0.0.0", "localhost:8765, from other computers at this one's address (end"),
+        ("robots.lan", "robots.lan:8765 (end"),
+    ],
+)
+def test_the_address_that_it_prints_can_be_opened(host, said, monkeypatch, tmp_path, capsys):
+    from experiments.applications import simulators
+
+    async def serve(app, host, port, ready):
+        ready(port)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    assert main(["play", str(tmp_path), "--visitors", "1", "--host", host]) == 0
+    assert f"drive it at http://{said}" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monkeypatch, tmp_path, capsys):
     """An unknown host was told to choose another port."""
     from experiments.applications import simulators
