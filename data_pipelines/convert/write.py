@@ -25,6 +25,7 @@ from data_pipelines.publishing.journal import Journal
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.convertible import ConvertibleSource, Skipped, UnitError
+from data_pipelines.sources.rlds.schema import RATE_KEY
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
 from hma_jax.config import require
@@ -178,7 +179,7 @@ def _finish(
         lengths=[s.records for _, s in kept],
         size=sum(s.size for _, s in kept),
         description=source.description,
-        metadata={**metadata, "hz": source.hz, "left_out": skipped},
+        metadata={**metadata, RATE_KEY: source.hz, "left_out": skipped},
         module="data_pipelines.convert",
     )
     for stray in [*partial.glob("part-*"), *partial.glob(".*")]:  # hidden files are of killed writers

@@ -14,6 +14,7 @@ from data_pipelines.inspection.suggest import NO_CAMERA, WindowFacts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import TURN, angle_lines
 from data_pipelines.sources.rlds.schema import field_slice
+from data_pipelines.sources.source import same_rate
 
 MISFIT = "entry does not fit"
 
@@ -94,7 +95,7 @@ def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
 
 def _rate(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
     """Formats that say their rate say it of the recording; another one makes another stride of it."""
-    if entry is None or facts.hz is None or facts.hz == entry.hz:
+    if entry is None or facts.hz is None or same_rate(facts.hz, entry.hz):
         return []
     return [Issue("warning", "another rate", f"its files say {facts.hz:g} Hz, but {entry.hz:g} Hz are used")]
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from data_pipelines.sources.source import Corrupt, EpisodeSource, OpenEpisode
+from data_pipelines.sources.source import Corrupt, EpisodeSource, OpenEpisode, same_rate
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class JoinedSource(EpisodeSource):
         known = [part for part in self.parts if part.hz is not None]
         for part in known:
             require(
-                part.hz == known[0].hz,
+                same_rate(part.hz, known[0].hz),
                 f"{self.name} joins recordings of different rates: {known[0].location} at {known[0].hz:g} Hz, "
                 f"{part.location} at {part.hz:g} Hz. Leave one of them out of `joins`, with an entry of its own.",
             )

@@ -7,6 +7,7 @@ cameras and action fields, and counting unusable episodes.
 from __future__ import annotations
 
 import functools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -224,6 +225,11 @@ class EpisodeSource(ABC):
                 f"{self.name}: {total} episodes cannot be used, more than max_skipped={self.max_skipped}. The last: "
                 f"{without_advice(reason)} To use the others, raise the limit: --set store.max_skipped=N."
             )
+
+
+def same_rate(hz: float, other: float) -> bool:
+    """Whether two rates are the same number, of which one may have been printed and typed again (six digits)."""
+    return math.isclose(hz, other, rel_tol=1e-5)
 
 
 def find_instruction(record: Mapping[str, Any]) -> str:

@@ -106,8 +106,7 @@ def generate(
     _print_comparison(comparison, done.episodes)
     written = [done.directory, done.directory.parent / "psnr.csv"]
     written += [done.directory.parent / "clips"] if clips else []
-    entry = ("--hz", f"{source.hz:g}", "--entry", f"{called}.toml")
-    wrote(*written, then=command("data inspect", done.directory, *entry))
+    wrote(*written, then=command("data inspect", done.directory, "--entry", f"{called}.toml"))
 
 
 def _print_comparison(comparison: Comparison, episodes: int) -> None:

@@ -46,7 +46,7 @@ def make_store(
 
     made_with, settings = load_tokenizer(tokenizer or workspace.tokenizer), to_dict(study.store)
     require_same("tokens", workspace.store, _differences(study, workspace, sources, made_with), replace)
-    _say_other_rates(study, sources)
+    say_other_rates(study, sources)
     say_unreached_rates(study, sources)
     how = {k: v for k, v in (("batch", batch), ("threads", threads)) if v is not None}
     workspace.store.mkdir(parents=True, exist_ok=True)
@@ -80,16 +80,13 @@ def data_differences(study: Study, workspace: Workspace, data: Sequence[str], to
     return [line for line in lines if line.startswith(("spec.", "source:"))]
 
 
-def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
+def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
     """Of datasets whose files say another native rate than their entry, which counts."""
-    from data_pipelines.sources.joined import Parts
-    from data_pipelines.sources.open import find_format
+    from data_pipelines.sources.source import same_rate
 
     for spec, path in sources:
-        places = path.places if isinstance(path, Parts) else (path,)
-        silent = all(find_format(place) == "rlds" for place in places)  # RLDS says none
-        own = None if silent else open_source((spec, path), study.store).hz
-        if own not in (None, spec.hz):
+        own = open_source((spec, path), study.store).hz
+        if own is not None and not same_rate(own, spec.hz):
             say(
                 f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "
                 "if the files are right, correct the entry"

@@ -46,7 +46,7 @@ def test_a_conversion_says_what_it_wrote_the_entry_and_what_is_next(tmp_path, ca
     )
     assert "`--entry FILE.toml`" in out and "--registry" in out
     assert f"wrote {tmp_path}/rlds/robomimic_lift/1.0.0" in out
-    assert f"next: hma data inspect {tmp_path}/rlds/robomimic_lift/1.0.0 --hz 20" in out
+    assert f"next: hma data inspect {tmp_path}/rlds/robomimic_lift/1.0.0\n" in out
     assert main(command) == 0 and "3 episodes" in said(capsys)  # found done
 
 

@@ -108,6 +108,19 @@ def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, 
     assert f"--registry {entries}" in capsys.readouterr().out
 
 
+def test_the_rate_that_the_files_say_is_written_and_another_one_told(robot, tmp_path, capsys):
+    """As of what was generated at 5 / 3 Hz; the command printed --hz 1.66667 before."""
+    (robot / "metadata.json").write_text(json.dumps({"generated": True, "hz": 5 / 3}))
+    file = tmp_path / "my.toml"
+    asked = ["data", "inspect", str(robot), "--entry", str(file), "--out", str(tmp_path)]
+    for more, hz, told in ((), 5 / 3, False), (("--hz", "1.66667"), 1.66667, False), (("--hz", "4"), 4, True):
+        assert main([*asked, *more]) == 0
+        said = capsys.readouterr().out
+        assert toml_file.load_entries(file)[0].hz == hz
+        assert ("note: --hz 4 is used, although the dataset's own files say 1.66667 Hz" in said) == told
+        assert ("although its files say" in said) == told
+
+
 def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ["--hz", "4", "--entry", "my entries.toml", "--frames", "3", "--out", "sheets"]

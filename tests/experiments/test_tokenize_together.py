@@ -25,6 +25,7 @@ from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import asked, pipeline, sources
 from experiments.preparing.asked import write_asked
 from experiments.preparing.sources import say_unreached_rates
+from experiments.preparing.store import say_other_rates
 from experiments.progress import Eta
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting
@@ -255,6 +256,15 @@ def test_a_rate_above_the_recording_s_is_told(capsys):
     )
     say_unreached_rates(replace(STUDY, rate=None), sources)
     assert not capsys.readouterr().out
+
+
+def test_a_rate_that_the_files_of_rlds_say_otherwise_than_the_entry_is_told(tmp_path, capsys):
+    rlds = write_rlds(tmp_path, ARM, LENGTHS)
+    for hz in (ARM.hz, ARM.hz / 2):
+        (rlds / "metadata.json").write_text(json.dumps({"hz": hz}))
+        say_other_rates(STUDY, [(ARM, rlds)])
+        said = f"{ARM.name}: its files say {hz:g} Hz, but its registry entry {ARM.hz:g} Hz, which is used"
+        assert (said in capsys.readouterr().out) == (hz != ARM.hz)
 
 
 def test_of_many_losses_some_are_named(tmp_path, capsys):

@@ -22,7 +22,15 @@ from data_pipelines.sources.rlds.example import Feature, parse_record
 from data_pipelines.sources.rlds.frame_spans import FrameSpanCache
 from data_pipelines.sources.rlds.index import index_path, load_index
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing_shard
-from data_pipelines.sources.rlds.schema import field_slice, listing, read_info, read_metadata, resolve_version, step_key
+from data_pipelines.sources.rlds.schema import (
+    field_slice,
+    listing,
+    read_info,
+    read_metadata,
+    read_rate,
+    resolve_version,
+    step_key,
+)
 from data_pipelines.sources.rlds.steps import load_steps, save_steps
 from data_pipelines.sources.rlds.tfrecord import open_record, read_parts, scan_shard
 from data_pipelines.sources.source import (
@@ -89,6 +97,10 @@ class RldsDataset(EpisodeSource):
         declared = np.asarray([run.count for run in self.runs], np.int64)
         missing_before = np.cumsum(declared) - declared - (self._index.ends - records)
         return np.arange(len(self), dtype=np.int64) + np.repeat(missing_before, records)
+
+    @functools.cached_property
+    def hz(self) -> float | None:
+        return read_rate(self.directory)
 
     def fingerprint(self) -> str:
         """Hash over the shards' names and sizes and the length and checksum of every record."""

@@ -1,18 +1,19 @@
-"""The metadata of an RLDS directory: its version directory, the fields of a step, its splits and shards.
+"""The metadata of an RLDS directory: its version directory, the fields of a step, its splits and shards, its rate.
 
-Owns reading features.json and dataset_info.json as tfds wrote them. Reads no record, and imports neither tfds nor the
-classes that the files name; the files may be of unknown origin, on a disk or in a remote store.
+Owns reading features.json, dataset_info.json and metadata.json as tfds wrote them. Reads no record, and imports neither
+tfds nor the classes that the files name; the files may be of unknown origin, on a disk or in a remote store.
 """
 
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.json_file import read_object
 from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
@@ -22,7 +23,10 @@ from hma_jax.config import ConfigError, require
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
-INFO, FEATURES = "dataset_info.json", "features.json"
+INFO, FEATURES, METADATA = "dataset_info.json", "features.json", "metadata.json"
+RATE_KEY = "hz"
+"""The key of metadata.json under which writers of this package say native frames per second."""
+
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 """tfds's default template of shard names."""
 
@@ -182,6 +186,22 @@ def read_info(directory: Location) -> DatasetInfo:
     except ValueError as error:
         raise DataError(f"{path}: {error}. {ADVICE}") from error
     return DatasetInfo(name, version, file_format, {split.name: split for split in splits})
+
+
+def read_rate(directory: Location) -> float | None:
+    """Native frames per second, as metadata.json says (`RATE_KEY`). None where it holds no rate, is missing or is no
+    JSON: nothing else is read from it, and others may keep anything there. UnreachableError where the disk or the store
+    fails."""
+    path = directory / METADATA
+    if not exists(path, "file"):
+        return None
+    try:
+        hz = read_object(path, if_missing=ADVICE, advice=ADVICE).get(RATE_KEY)
+    except UnreachableError:
+        raise
+    except DataError:
+        return None
+    return float(hz) if type(hz) in (int, float) and 0 < hz < math.inf else None
 
 
 def _split(values: Any) -> SplitInfo:

@@ -14,6 +14,7 @@ import numpy as np
 from data_pipelines.names import made_name
 from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.schema import RATE_KEY
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import (
     STEP_FIELDS,
@@ -104,7 +105,7 @@ class Recording:
             write_info(
                 place, name=name, features=features, lengths=[1], size=len(record),
                 description=f"One episode of {self.robot.name}, played by hand in a learned simulator.",
-                metadata={**({"hz": self.rate} if self.rate else {}), "stride": self.robot.stride, "generated": True},
+                metadata={**({RATE_KEY: self.rate} if self.rate else {}), "stride": self.robot.stride, "generated": True},
                 module="experiments.applications.play",
             )  # fmt: skip
             return _zipped(Path(folder))

@@ -159,13 +159,12 @@ def _convert(
         say(f"left out {count:,} x: {reason}")
     if unsupported_images:
         say(unsupported_images_text(unsupported_images))
-    inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
     say(
         "to read it, a registry entry of this name is needed: add `--entry FILE.toml` to the next command, and give "
         "that file to all others with --registry; or add this to data_pipelines/registry/own.py:"
     )
     say(f"    {entry(done.spec)}")
-    wrote(done.directory, then=inspect)
+    wrote(done.directory, then=command("data inspect", done.directory))
 
 
 def entry(spec: DatasetSpec) -> str:

@@ -101,9 +101,10 @@ def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | N
     """What to run first where a known dataset was looked at with another native rate than its entry's, which is the
     one that a study takes; None where they agree."""
     from data_pipelines.registry import find_reader
+    from data_pipelines.sources.source import same_rate
 
     known = find_reader(facts.name)
-    if known is None or hz is None or known.hz == hz:
+    if known is None or hz is None or same_rate(known.hz, hz):
         return None
     if known.joins:
         return f"correct hz in the entry of {known.name}, by which a study reads this at {known.hz:g} Hz, not {hz:g}"

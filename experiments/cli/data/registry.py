@@ -132,7 +132,8 @@ def data_inspect(
     Args:
         directory: The dataset: an RLDS directory (<name> or <name>/<version>, a path or URL), the root of a
             LeRobot dataset, or a robomimic .hdf5 file.
-        hz: Native frames per second, if the files do not contain it (those of LeRobot and robomimic do).
+        hz: Native frames per second, if the files do not contain it (those of LeRobot and robomimic do, and what
+            was converted, generated or played here).
         split: The split to read.
         out: Directory for contact_sheet.png. Default: runs/inspect/NAME.
         episodes: Number of episodes to read, drawn at random; fewer if they have more than 2 GB in all.
@@ -181,6 +182,7 @@ def data_inspect(
     if entry is not None:
         _write_entry(entry, suggestion)
         _say_displaced(own.get(facts.name), suggestion.spec(), entry)
+    _say_other_rate(facts, hz)
     if known is not None or entry is not None:
         _say_next(facts, windows, entry or registry, other_rate(facts, rate, registry) if taken else None)
 
@@ -190,11 +192,12 @@ def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetS
     by the user; `taken`: the registry entry by which the dataset will be read."""
     from data_pipelines.inspection.suggest import window_facts
     from data_pipelines.registry.spec import stride_of
+    from data_pipelines.sources.source import same_rate
 
     stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate)
     windows = window_facts(facts, stride, frames)
     source = "" if hz or not taken else " (registry)"
-    if facts.hz not in (None, rate):
+    if facts.hz is not None and not same_rate(facts.hz, rate):
         source += f", although its files say {facts.hz:g}"
     console.print(
         f"[bold]rate[/] {rate:g} Hz{source}: stride {stride}, "
@@ -327,6 +330,18 @@ def _say_displaced(own: DatasetSpec | None, spec: DatasetSpec, path: Path) -> No
         say(
             f"note: this takes the place of the project's entry of {own.name}, in commands with --registry {path} (there "
             f"-> here): {'; '.join(lines)}; to keep that, remove it from {path}"
+        )
+
+
+def _say_other_rate(facts: Facts, hz: float | None) -> None:
+    """Says that the user's rate is not that of the files, which counts no more. It may be the right one: a file of
+    another's may be wrong, and a model was trained at the rate that somebody gave its robot."""
+    from data_pipelines.sources.source import same_rate
+
+    if hz is not None and facts.hz is not None and not same_rate(hz, facts.hz):
+        say(
+            f"note: --hz {hz:g} is used, although the dataset's own files say {facts.hz:g} Hz; if they are right, run this "
+            "again without --hz"
         )
 
 

@@ -156,7 +156,8 @@ def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None)
         if not f.cameras:
             after = "leave it out, or write it again with its pictures stored as images: it has no camera"
         elif not v.registered:
-            words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", file)
+            native = () if v.hz and v.hz == f.hz else ("--hz", f"{v.hz:g}" if v.hz else "HZ")
+            words = command("data inspect", f.directory, *native, "--entry", file)
             after = f"{words}  # it is not in the registry; this writes its entry"
         elif any(r.title == MISFIT for r in v.issues):
             after = f"{command('data inspect', f.directory)}  # it says what the registry's entry should be"

@@ -79,7 +79,7 @@ def test_every_episode_is_written_once_in_order_with_its_facts(tmp_path):
     assert record["episode_metadata/file_path"] == [b"u1/0"]
     assert record["steps/reward"].tolist() == [0, 1, 2]
     metadata = json.loads((done.directory / "metadata.json").read_text())
-    assert metadata["hz"] == 5 and metadata["left_out"] == {"nothing in it": 3}
+    assert metadata["hz"] == dataset.hz == 5 and metadata["left_out"] == {"nothing in it": 3}
     assert sorted(p.name for p in (tmp_path / "toy").iterdir()) == ["1.0.0"]
 
 

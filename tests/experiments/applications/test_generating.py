@@ -84,7 +84,7 @@ def test_recorded_actions_are_replayed_and_a_killed_command_goes_on(run, recorde
     source = RldsDataset(recorded, "val")
     metadata = json.loads(content(tmp_path / "whole")["metadata.json"])
     assert metadata["actions"]["dataset"] == "pusher_sand" and metadata["hz"] == 2.0 and metadata["stride"] == 2
-    assert len(made) == len(source) == 5
+    assert len(made) == len(source) == 5 and made.hz == 2
     for i in range(5):
         mine = made.episode(i, "observation/image", ("action",))
         truth = open_trajectories(str(recorded), "val", ROBOT, {}, load_tokenizer(run.parent / "tokenizer"), run)[0][i]

@@ -123,6 +123,24 @@ def test_damaged_metadata(directory, file, content):
         RldsDataset(directory)
 
 
+@pytest.mark.parametrize(
+    ("content", "hz"),
+    [
+        ('{"hz": 2.5}', 2.5),
+        ('{"hz": 0}', None),
+        ('{"hz": "5"}', None),
+        ('{"hz": NaN}', None),
+        ("[]", None),
+        ("{", None),
+    ],
+)
+def test_the_rate_is_that_of_the_metadata_where_they_have_one(directory, content, hz):
+    """What else is in the file, which others may have written, is no reason not to read the episodes."""
+    assert RldsDataset(directory).hz is None
+    (directory / "metadata.json").write_text(content)
+    assert RldsDataset(directory).hz == hz
+
+
 def test_missing_features(directory):
     (directory / "features.json").unlink()
     with pytest.raises(DataError, match="features.json is missing"):
