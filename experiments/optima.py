@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
 from scipy.special import stdtrit  # not scipy.stats, which takes most of a second to import
@@ -58,14 +58,15 @@ def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
         own = of_sweep(rows, sweep.name)
         for metric, scope in LOSSES.items():
             for role, series in all_series(own, sweep.name).items():
-                curves = {s: curve(own, sweep.name, metric, role, scope, s) for s in series}
-                best = {s: lowest(points, diverged(own, sweep.name, role, s)) for s, points in curves.items()}
-                base = best.get(sweep.base)
+                curves = {
+                    s: candidates(curve(own, sweep.name, metric, role, scope, s), diverged(own, sweep.name, role, s))
+                    for s in series
+                }
                 of_base = curves.get(sweep.base, [])
                 found += [
-                    _optimum(own, sweep.name, metric, role, s, curves[s], point, base, of_base)
-                    for s, point in best.items()
-                    if point
+                    _optimum(own, sweep.name, metric, role, s, points, best, of_base)
+                    for s, points in curves.items()
+                    if (best := lowest(points))
                 ]
     return found
 
@@ -81,10 +82,14 @@ def ends(rows: Iterable[Row], sweep: str, role: str, series: str) -> set[float]:
     return set(tried[:1] + tried[-1:])
 
 
-def lowest(points: Sequence[CurvePoint], excluded: set[float]) -> CurvePoint | None:
-    """The best point of a curve, if any has a finite mean and is not `excluded`."""
-    candidates = [p for p in points if p.x not in excluded and math.isfinite(p.mean)]
-    return min(candidates, key=lambda p: p.mean, default=None)
+def candidates(points: Iterable[CurvePoint], excluded: Set[float]) -> list[CurvePoint]:
+    """The points of a curve that have a finite mean and are not `excluded`."""
+    return [p for p in points if p.x not in excluded and math.isfinite(p.mean)]
+
+
+def lowest(points: Iterable[CurvePoint], excluded: Set[float] = frozenset()) -> CurvePoint | None:
+    """The best of the `candidates` of a curve, if it has any."""
+    return min(candidates(points, excluded), key=lambda p: p.mean, default=None)
 
 
 def _optimum(
@@ -95,24 +100,19 @@ def _optimum(
     series: str,
     points: Sequence[CurvePoint],
     best: CurvePoint,
-    base: CurvePoint | None,
     of_base: Sequence[CurvePoint],
 ) -> Optimum:
+    """`points` and `of_base` are the candidates of the curve and of the base series."""
     transferred, moved, penalties = math.nan, math.nan, [math.nan]
-    diverged_x = diverged(rows, sweep, role, series)
-    low, high = as_good(points, best, diverged_x)
-    if base:
+    low, high = as_good(points, best, {r.x for r in _of(rows, sweep, role, series)})
+    if base := lowest(of_base):
         transferred, grid = base.x, sorted({r.x for r in rows if r.sweep == sweep})
         moved = grid.index(best.x) - grid.index(base.x)
         transferred_point = next((p for p in points if p.x == base.x), None)
-        if base.x in diverged_x:
+        if base.x in diverged(rows, sweep, role, series):
             penalties = [math.inf]
         elif transferred_point:
-            penalties = (
-                cross_validated_penalties(points, of_base, diverged_x)
-                or _by_seed(transferred_point, best)
-                or [math.nan]
-            )
+            penalties = cross_validated_penalties(points, of_base) or _by_seed(transferred_point, best) or [math.nan]
     return Optimum(
         sweep, metric, role, series, best.x,
         edge="edge" if ends(rows, sweep, role, series) & {low, high} else "",
@@ -121,14 +121,14 @@ def _optimum(
     )  # fmt: skip
 
 
-def as_good(points: Sequence[CurvePoint], best: CurvePoint, excluded: set[float]) -> tuple[float, float]:
-    """(lowest, highest x) of the points around `best` that seeds do not tell from it: paired, with 95 % and one side.
+def as_good(points: Sequence[CurvePoint], best: CurvePoint, grid: set[float]) -> tuple[float, float]:
+    """(lowest, highest x) of the candidates around `best` that seeds do not tell from it: paired, 95 % and one side.
 
-    The range ends before the first point that they do tell, that is `excluded`, or has no error. Of a point that
-    scatters more than the curve's median one, the median error counts: where training is about to diverge, seeds
-    scatter so much that no loss could be told from the best.
+    The range ends before the first point that they do tell or that has no error, and before an x of the `grid` without
+    a candidate. Of a point that scatters more than the curve's median one, the median error counts: where training is
+    about to diverge, seeds scatter so much that no loss could be told from the best.
     """
-    others = [p for p in points if p.x != best.x and p.x not in excluded]
+    others = [p for p in points if p.x != best.x]
     beside = {p.x: difference(p, best) for p in others}
     usual = statistics.median([error for _, error in beside.values() if math.isfinite(error)] or [math.nan])
 
@@ -137,20 +137,18 @@ def as_good(points: Sequence[CurvePoint], best: CurvePoint, excluded: set[float]
         seeds = len(_by_seed(point, best))
         return not math.isfinite(error) or mean > -stdtrit(seeds - 1, 0.05) * min(error, usual)
 
-    apart = excluded | {p.x for p in others if told(p)}
+    apart = grid - {p.x for p in points} | {p.x for p in others if told(p)}
     below = max((x for x in apart if x < best.x), default=-math.inf)
     above = min((x for x in apart if x > best.x), default=math.inf)
     near = [p.x for p in points if below < p.x < above]
     return min(near), max(near)
 
 
-def cross_validated_penalties(
-    points: Sequence[CurvePoint], of_base: Sequence[CurvePoint], diverged_x: set[float]
-) -> list[float]:
+def cross_validated_penalties(points: Sequence[CurvePoint], of_base: Sequence[CurvePoint]) -> list[float]:
     """What each seed of a curve loses by the base's best x instead of its own curve's, where both are chosen by the
-    other seeds. [] with fewer than two seeds that every point of both curves has."""
-    own, base = ({p.x: p.seeds for p in curve if p.x not in diverged_x} for curve in (points, of_base))
-    base = {x: seeds for x, seeds in base.items() if x in own}
+    other seeds from the candidates of each. [] with fewer than two seeds that every candidate has."""
+    own = {p.x: p.seeds for p in points}
+    base = {p.x: p.seeds for p in of_base if p.x in own}
     shared = set.intersection(*(set(seeds) for seeds in (*own.values(), *base.values()))) if base else set()
     if len(shared) < 2:
         return []

@@ -141,23 +141,24 @@ def test_rates_that_seeds_do_not_tell_apart_are_as_good():
     best = point(2.0, 1.00, 1.10, 1.20)
     behind = point(4.0, 1.05, 1.15, 1.25)  # by as much on each seed, whatever the seeds' own level
     ahead_once = point(1.0, 1.02, 1.09, 1.23)
-    assert as_good([ahead_once, best, behind], best, set()) == (1.0, 2.0)
-    assert as_good([ahead_once, best, behind], best, {1.0}) == (2.0, 2.0)
+    assert as_good([ahead_once, best, behind], best, {1.0, 2.0, 4.0}) == (1.0, 2.0)
     alone = point(2.0, 0.9)
-    assert as_good([point(1.0, 1.0), alone], alone, set()) == (2.0, 2.0), (
+    assert as_good([point(1.0, 1.0), alone], alone, {1.0, 2.0}) == (2.0, 2.0), (
         "one seed tells nothing: the best alone stands"
     )
 
 
 def test_what_is_as_good_ends_where_a_rate_is_worse_and_where_seeds_scatter_or_have_no_number():
+    grid = {1.0, 2.0, 4.0, 8.0, 16.0}
     best = point(4.0, 1.00, 1.10, 1.20)
     near, worse, far = point(8.0, 1.02, 1.09, 1.23), point(2.0, 1.05, 1.15, 1.25), point(1.0, 0.99, 1.11, 1.22)
-    assert as_good([far, worse, best, near], best, set()) == (4.0, 8.0), "a rate beyond one that is told"
+    assert as_good([far, worse, best, near], best, grid) == (4.0, 8.0), "a rate beyond one that is told"
     # By their own error seeds that scatter by as much as they are behind tell nothing: t = 2.3 of 2.9.
     wild = point(16.0, 1.05, 2.00, 2.20)
-    assert as_good([worse, best, near, wild], best, set()) == (4.0, 8.0)
-    nothing = point(16.0, 1.00, 1.10, math.nan)
-    assert as_good([worse, best, near, nothing], best, set()) == (4.0, 8.0)
+    assert as_good([worse, best, near, wild], best, grid) == (4.0, 8.0)
+    beyond = replace(near, x=16.0)
+    assert as_good([worse, best, near, beyond], best, grid) == (4.0, 16.0)
+    assert as_good([worse, best, beyond], best, grid) == (4.0, 4.0), "a rate beyond one that diverged or did not run"
 
 
 def test_a_rate_that_is_as_good_at_an_end_of_the_grid_leaves_an_edge(tmp_path):
@@ -174,16 +175,47 @@ def test_a_rate_that_is_as_good_at_an_end_of_the_grid_leaves_an_edge(tmp_path):
     assert (found.x, found.near_high, found.edge) == (grid[-2], grid[-1], "edge")
 
 
+def test_what_is_as_good_does_not_reach_over_a_rate_without_a_result(tmp_path):
+    """While the sweep ran, and for good where a trial failed, it reached the end of the grid beyond."""
+    rows = rows_with(tmp_path, {f"width 8 · seed {s} · learning rate 0.002, no muP": "failed" for s in (0, 1)})
+    grid = sorted({r.x for r in rows})
+    wanted = {0: (0.3, 0.2, 0.0, None, -0.02), 1: (0.36, 0.26, 0.0, None, 0.03)}
+
+    def level(r):
+        flat = (r.role, r.series, r.metric, r.scope) == (STANDARD, "width 8", "cross_entropy", "overall")
+        return replace(r, mean=1.0 + wanted[r.seed][grid.index(r.x)]) if flat else r
+
+    found = optima_of([level(r) for r in rows])[STANDARD, "width 8"]
+    assert (found.x, found.near_high, found.edge) == (grid[2], grid[2], "")
+
+
 def test_what_a_choice_costs_is_judged_on_seeds_that_it_was_not_made_by():
     """Of noise alone, the lowest of several losses would always seem to gain; the choice of other seeds does not."""
     own = [point(1.0, 1.0, 1.2, 1.1), point(2.0, 1.2, 1.0, 1.1)]
     base = [point(1.0, 0.5, 0.5, 0.5), point(2.0, 0.9, 0.9, 0.9)]
     # Left out 0 the others choose 2, which costs it 0.2; left out 1 they choose 1, which costs 0.2; the base stays at
     # 1.
-    assert cross_validated_penalties(own, base, set()) == pytest.approx([-0.2, 0, 0])
-    assert cross_validated_penalties([point(1.0, 1.0), point(2.0, 2.0)], base, set()) == []
+    assert cross_validated_penalties(own, base) == pytest.approx([-0.2, 0, 0])
+    assert cross_validated_penalties([point(1.0, 1.0), point(2.0, 2.0)], base) == []
     clear = [point(1.0, 1.3, 1.4, 1.5), point(2.0, 1.0, 1.1, 1.2)]
-    assert cross_validated_penalties(clear, base, set()) == pytest.approx([0.3, 0.3, 0.3])
+    assert cross_validated_penalties(clear, base) == pytest.approx([0.3, 0.3, 0.3])
+
+
+def test_a_rate_at_which_a_seed_of_the_base_diverged_is_not_its_best_for_others(tmp_path):
+    """Its other seeds have the lowest loss there, and so every curve paid for a rate that nobody would take."""
+    rows = rows_with(tmp_path, study=replace(STUDY, seeds=(0, 1, 2)))
+    grid = sorted({r.x for r in rows})
+    losses = {"width 16": (1.3, 1.2, 1.1, 1.0, 0.9), "width 32": (1.3, 1.2, 1.1, 1.0, 1.6)}
+
+    def changed(r):
+        if r.role == STANDARD and r.series == "width 16" and r.x == grid[-1] and r.seed == 0:
+            return replace(r, status="diverged", metric="", scope="", mean=math.nan)
+        of_curve = (r.role, r.metric, r.scope) == (STANDARD, "cross_entropy", "overall") and r.series in losses
+        return replace(r, mean=losses[r.series][grid.index(r.x)]) if of_curve else r
+
+    found = optima_of([changed(r) for r in rows])[STANDARD, "width 32"]
+    assert (found.x, found.transferred_x, found.moved) == (grid[-2], grid[-2], 0)
+    assert (found.penalty, found.penalty_low, found.penalty_high) == (0, 0, 0)
 
 
 def test_an_optimum_at_the_end_of_the_grid_is_marked(unrendered, tmp_path):
