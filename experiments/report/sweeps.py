@@ -280,6 +280,8 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
             # Whichever reaches an end: what is best beyond it may have moved further than `far`.
             reaches = ", some at an end of the grid or not told from it, so perhaps further"
             open_ended = reaches if any(o.edge for o in own) else ""
+            if any(math.isnan(o.seed_sem) for o in own):
+                open_ended += ", some told by one seed only, so perhaps less or more"
             steps = counted(round(abs(far.moved)), "step")
             span = counted(round(max(o.moved for o in own) - min(o.moved for o in own)), "step")
             parts.append(

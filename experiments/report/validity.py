@@ -14,7 +14,7 @@ from typing import Any, Literal
 from experiments.analysis.controllability import ROUNDING
 from experiments.analysis.intervals import HELD_OUT_LOSS, standard_errors
 from experiments.analysis.predictions import Outcome
-from experiments.optima import Optimum
+from experiments.optima import Optimum, ends
 from experiments.report.pieces import section
 from experiments.report.robots import Robot
 from experiments.rows import OVERALL, TRAINING_LOSS, UNTRAINED, Row
@@ -80,7 +80,7 @@ def check_study(
         checks += _untrained(rows, vocabulary)
         checks += [_controls(rows, metric) for metric in CONTROLLED if metric in measured]
         checks.append(_copying(robots, whose))
-    checks += _optima(optima) + [_prediction(o) for o in outcomes]
+    checks += _optima(optima, rows) + [_prediction(o) for o in outcomes]
     return checks
 
 
@@ -235,19 +235,20 @@ def _held_out(optima: Sequence[Optimum]) -> bool:
     return any(o.metric == HELD_OUT_LOSS for o in optima)
 
 
-def _optima(optima: Sequence[Optimum]) -> list[Check]:
+def _optima(optima: Sequence[Optimum], rows: Sequence[Row]) -> list[Check]:
     """Of muP's curves, on held-out data where there is a likelihood. Where the standard parametrisation is best is a
-    finding, not a condition."""
+    finding, not a condition. What the seeds do not tell from an end of the grid is open: more of them may."""
     mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT_LOSS if _held_out(optima) else TRAINING_LOSS)]
     if not mup:
         return []
-    edge = [o.series for o in mup if o.edge]
-    text = (
-        f"At an end of the grid, or not told from it, for {', '.join(edge)}."
-        if edge
-        else f"On all {len(mup)} curves with muP."
-    )
-    return [Check("The best learning rate lies inside the grid.", "bad" if edge else "good", text)]
+    at_end = [o.series for o in mup if o.x in ends(rows, o.sweep, o.role, o.series)]
+    alone = [o.series for o in mup if math.isnan(o.seed_sem) and o.series not in at_end]
+    near_end = [o.series for o in mup if o.edge and o.series not in at_end]
+    said = {"at an end of the grid": at_end, "not told from one at an end": near_end, "told by one seed only": alone}
+    text = "; ".join(f"{what} for {', '.join(series)}" for what, series in said.items() if series)
+    text = f"{text[0].upper()}{text[1:]}." if text else f"On all {len(mup)} curves with muP."
+    verdict: Verdict = "bad" if at_end else "open" if near_end or alone else "good"
+    return [Check("The best learning rate lies inside the grid.", verdict, text)]
 
 
 def _prediction(outcome: Outcome) -> Check:

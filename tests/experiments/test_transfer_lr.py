@@ -12,6 +12,7 @@ from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
 from experiments.report.plots import plot_sweep
 from experiments.report.sweeps import _transfer
+from experiments.report.validity import _optima
 from experiments.rows import TRAINING, TRAINING_LOSS, CurvePoint, curve, read_csv
 from experiments.study import TransferConfig
 from experiments.sweeps import lr
@@ -131,6 +132,34 @@ def test_an_optimum_at_an_end_of_the_grid_leaves_open_how_far_the_best_rate_move
     assert f"{within} (held-out loss)" in _transfer([base, inside, other], "width")
     said = _transfer([base, inside, replace(other, edge="edge")], "width")
     assert f"{within}, some at an end of the grid or not told from it, so perhaps further" in said
+
+
+def test_whether_the_best_rate_lies_inside_is_open_until_seeds_tell_it_from_the_ends(tmp_path):
+    """By one seed it was inside, and by a second one, which told as little of the ends, at an end of the grid."""
+    rows = rows_with(tmp_path)
+    grid, series = sorted({r.x for r in rows}), ("width 8", "width 16", "width 32")
+    above = {x: 0.1 * abs(i - 2) for i, x in enumerate(grid)}
+
+    def checked(noise, seeds=(0, 1)):
+        """Of curves that are lowest in the middle, but for what `noise` of seed 1 and x adds."""
+        changed = [
+            replace(r, mean=1 + above[r.x] + noise(r.x) * r.seed) if r.metric == "cross_entropy" else r
+            for r in rows
+            if r.seed in seeds
+        ]
+        optima = find_optima(changed, [lr.plan(STUDY)])
+        (check,) = _optima(optima, changed)
+        return check, _transfer(optima, "width")
+
+    check, said = checked(lambda x: 0, seeds=(0,))
+    assert check.verdict == "open" and check.text == f"Told by one seed only for {', '.join(series)}."
+    assert "some told by one seed only" in said
+    check, said = checked(lambda x: 0)
+    assert check.verdict == "good" and "one seed" not in said
+    check, said = checked(lambda x: 0.15 * (x != grid[2]) * (-1) ** grid.index(x))
+    assert check.verdict == "open" and check.text.startswith("Not told from one at an end for width 8")
+    check, said = checked(lambda x: -9 * (x == grid[0]))
+    assert check.verdict == "bad" and check.text == f"At an end of the grid for {', '.join(series)}."
 
 
 def point(x: float, *losses: float) -> CurvePoint:
