@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -38,8 +38,16 @@ class DatasetWindows:
 
 
 @dataclass(frozen=True)
+class ChoiceSettings:
+    """The settings of `EvalConfig` that bound a choice of windows. Others may lead to the same choice."""
+
+    windows_per_dataset: int
+    prompt_frames: int | None  # None: all windows are whole
+
+
+@dataclass(frozen=True)
 class EvalManifest:
-    """A frozen choice of held-out windows. Datasets are sorted by name."""
+    """A frozen choice of held-out windows. Datasets are sorted by name. The fields that are compared name it."""
 
     frames: int  # T
     seed: int
@@ -48,9 +56,10 @@ class EvalManifest:
     datasets: tuple[DatasetWindows, ...] = field(default_factory=tuple)
     rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
     least: int = 0  # real frames of the shortest window; 0 in files from before there was padding
+    settings: ChoiceSettings | None = field(default=None, compare=False)  # None in files of earlier versions
 
     def hash(self) -> str:
-        return stable_hash(self)
+        return stable_hash({f.name: getattr(self, f.name) for f in fields(self) if f.compare})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,8 +92,9 @@ class EvalManifest:
         advice = "Freeze the evaluation set again; results on the old one are not comparable."
         try:
             values = json.loads(Path(path).read_text())
-            stated, found = values.pop("hash", None), stable_hash(values)
-            manifest = from_dict(cls, values)
+            stated, manifest = values.pop("hash", None), from_dict(cls, values)
+            values.pop("settings", None)
+            found = stable_hash(values)
         except OSError as error:
             reason = error.strerror or error
             raise DataError(f"{path}: the evaluation set cannot be read ({reason}). {advice}") from error
@@ -141,7 +151,7 @@ def freeze_manifest(
     least = frames if prompt is None else min(prompt + 1, frames)
     sets = {name: val_windows(store, name, frames, least, rate=rate) for name in sorted(set(datasets))}
     require_windows(sets)
-    chosen, shortest = [], frames
+    chosen, shortest, settings = [], frames, ChoiceSettings(windows_per_dataset, prompt)
     for name, windows in sets.items():
         apart = np.flatnonzero(windows.start % (spacing * windows.slicer.spacing) == 0)
         order = np.argsort(hash64(apart, stream_seed(seed, "evaluation", name)), kind="stable")
@@ -150,7 +160,7 @@ def freeze_manifest(
         steps = store.manifest(name).val.steps
         shortest = min([shortest, *(int(windows.slicer.max_real(steps[episode])) for episode, _ in pairs)])
         chosen.append(DatasetWindows(name, pairs, "" if pairs else windows.why_empty()))
-    return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen), rate, shortest)
+    return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen), rate, shortest, settings)
 
 
 def eval_batches(

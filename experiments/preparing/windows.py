@@ -13,6 +13,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
 from experiments.words import few
 from hma_jax.config import require
+from hma_jax.config.json import diff
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -124,13 +125,15 @@ def _differences(existing: EvalManifest, wanted: EvalManifest) -> list[str]:
     lines = _setting_differences(existing, wanted.frames, wanted.rate, wanted.seed, names)
     if existing.store != wanted.store and not lines:
         lines.append(f"tokens: {existing.store} -> {wanted.store}")
-    old, new = (max(len(d.windows) for d in m.datasets) for m in (existing, wanted))
-    if old != new:
-        lines.append(f"eval.windows_per_dataset: {old} -> {new} in the dataset with the most")
-    return lines or [
-        f"windows: {existing.hash()} -> {wanted.hash()}, as of another eval.prompt_frames or an earlier version, which had "
-        "none of short episodes"
-    ]
+    if existing.settings is not None:
+        lines += diff(existing.settings, wanted.settings, "eval")
+        cause = "an earlier version, which chose others"
+    else:
+        cause = (
+            "another eval.prompt_frames or eval.windows_per_dataset (what they were is not recorded there), or an earlier "
+            "version, which had none of short episodes"
+        )
+    return lines or [f"windows: {existing.hash()} -> {wanted.hash()}, as of {cause}"]
 
 
 def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float | None) -> dict[str, dict[str, int]]:

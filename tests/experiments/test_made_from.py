@@ -11,6 +11,7 @@ import pytest
 from data_pipelines.registry import get_spec, register
 from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
+from data_pipelines.windows.evalset import ChoiceSettings, DatasetWindows, EvalManifest
 from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import (
@@ -22,6 +23,7 @@ from experiments.preparing.made_from import (
     read_stamp,
 )
 from experiments.preparing.sources import find_sources
+from experiments.preparing.windows import _differences
 from experiments.running.closure import trace
 from experiments.setting import StudyArguments, make_setting
 from tests.data_pipelines.fakes import write_rlds
@@ -403,6 +405,23 @@ def test_differences_of_many_datasets_are_one_line():
     assert differences(both, other) == [
         "x.y: 1 -> 2", "datasets: 50 -> 49, without robot_0", "data of robot_49.shards: 'robot_49' -> 'other'",
     ]  # fmt: skip
+
+
+def test_windows_are_told_apart_by_the_settings_that_were_asked_for():
+    """A shorter prompt leaves more windows in short episodes; their number is no setting of the user."""
+
+    def frozen(count: int, settings: ChoiceSettings | None) -> EvalManifest:
+        return EvalManifest(
+            6, 0, 6, "tokens", (DatasetWindows("arm", tuple((i, 0) for i in range(count))),), settings=settings
+        )
+
+    shorter = frozen(6, ChoiceSettings(8, 2))
+    assert _differences(frozen(4, ChoiceSettings(8, 4)), shorter) == ["eval.prompt_frames: 4 -> 2"]
+    assert _differences(frozen(4, ChoiceSettings(4, 2)), shorter) == ["eval.windows_per_dataset: 4 -> 8"]
+    (line,) = _differences(frozen(4, None), shorter)
+    assert "as of another eval.prompt_frames or eval.windows_per_dataset" in line
+    (line,) = _differences(frozen(4, ChoiceSettings(8, 2)), shorter)
+    assert "as of an earlier version" in line
 
 
 def test_to_replace_a_step_is_to_replace_what_is_made_of_it():

@@ -8,7 +8,13 @@ import pytest
 from data_pipelines.errors import DataError
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
-from data_pipelines.windows.evalset import EvalManifest, eval_batches, freeze_manifest, subsample_windows
+from data_pipelines.windows.evalset import (
+    ChoiceSettings,
+    EvalManifest,
+    eval_batches,
+    freeze_manifest,
+    subsample_windows,
+)
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash, to_dict
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
@@ -35,7 +41,8 @@ def test_spacing_allows_overlap_when_asked(store):
 
 
 def test_windows_are_whole_where_the_prompt_fills_them(store, manifest):
-    assert freeze_manifest(store, store.names, 4, 5, 0, prompt=4) == manifest
+    filled = freeze_manifest(store, store.names, 4, 5, 0, prompt=4)
+    assert filled == manifest and filled.hash() == manifest.hash() and filled.settings == ChoiceSettings(5, 4)
 
 
 def test_fewer_windows_are_a_subset_of_more(store):
@@ -142,7 +149,7 @@ def test_a_window_keeps_its_name_in_other_batches_and_selections(store, table, m
 def test_file_round_trip_and_hash(store, manifest, tmp_path):
     manifest.save(tmp_path / "new" / "eval.json")
     loaded = EvalManifest.load(tmp_path / "new" / "eval.json")
-    assert loaded == manifest and loaded.hash() == manifest.hash()
+    assert loaded == manifest and loaded.hash() == manifest.hash() and loaded.settings == ChoiceSettings(5, None)
     assert freeze_manifest(store, store.names, 4, 5, seed=1).hash() != manifest.hash()
     assert freeze_manifest(store, store.names[::-1], 4, 5, seed=0) == manifest
 
@@ -221,10 +228,10 @@ def test_short_episodes_are_judged_up_to_their_end(tmp_path):
 def test_windows_frozen_by_an_earlier_version_are_read(manifest, tmp_path):
     """Their file has neither a rate nor a least number of frames."""
     path = tmp_path / "eval.json"
-    values = {k: v for k, v in to_dict(manifest).items() if k not in ("rate", "least")}
+    values = {k: v for k, v in to_dict(manifest).items() if k not in ("rate", "least", "settings")}
     path.write_text(json.dumps({"hash": stable_hash(values), **values}))
     old = EvalManifest.load(path)
-    assert (old.rate, old.least, old.datasets) == (2.0, 0, manifest.datasets)
+    assert (old.rate, old.least, old.settings, old.datasets) == (2.0, 0, None, manifest.datasets)
 
 
 def test_the_rate_is_that_of_the_frames(tmp_path):
