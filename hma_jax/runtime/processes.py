@@ -12,9 +12,9 @@ import secrets
 import socket
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,6 +37,8 @@ MARGIN = 20.0
 one, and is the fallback if this process's watchdog is stuck. Twice, because JAX sends its own heartbeat after half its
 timeout only, and counts from the last one."""
 
+FOR_EVER = 10**12
+"""Milliseconds: thirty years."""
 
 # How error messages of collectives and of the coordination service begin.
 STATUSES = ("ABORTED:", "CANCELLED:", "DEADLINE_EXCEEDED:", "INTERNAL:", "UNAVAILABLE:", "UNKNOWN:")
@@ -140,37 +142,45 @@ def start(asked: Processes) -> None:
         return
     # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `AgreedMaximum` sees both.
     jax.config.update("jax_enable_preemption_service", False)
-    failed: list[Exception] = []
 
     def join() -> None:
-        try:
-            jax.distributed.initialize(
-                asked.coordinator,
-                asked.processes,
-                asked.process,
-                local_device_ids=own_devices(os.environ) if asked.detect else None,
-                cluster_detection_method=None if asked.detect else "deactivate",
-                initialization_timeout=int(asked.start_timeout + MARGIN),
-                heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),
-                shutdown_timeout_seconds=int(asked.lost_after),
-            )
-        except (RuntimeError, ValueError, TypeError) as error:
-            failed.append(error)
+        jax.distributed.initialize(
+            asked.coordinator,
+            asked.processes,
+            asked.process,
+            local_device_ids=own_devices(os.environ) if asked.detect else None,
+            cluster_detection_method=None if asked.detect else "deactivate",
+            initialization_timeout=int(asked.start_timeout + MARGIN),  # after which JAX aborts the process
+            heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),
+            shutdown_timeout_seconds=int(asked.lost_after),
+        )
 
-    # JAX waits in a call that no signal interrupts, and aborts the process after its own timeout.
-    joining = threading.Thread(target=join, name="join", daemon=True)
     try:
-        joining.start()
-        joining.join(asked.start_timeout)
+        _interruptible(join, asked.start_timeout)
     except KeyboardInterrupt as request:
         _exit_now("stopped while waiting for the other processes", exit_of_interrupt(request))
-    if joining.is_alive():
+    except TimeoutError:
         _exit_now(f"error: {_join_failure(asked, 'not all have started')}", Exit.REFUSED)
-    if failed:
-        reason = " ".join(str(failed[0]).split())[:300]
-        raise ConfigError(_join_failure(asked, reason)) from failed[0]
+    except (RuntimeError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(_join_failure(asked, reason)) from error
     if jax.process_count() > 1:
         _start_watchdog(asked.lost_after)
+
+
+def _interruptible(call: Callable[[], T], timeout: float | None = None) -> T:
+    """What `call` returns or raises. It is called in a thread of its own: JAX waits in calls that no signal interrupts,
+    and here they are handled at once. Raises TimeoutError after `timeout` seconds; the call is then left to itself."""
+    outcome: Future[T] = Future()
+
+    def work() -> None:
+        try:
+            outcome.set_result(call())
+        except Exception as error:
+            outcome.set_exception(error)
+
+    threading.Thread(target=work, name="interruptible", daemon=True).start()
+    return outcome.result(timeout)
 
 
 def _join_failure(asked: Processes, reason: str) -> str:
@@ -249,7 +259,9 @@ def all_gather(name: str, text: str) -> list[str]:
     call = _call_counts[name] = _call_counts.get(name, 0) + 1
     key = f"hma/all_gather/{name}/{call}"
     client.key_value_set(f"{key}/{jax.process_index()}", f"={text}")
-    return [_wait_for(client, f"{key}/{p}")[1:] for p in range(jax.process_count())]
+    # Asked for once: JAX keeps a request that timed out, here and in process 0, until the key is set.
+    get = lambda p: client.blocking_key_value_get(f"{key}/{p}", FOR_EVER)[1:]
+    return _interruptible(lambda: [get(p) for p in range(jax.process_count())])
 
 
 def barrier(name: str) -> None:
@@ -317,16 +329,6 @@ class AgreedMaximum:
 
 
 _call_counts: dict[str, int] = {}
-
-
-def _wait_for(client: Any, key: str) -> str:
-    while True:
-        try:
-            return client.blocking_key_value_get(key, 1_000)  # milliseconds in which no signal is handled
-        except jax.errors.JaxRuntimeError as error:
-            if "DEADLINE_EXCEEDED" not in str(error):
-                raise
-            time.sleep(0.1)
 
 
 def _state() -> Any:

@@ -11,7 +11,9 @@ import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import jax
 import pytest
 from jax._src.lib import _jax
 
@@ -119,17 +121,53 @@ def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, mes
         processes.start(asked)
 
 
-def test_a_process_that_waits_for_another_one_stops_when_it_is_asked():
+class Client:
+    """Of a coordination service with the key that process 1 of two sets after a while."""
+
+    def __init__(self):
+        self.asked, self.there = [], threading.Event()
+
+    def key_value_set(self, key: str, value: str) -> None:
+        del key, value
+
+    def blocking_key_value_get(self, key: str, timeout: int) -> str:
+        if key.endswith("1"):
+            self.asked.append(key)
+            if not self.there.wait(min(timeout / 1000, 60)):
+                raise jax.errors.JaxRuntimeError("DEADLINE_EXCEEDED: it timed out")
+        return "=here"
+
+
+@pytest.fixture
+def of_two(monkeypatch):
+    """Makes this process the first of two, whose coordination service has the given client."""
+
+    def be(client: Any) -> None:
+        monkeypatch.setattr(processes, "_state", lambda: SimpleNamespace(client=client))
+        monkeypatch.setattr(processes.jax, "process_count", lambda: 2)
+
+    return be
+
+
+def test_a_process_that_waits_for_another_one_asks_for_its_text_once(of_two):
+    """JAX keeps each request that timed out in the memory of both processes: in hours they would fill it."""
+    of_two(client := Client())
+    threading.Timer(1.5, client.there.set).start()
+    assert processes.all_gather("late", "here") == ["here", "here"] and len(client.asked) == 1
+
+
+def test_a_process_that_waits_for_another_one_stops_when_it_is_asked(of_two):
     """Its wait is a call of JAX that no signal interrupts."""
     address = f"127.0.0.1:{free_port()}"
     service = _jax.get_distributed_runtime_service(address, 1)
     client = _jax.get_distributed_runtime_client(address, 0)
     client.connect()
+    of_two(client)
     request = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
     began = time.monotonic()
     with pytest.raises(Terminated), sigterm_as_interrupt():
         request.start()
-        processes._wait_for(client, "nobody sets it")
+        processes.all_gather("nobody else calls it", "")
     assert time.monotonic() - began < 5
     client.shutdown()
     service.shutdown()
