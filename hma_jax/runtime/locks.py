@@ -36,6 +36,7 @@ from functools import cache
 from pathlib import Path
 
 from hma_jax.config import ConfigError
+from hma_jax.runtime.files import IO_ERRNOS, naming
 
 RENEWED_EVERY = 30.0
 """Seconds between two renewals of a lease."""
@@ -99,7 +100,7 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
 
     `lease`: holds it against other machines too where the file system does not (see above). `remove`: the file
     goes when the lock is given back. Raises Held at once if another process, or another thread, has it, and
-    OSError if the file cannot be read and written.
+    OSError if the file cannot be read, written and locked now.
     """
     fd, locked = _open(path, lease)
     try:
@@ -174,7 +175,8 @@ def find_held(path: Path) -> Held | None:
 
 def _lock(fd: int, path: Path, lease: bool, kind: int = fcntl.LOCK_EX) -> bool:
     """Locks the open file: whether the file system took the lock. Raises Held, OSError."""
-    locked = _flock(fd, kind)
+    with naming(path):
+        locked = _flock(fd, kind)
     if locked is None or lease:
         holder = read_holder(path)
         if locked is None or _leased(path, holder, locked):
@@ -183,12 +185,16 @@ def _lock(fd: int, path: Path, lease: bool, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def _flock(fd: int, kind: int) -> bool | None:
-    """True: locked; None: another holds it; False: the file system takes no locks."""
+    """True: locked; None: another holds it; False: the file system takes no locks. Raises OSError if it fails."""
     try:
         fcntl.flock(fd, kind | fcntl.LOCK_NB)
         return True
     except OSError as error:
-        return None if error.errno in TAKEN else False
+        if error.errno in TAKEN:
+            return None
+        if error.errno in IO_ERRNOS:  # nobody knows now whether another holds it
+            raise
+        return False
 
 
 def _leased(path: Path, holder: Holder | None, locked: bool) -> bool:

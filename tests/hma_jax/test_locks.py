@@ -168,6 +168,21 @@ def unreadable(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
     monkeypatch.setattr(Path, "read_text", fail)
 
 
+@pytest.mark.parametrize("ask", [lambda path: locked_run(path.parent).__enter__(), find_held])
+def test_a_disk_that_fails_when_it_is_asked_for_a_lock_is_none_that_takes_no_locks(ask, tmp_path: Path, monkeypatch):
+    """Otherwise a second process would train in the run of the first."""
+
+    def fail(fd: int, kind: int) -> None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+    path = tmp_path / ".lock"
+    with locked_run(tmp_path) as lock:
+        monkeypatch.setattr(locks.fcntl, "flock", fail)
+        with pytest.raises(OSError, match=os.strerror(errno.ESTALE)) as error:
+            ask(path)
+        assert error.value.filename == str(path) and not lock.lost()
+
+
 def test_a_lock_is_lost_when_it_is_gone_or_another_s_not_when_its_disk_does_not_answer(tmp_path: Path, monkeypatch):
     path = tmp_path / "run" / "lock"
     path.parent.mkdir()
