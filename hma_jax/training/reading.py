@@ -20,7 +20,7 @@ import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.processes import all_gather, broadcast_from_writer
+from hma_jax.runtime.processes import all_gather, broadcast_from_writer, is_writer
 from hma_jax.training.hashes import Damaged, ReadError, verify
 from hma_jax.training.run_lock import list_steps
 
@@ -36,8 +36,11 @@ class CheckpointError(ConfigError):
 
 def agree_on_latest(directory: Path) -> int | None:
     """The latest step with a checkpoint as process 0 sees it: a shared disk may show the others an older state of the
-    directory."""
-    steps = list_steps(directory)
+    directory. Raises CheckpointError or ReadError, in all processes, if it cannot be listed now."""
+    steps: list[int] = []
+    with raised_in_all("checkpoints"), _reading(directory):
+        if is_writer():
+            steps = list_steps(directory)
     latest = broadcast_from_writer("latest checkpoint", str(steps[-1]) if steps else "")
     return int(latest) if latest else None
 
@@ -90,11 +93,12 @@ def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
     With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing, ReadError if
     one cannot be read now.
     """
-    old = (checkpoint / WHOLE_STATE).is_dir()
-    folders = {WHOLE_STATE} if old else set(shapes)
     share = jax.process_index(), jax.process_count()
-    with raised_in_all("damage"), _reading(checkpoint):
-        verify(checkpoint, lambda name: name.split("/")[0] in folders, share)
+    with raised_in_all("damage"):
+        old = has_item(checkpoint, WHOLE_STATE)
+        folders = {WHOLE_STATE} if old else set(shapes)
+        with _reading(checkpoint):
+            verify(checkpoint, lambda name: name.split("/")[0] in folders, share)
     with _reading(checkpoint):
         if not old:
             return ocp.load_checkpointables(checkpoint, dict(shapes))
@@ -105,7 +109,9 @@ def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def has_item(checkpoint: Path, name: str) -> bool:
-    return (checkpoint / name).is_dir()
+    """Raises CheckpointError for a checkpoint that is gone, ReadError if it cannot be read now."""
+    with _reading(checkpoint):
+        return name in os.listdir(checkpoint)
 
 
 @contextmanager
@@ -140,21 +146,18 @@ def error_code(error: Exception) -> int | None:
 
 
 def _advice(checkpoint: Path) -> str:
-    earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
-    whole = [step for step in earlier if _is_whole(checkpoint.parent / str(step))]
-    if not whole:
+    directory = checkpoint.parent
+    try:
+        earlier = [step for step in list_steps(directory) if step < int(checkpoint.name)]
+        whole = next((step for step in reversed(earlier) if find_damage(directory / str(step)) is None), None)
+    except OSError:
+        return "those before it cannot be read now: run the same command again when their disk answers"
+    if whole is None:
         return "there is no undamaged checkpoint before it: train again in a new output directory"
     return (
-        f"that of step {whole[-1]} is undamaged: to continue from there, train with --skip-damaged (in Python "
+        f"that of step {whole} is undamaged: to continue from there, train with --skip-damaged (in Python "
         "LoopOptions(skip_damaged=True)), or remove this directory"
     )
-
-
-def _is_whole(checkpoint: Path) -> bool:
-    try:
-        return find_damage(checkpoint) is None
-    except ReadError:  # nobody knows now
-        return False
 
 
 def hush_orbax() -> None:

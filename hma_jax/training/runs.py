@@ -20,6 +20,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params, path_name, require_params
 from hma_jax.runtime.devices import default_device
+from hma_jax.runtime.processes import broadcast_from_writer
 from hma_jax.training.hashes import ReadError
 from hma_jax.training.reading import (
     CheckpointError,
@@ -162,10 +163,11 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
                 f"{run_dir}: not a run of this project (no {', '.join(sorted(missing))}); give the directory "
                 "of a training run"
             )
+        averaged = has_item(checkpoint, "ema")
+    averaged = bool(broadcast_from_writer("average", "kept" if averaged else ""))  # all read the same item
     described = modernise(described, str(run_dir))
     model = from_dict(ModelConfig, described["model"])
     table = from_dict(EmbodimentTable, described["table"])
-    averaged = has_item(checkpoint, "ema")
     require(
         averaged or weights != "ema",
         f"{run_dir} keeps no average of its weights (train.ema_decay is 0); use the last weights",

@@ -61,6 +61,13 @@ def equal(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+def replace_checkpoint(old: Path, new: Path) -> None:
+    """As training does it, on another host."""
+    aside = shutil.copytree(old, new.parents[1] / "aside")
+    os.replace(aside, new)
+    shutil.rmtree(old)
+
+
 @pytest.mark.parametrize("code", [errno.ENOENT, errno.ESTALE])
 def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_newer_one(
     code, averaged, tmp_path, monkeypatch
@@ -72,14 +79,57 @@ def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_ne
 
     def replaced(checkpoint: Path):
         if old.is_dir():
-            os.replace(shutil.copytree(old, tmp_path / "3"), new)
-            shutil.rmtree(old)
+            replace_checkpoint(old, new)
             if code == errno.ESTALE:
                 raise ReadError(f"{old} cannot be read now")
         return read_description(checkpoint)
 
     monkeypatch.setattr(runs, "read_description", replaced)
     assert load_run(tmp_path / "run").step == 3
+
+
+@pytest.mark.parametrize("code", [errno.ENOENT, errno.ESTALE])
+def test_so_does_one_that_is_removed_before_its_items_are_looked_for(code, averaged, tmp_path, monkeypatch):
+    """It was said to keep no average."""
+    shutil.copytree(averaged[0], tmp_path / "run")
+    old, new = (tmp_path / "run" / "checkpoints" / step for step in "23")
+
+    def refused(look):
+        def refuse(path, *arguments, **options):
+            if Path(path).is_relative_to(old):
+                raise OSError(code, os.strerror(code), str(path))
+            return look(path, *arguments, **options)
+
+        return refuse
+
+    def replaced(checkpoint: Path):
+        described = read_description(checkpoint)
+        if checkpoint == old:
+            replace_checkpoint(old, new)
+            monkeypatch.setattr(Path, "stat", refused(Path.stat))
+            monkeypatch.setattr(os, "listdir", refused(os.listdir))
+        return described
+
+    monkeypatch.setattr(runs, "read_description", replaced)
+    assert load_run(tmp_path / "run", "ema").step == 3
+
+
+def test_checkpoints_that_process_0_cannot_list_now_are_refused_by_all(averaged, monkeypatch):
+    def fail(directory: Path) -> list[int]:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(directory))
+
+    monkeypatch.setattr(reading, "list_steps", fail)
+    with pytest.raises(
+        ReadError, match=f"{averaged[0] / 'checkpoints'} cannot be read now .{os.strerror(errno.ESTALE)}"
+    ):
+        load_run(averaged[0])
+    monkeypatch.setattr(reading, "is_writer", lambda: False)
+    monkeypatch.setattr(reading, "all_gather", lambda name, own: ["ReadError: why", own])
+    with pytest.raises(ReadError, match="why"):
+        load_run(averaged[0])
+    monkeypatch.setattr(reading, "all_gather", lambda name, own: ["", own])
+    monkeypatch.setattr(reading, "broadcast_from_writer", lambda *_: "2")
+    assert load_run(averaged[0]).step == 2  # what the others see does not matter
 
 
 def test_several_processes_read_the_step_that_process_0_sees_and_another_one_together(averaged, tmp_path, monkeypatch):
