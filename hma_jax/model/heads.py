@@ -137,7 +137,8 @@ class ActionDenoiser(nnx.Module):
         graphdef, params = nnx.split(self.robots)
 
         def taken(p: nnx.Param) -> nnx.Param:
-            return p.replace(take_by_robot(p.astype(self.dtype), slice_B, layouts_of(p)))
+            whole = p.get_value() if p.precise else p.astype(self.dtype)
+            return p.replace(take_by_robot(whole, slice_B, layouts_of(p)))
 
         own = jax.tree.map(taken, params, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
         return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)

@@ -207,7 +207,7 @@ class Declared(Generic[M]):
         layouts = find_layouts(spec.axes, spec.shape, self.min_shard_size)
         if layouts and spec.embodiment_axis is None and LAYER_AXIS not in spec.axes:
             value = for_compute(value, layouts)
-        return nnx.Param(value, axes=spec.axes, role=spec.role, layouts=layouts)
+        return nnx.Param(value, axes=spec.axes, role=spec.role, precise=spec.precise, layouts=layouts)
 
     def leaves(self) -> dict[str, ParamSpec]:
         """'path/of/parameter' -> spec, in a fixed order."""
@@ -249,7 +249,8 @@ def layer_for_compute(layer: nnx.State, dtype: jnp.dtype) -> nnx.State:
         layouts = PartitionSpec(*storage[1:]), PartitionSpec(*compute[1:])
         if EMBODIMENT_AXIS not in variable.axes:
             w = remat.gathered(for_compute(w, layouts, None if variable.role == "vector" else dtype))
-        return nnx.Param(w, axes=variable.axes[1:], role=variable.role, layouts=layouts)
+        about = {"role": variable.role, "precise": variable.precise}
+        return nnx.Param(w, axes=variable.axes[1:], layouts=layouts, **about)
 
     return jax.tree.map(sent, layer, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
 

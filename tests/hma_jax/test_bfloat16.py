@@ -77,5 +77,23 @@ def test_what_heads_predict_is_not_rounded_to_bfloat16(diffusion):
         assert y.dtype == np.float32 and np.mean(live == live.astype(jnp.bfloat16).astype(np.float32)) < 0.1
 
 
+def test_a_small_change_of_the_last_bias_reaches_what_both_denoisers_predict():
+    """Rounded to bfloat16, 1.001 is 1, and a bias would be trained in steps of 0.008."""
+    config = model_config(diffusion=LATENTS)
+    declared = declare_model(config, TABLE, ExecutionConfig("bfloat16"))
+    z, x = (np.random.default_rng(n).normal(size=(2, 3, n)).astype(np.float32) for n in (config.width, 2))
+
+    @jax.jit
+    def predicted(params, bias):
+        out_bias = lambda path, p: jnp.full_like(p, bias) if path[-1].key == "out_bias" else p
+        model, time = declared.merge(jax.tree.map_with_path(out_bias, params)), jnp.zeros((2, 3), jnp.int32)
+        x_BTU = jnp.resize(x, (2, 3, TABLE.action_width))
+        return model.denoiser(x, time, z), model.action_head(x_BTU, time, z, np.arange(2))
+
+    params = lively_params(config)[1]
+    for before, after in zip(predicted(params, 1.0), predicted(params, 1.001), strict=True):
+        np.testing.assert_allclose(after - before, 0.001, atol=1e-5)
+
+
 def apart(g: np.ndarray, exact: np.ndarray) -> float:
     return float(np.linalg.norm(g - exact) / np.linalg.norm(exact))
