@@ -45,7 +45,7 @@ class Simulator(Protocol):
         """Inverse of `physics`."""
 
     def vector(self) -> np.ndarray:
-        """float32 [S]: the robot's observed state (proprioception)."""
+        """float32 [S]: the robot's observed state (proprioception); S is the same in all of its environments."""
 
     def frame(self) -> np.ndarray:
         """uint8 [size, size, 3], RGB."""

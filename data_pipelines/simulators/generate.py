@@ -32,7 +32,7 @@ from data_pipelines.sources.rlds.writer import VERSION
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.locks import Held
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Raise it when simulation, behaviour, rendering or encoding change: datasets of older versions are then recognised
 (`made_by_other_versions`)."""
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_pipelines.errors import DataError
 from data_pipelines.publishing.files import publish
 from data_pipelines.publishing.output_lock import OutputLock
 from data_pipelines.simulators.record import build_features
@@ -33,10 +34,18 @@ def write_dataset(
 ) -> Path:
     """`<home>/<version>/` from the episodes in `staging`, which are then removed.
 
-    `lock` is that of the dataset in `home`: who holds it may remove the staging directories of other settings.
+    `lock` is that of the dataset in `home`: who holds it may remove the staging directories of other settings. Raises
+    DataError for episodes whose states have different widths: a dataset has one.
     """
     scratch, final = lock.scratch, home / VERSION
     facts = [json.loads(facts_path(staging, i).read_text()) for i in range(episodes)]
+    examples = {f["states"]: f["env"] for f in facts}
+    if len(examples) > 1:
+        found = ", ".join(f"{width} in {env}" for width, env in examples.items())
+        raise DataError(
+            f"{spec.name}: states have different numbers of values ({found}), but those of a dataset have one. The "
+            "backend's `vector` must give as many in every environment of the robot"
+        )
     frames = sum(f["frames"] for f in facts)
     shards = max(1, min(episodes, round(frames / SHARD_FRAMES)))
     bounds = np.linspace(0, episodes, shards + 1).astype(int)

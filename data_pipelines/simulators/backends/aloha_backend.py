@@ -9,6 +9,7 @@ from gym_aloha.env import AlohaEnv
 from data_pipelines.simulators.backends.physics import PhysicsBackend
 
 ARM = 6  # joints, then one gripper
+JOINTS = 2 * (ARM + 2)  # of both arms, with two fingers each; they come first in the physics
 SPAN = 0.7  # radians that a joint may go from where it starts
 
 
@@ -26,6 +27,10 @@ class Backend(PhysicsBackend):
         arm = np.asarray(START_ARM_POSE[:ARM])
         self.low = np.tile(np.append(arm - SPAN, 0.0), 2)
         self.high = np.tile(np.append(arm + SPAN, 1.0), 2)
+
+    def vector(self) -> np.ndarray:
+        """Of the arms alone: one task has one loose object, the other two."""
+        return np.concatenate([self.data.qpos[:JOINTS], self.data.qvel[:JOINTS]]).astype(np.float32)
 
     def advance(self, action: np.ndarray) -> tuple[float, bool]:
         _, reward, _, _, info = self.env.step(action)

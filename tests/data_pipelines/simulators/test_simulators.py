@@ -74,12 +74,16 @@ run(spec.envs[-1], 3, 10)
 again, _ = run(spec.envs[0], 11, 4)
 same = [bool(np.array_equal(x, y)) for a, b in zip(first, again) for x, y in zip(a, b)]
 finite = bool(np.isfinite([simulator.low, simulator.high]).all())
-print("\\n" + json.dumps([len(simulator.low), finite, rate, all(same)]), flush=True)
+widths = set()
+for env in spec.envs:
+    simulator.start(env, 11)
+    widths.add(len(simulator.vector()))
+print("\\n" + json.dumps([len(simulator.low), finite, rate, all(same), sorted(widths)]), flush=True)
 import os
 os._exit(0)
 """
-"""Prints the action size, whether its bounds are finite, the physics' clock over that of the row, and
-whether an episode is the same, to the last pixel, after others."""
+"""Prints the action size, whether its bounds are finite, the physics' clock over that of the row,
+whether an episode is the same, to the last pixel, after others, and the widths of states in all environments."""
 
 
 @pytest.mark.parametrize("name", [spec.name for spec in EMBODIMENTS])
@@ -87,10 +91,11 @@ def test_every_robot_is_what_its_row_says_and_forgets_what_it_did(name):
     command = [sys.executable, "-W", "ignore", "-c", AUDIT, name]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
-    dim, finite, rate, same = json.loads(done.stdout.splitlines()[-1])
+    dim, finite, rate, same, widths = json.loads(done.stdout.splitlines()[-1])
     assert (dim, finite) == (select([name])[0].action_dim, True)
     assert abs(rate - 1) < 0.01, "frames do not come at the row's rate"
     assert same, "an episode depends on those before it"
+    assert len(widths) == 1, "states of one dataset have different widths"
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from data_pipelines.simulators.episode import StartState
 from data_pipelines.simulators.record import encode_episode
 from data_pipelines.simulators.simulator import can_simulate
 from data_pipelines.simulators.stats import stats_table
-from data_pipelines.simulators.worker import Job, episode_seed
+from data_pipelines.simulators.worker import Job, episode_seed, facts_path
 from data_pipelines.simulators.write import write_dataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
@@ -50,6 +51,19 @@ def test_what_was_simulated_is_read_back(home):
         assert np.abs(episode.images[0].astype(int) - made.frames[0]).max() <= 2
         assert read_start(dataset, i) == made.start, "the start state lost digits"
     assert sorted(p.name for p in (home / "pusht").iterdir()) == ["1.0.0", "stats.json"]
+
+
+def test_episodes_with_states_of_different_widths_are_no_dataset(tmp_path):
+    """`tfds` decodes half of such a dataset."""
+    for i in range(2):
+        write_episode(tmp_path, i)
+    facts = json.loads(facts_path(tmp_path, 1).read_text())
+    facts_path(tmp_path, 1).write_text(json.dumps(facts | {"env": "PushTwo", "states": 13}))
+    home = tmp_path / "pusht"
+    home.mkdir()
+    with lock_output(home / ".1.0.0") as held, pytest.raises(DataError, match=r"pusht: .*10 in PushT, 13 in PushTwo"):
+        write_dataset(SPEC, home, held, tmp_path, episodes=2, size=SIZE, metadata={"fingerprint": "mark"})
+    assert not (home / "1.0.0").exists()
 
 
 def test_tfds_decodes_the_records(home):
