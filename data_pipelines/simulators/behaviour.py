@@ -43,7 +43,7 @@ class OrnsteinUhlenbeck:
 
 
 class Behaviour:
-    """The actions of one episode, in [low, high]. `rest` is the action that does nothing."""
+    """The actions of one episode, in [low, high] rounded to float32. `rest` is the action that does nothing."""
 
     def __init__(
         self,

@@ -121,8 +121,9 @@ def record_episode(simulator: Simulator, spec: SimSpec, env: str, seed: int) -> 
 
 
 def replay_episode(simulator: Simulator, start: StartState, actions: Sequence[np.ndarray]) -> Replay:
-    """Runs `actions` [N, A] (raw units) from `start`. Raises DataError for those of another robot."""
-    actions = np.asarray(actions, np.float64)
+    """Runs `actions` [N, A] (raw units) from `start`, in float32 and within the robot's bounds: as recorded ones were
+    run. Raises DataError for those of another robot."""
+    actions = np.asarray(actions, np.float32)
     simulator.start(start.env, start.seed)
     size = len(simulator.low)
     if actions.ndim != 2 or actions.shape[1] != size:
@@ -135,7 +136,9 @@ def replay_episode(simulator: Simulator, start: StartState, actions: Sequence[np
         )
     simulator.set_physics(np.asarray(start.physics))
     frames, rewards, reached = [simulator.frame()], [], False
-    for action in np.clip(actions, simulator.low, simulator.high):
+    # Bounds are rounded as actions are: a recorded one may lie beyond the exact bound by that much.
+    low, high = np.float32(simulator.low), np.float32(simulator.high)
+    for action in np.clip(actions, low, high).astype(np.float64):
         reward, done = simulator.step(action)
         rewards.append(reward)
         reached = reached or done
