@@ -116,10 +116,7 @@ def _begin_truth(truth: Truth, robot: Robot, start: Any) -> TrueSimulator | None
 def _rewind(simulator: Simulator, truth: Truth, session: Session, values: Message) -> None:
     del truth
     require(session.robot is not None, "begin an episode first")
-    most = simulator.max_rewind(session.episode)
-    frames = min(whole(values.get("frames", 1)), most)
-    if session.truth is not None:
-        frames = min(frames, session.truth.max_rewind(0))
+    frames = min(whole(values.get("frames", 1)), reach(simulator, session))
     simulator.rewind(frames, [session.episode])
     if session.truth is not None:
         session.truth.rewind(frames)
@@ -155,6 +152,12 @@ HANDLERS = {"start": _start, "rewind": _rewind, "record": _record, "truth": _tru
 # --- Messages ----------------------------------------------------------------------------------
 
 
+def reach(simulator: Simulator, session: Session) -> int:
+    """By how many frames a visitor's episode can be rewound: no further than the true simulator beside it."""
+    most = simulator.max_rewind(session.episode)
+    return most if session.truth is None else min(most, session.truth.max_rewind(0))
+
+
 def frame_of(simulator: Simulator, session: Session, request: Request) -> Message:
     """The present frame of a visitor whose episode has begun, and where it stands."""
     image = simulator.images[session.episode]
@@ -166,7 +169,7 @@ def frame_of(simulator: Simulator, session: Session, request: Request) -> Messag
         "image": picture(image),
         "count": simulator.counts[session.episode],
         "window": simulator.model.config.frames,
-        "reach": simulator.max_rewind(session.episode),
+        "reach": reach(simulator, session),
         "clipped": list(simulator.clipped[session.episode]) if request.kind == "act" else [],
         "recorded": len(session.recording) if session.recording is not None else 0,
         "recording": session.recorded,

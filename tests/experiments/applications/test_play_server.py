@@ -194,8 +194,9 @@ def test_the_true_simulator_goes_along_and_a_start_that_fails_changes_nothing():
         await player.enter()
         begun = await ask(player.socket, type="truth", on=True)
         assert begun["count"] == 2 and "psnr" in begun
+        assert begun["reach"] == 0, "nothing can be rewound beside it"
         first, second = [await ask(player.socket, type="act", action=[0.5] * 7) for _ in range(2)]
-        assert len({begun["true"], first["true"], second["true"]}) == 3
+        assert len({begun["true"], first["true"], second["true"]}) == 3 and second["reach"] == 2
         back = await ask(player.socket, type="rewind", frames=9)
         assert (back["count"], back["true"]) == (2, begun["true"]), "no further than both can"
         failed = await ask(player.socket, type="start", robot="pusher", start=0)
