@@ -34,7 +34,7 @@ def encode_episode(spec: SimSpec, episode: Episode, index: int) -> bytes:
     steps = len(episode.actions)
     text = instruction(spec, episode.start.env)
     features = step_features(episode.rewards, [text] * steps) | {
-        f"steps/observation/{IMAGE_KEY}": [encode_jpeg(np.ascontiguousarray(f)) for f in episode.frames],
+        f"steps/observation/{IMAGE_KEY}": [encode_jpeg(f) for f in episode.frames],
         "steps/observation/state": episode.states.ravel(),
         "steps/action": episode.actions.ravel(),
         "steps/is_terminal": np.zeros(steps, np.int64),  # cut by the clock, none ends by itself

@@ -66,7 +66,7 @@ def step_features(rewards: np.ndarray, instructions: Sequence[str]) -> dict[str,
 
 def encode_jpeg(frame: np.ndarray) -> bytes:
     """JPEG of uint8 [H, W, 3], RGB, without chroma subsampling."""
-    return simplejpeg.encode_jpeg(frame, quality=JPEG_QUALITY, colorsubsampling="444")
+    return simplejpeg.encode_jpeg(np.ascontiguousarray(frame), quality=JPEG_QUALITY, colorsubsampling="444")
 
 
 def shard_name(dataset: str, index: int, count: int, split: str = "train") -> str:

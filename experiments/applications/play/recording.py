@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from data_pipelines.names import made_name
 from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import RATE_KEY
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import (
@@ -31,7 +33,10 @@ from data_pipelines.sources.rlds.writer import (
 from hma_jax.simulator.robots import Robot
 
 MOST_FRAMES = 3000
-"""Of a recording, which is kept in memory: it ends there."""
+"""Of a recording, which ends there: downloads of all visitors are made one after the other."""
+
+MOST_BYTES = 2**26
+"""Of its pictures, which are kept in memory: with so many it ends, too."""
 
 SHOWN = 2.0
 """Frames per second of a video of a robot whose own time is not known."""
@@ -41,23 +46,27 @@ ENLARGED = 4
 
 
 class Recording:
-    """Frames of one episode and the chunks between them, newest last."""
+    """Frames of one episode and the chunks between them, newest last. Frames are kept as JPEG, as in the dataset."""
 
     def __init__(self, robot: Robot):
         self.robot = robot
-        self._images: list[np.ndarray] = []
+        self._images: list[bytes] = []
         self._chunks: list[np.ndarray] = []
 
     def __len__(self) -> int:
         return len(self._images)
 
-    def add(self, before: np.ndarray, chunk: np.ndarray, after: np.ndarray) -> bool:
-        """Adds the frame after `chunk` [stride, A], the first time also the one `before`. False: that was the last."""
+    def add(self, before: np.ndarray, chunk: np.ndarray, after: np.ndarray) -> None:
+        """Adds the frame `after` [H, W, 3] the `chunk` [stride, A], the first time also the one `before`."""
         if not self._images:
-            self._images.append(np.array(before))
-        self._images.append(np.array(after))
+            self._images.append(encode_jpeg(before))
+        self._images.append(encode_jpeg(after))
         self._chunks.append(np.array(chunk, np.float32))
-        return len(self) < MOST_FRAMES
+
+    @property
+    def full(self) -> bool:
+        """Whether it takes no further frame."""
+        return len(self) >= MOST_FRAMES or sum(map(len, self._images)) >= MOST_BYTES
 
     def copy(self) -> Recording:
         """As it is now, for another thread to read, even while frames are being added or taken back."""
@@ -79,13 +88,13 @@ class Recording:
 
     def video(self) -> bytes:
         """MP4, enlarged, in the robot's own time as far as it is known."""
-        return encode_video(self._images, self.rate or SHOWN)
+        return encode_video(map(decode_image, self._images), self.rate or SHOWN)
 
     def dataset(self) -> bytes:
         """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it.
         metadata.json says the rate where it is known."""
         name = made_name(f"{self.robot.name}_played")
-        height, width = self._images[0].shape[:2]
+        height, width = decode_image(self._images[0]).shape[:2]
         chunk = self.robot.stride * self.robot.action_dim
         step = {"observation/image": image_field(height, width), "action": vector_field(chunk)} | STEP_FIELDS
         features = build_features(step, {"file_path": Field(TEXT)})
@@ -94,7 +103,7 @@ class Recording:
         actions[: steps - 1] = [c.ravel() for c in self._chunks]
         record = encode_example({
             **step_features(np.zeros(steps), [""] * steps),
-            "steps/observation/image": [encode_jpeg(image) for image in self._images],
+            "steps/observation/image": self._images,
             "steps/action": actions.ravel(),
             "episode_metadata/file_path": [f"played/{self.robot.name}".encode()],
         })  # fmt: skip
@@ -111,18 +120,19 @@ class Recording:
             return _zipped(Path(folder))
 
 
-def encode_video(images: Sequence[np.ndarray], rate: float) -> bytes:
+def encode_video(images: Iterable[np.ndarray], rate: float) -> bytes:
     """MP4 of frames uint8 [H, W, 3], enlarged, `rate` of them per second. ConfigError where PyAV is missing."""
     av = require_module("av", "a video")
     file = io.BytesIO()
+    large = (image.repeat(ENLARGED, 0).repeat(ENLARGED, 1) for image in images)
+    first = next(large)
     with av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
-        height, width = (ENLARGED * side for side in images[0].shape[:2])
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "16"}
-        for image in images:
-            large = image.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(large, format="rgb24")))
+        for image in chain([first], large):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
     return file.getvalue()
 

@@ -88,7 +88,8 @@ def _act(
             session.truth.step([chunk])
         if session.recorded and session.recording is not None:
             done = session.robot.clip_to_range(chunk, "clip")[0]
-            session.recorded = session.recording.add(before[session.episode], done, simulator.images[session.episode])
+            session.recording.add(before[session.episode], done, simulator.images[session.episode])
+            session.recorded = not session.recording.full
 
 
 # --- Everything but acting ---------------------------------------------------------------------
@@ -173,6 +174,7 @@ def frame_of(simulator: Simulator, session: Session, request: Request) -> Messag
         "clipped": list(simulator.clipped[session.episode]) if request.kind == "act" else [],
         "recorded": len(session.recording) if session.recording is not None else 0,
         "recording": session.recorded,
+        "full": session.recording is not None and session.recording.full,
         "ms": round(1000 * (time.perf_counter() - request.at), 1),
     }
     if session.truth is not None:
@@ -195,7 +197,7 @@ def error_of(error: Exception, request: Request) -> Message:
 
 def picture(image: np.ndarray) -> str:
     """A frame uint8 [H, W, 3] as a browser shows it."""
-    return "data:image/jpeg;base64," + base64.b64encode(encode_jpeg(np.ascontiguousarray(image))).decode()
+    return "data:image/jpeg;base64," + base64.b64encode(encode_jpeg(image)).decode()
 
 
 def numbers(value: Any) -> np.ndarray:

@@ -13,6 +13,8 @@ import pytest
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
 from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.writer import encode_jpeg
+from experiments.applications.play import recording as recording_module
 from experiments.applications.play.recording import Recording
 from experiments.applications.play.server import SESSIONS
 from hma_jax.simulator.robots import Robot
@@ -50,6 +52,32 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
         np.testing.assert_array_equal(actions[:, 0], np.float32([0.5, 0.5, 0.45, 0.0]))
 
     serving(test)
+
+
+def test_the_frame_that_fills_a_recording_says_so_and_it_stays_as_it_is(monkeypatch):
+    monkeypatch.setattr(recording_module, "MOST_FRAMES", 4)
+
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        assert not (await ask(player.socket, type="record", on=True))["full"]
+        frames = [await ask(player.socket, type="act", action=[0.5] * 7) for _ in range(5)]
+        said = [(f["recorded"], f["recording"], f["full"]) for f in frames]
+        assert said == [(2, True, False), (3, True, False)] + 3 * [(4, False, True)]
+        assert (await ask(player.socket, type="rewind", frames=2))["recorded"] == 4
+        assert not (await ask(player.socket, type="record", on=True))["full"], "another one begins"
+
+    serving(test)
+
+
+def test_a_recording_of_large_frames_is_full_earlier(monkeypatch):
+    frame = np.random.default_rng(0).integers(256, size=(64, 64, 3), dtype=np.uint8)
+    monkeypatch.setattr(recording_module, "MOST_BYTES", 4 * len(encode_jpeg(frame)))
+    recording, full = Recording(Robot("arm", 2, (0.0,), (1.0,), (0.0,))), []
+    for _ in range(3):
+        recording.add(frame, np.zeros((2, 1)), frame)
+        full.append((len(recording), recording.full))
+    assert full == [(2, False), (3, False), (4, True)]
 
 
 @pytest.mark.parametrize(("hz", "said"), [(10.0, 5.0), (5.0, 2.5), (0.0, None)])
