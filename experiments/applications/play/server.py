@@ -221,7 +221,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
         visitor = sessions.connect(request.query.get("token"))
         await _serve_connection(sessions, visitor, socket, request.transport)
     except NoFreeSession:
-        await socket.send_str(json.dumps({"type": "full", "message": "all places are taken; try again later"}))
+        await socket.send_str(json.dumps({"type": "full", "message": "all places are taken"}))
         await socket.close(code=1013)
     finally:
         del sockets[socket]

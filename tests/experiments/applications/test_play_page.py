@@ -269,6 +269,38 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
     browsing(test, visitors=1)
 
 
+def test_a_robot_that_is_chosen_while_the_connection_is_lost_begins_once_there_is_one(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate("state.socket.close(); document.querySelector('[data-name=arm]').click()")
+        await page.wait_for_function("state.socket.readyState == 1 && state.tries == 0")
+        await frames(page, 2)
+        assert await page.inner_text("#name") == "arm" and not page.faults
+        [visitor] = client.server.app[SESSIONS].visitors.values()
+        assert visitor.session.robot.name == "arm"
+
+    browsing(test)
+
+
+def test_who_finds_no_place_waits_for_one_and_cannot_press_anything_meanwhile(browsing, monkeypatch):
+    edit_page(monkeypatch, "RETRY = 10e3", "RETRY = 0.2e3")
+
+    async def test(browser, address, client):
+        first = await opened(browser, address)
+        second = await (await browser.new_context(bypass_csp=True)).new_page()
+        await second.goto(address)
+        await second.wait_for_function("document.getElementById('status').textContent.includes('trying again in 0.2')")
+        assert "all places are taken" in await second.inner_text("#status")
+        assert await second.evaluate("[...document.querySelectorAll('button')].every(b => b.closest('[inert]'))")
+        assert not await second.is_visible("#seen"), "a picture that is broken"
+        await first.close()
+        await second.wait_for_selector("body[data-count]", timeout=PATIENCE)
+        await second.wait_for_function("document.getElementById('status').textContent == 'connected'")
+        assert not await second.evaluate("document.querySelector('[inert]')") and await second.is_visible("#seen")
+
+    browsing(test, visitors=1)
+
+
 def test_a_page_that_is_loaded_again_while_a_robot_begins_shows_that_robot(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
@@ -433,7 +465,7 @@ def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_rob
         await page.route("**/robots", lambda route: None)  # the answer does not come
         await page.reload()
         await page.keyboard.press("r")
-        await page.click("#again")
+        assert await page.locator("#again").evaluate("button => !!button.closest('[inert]')")
         assert not page.faults
 
     browsing(test)

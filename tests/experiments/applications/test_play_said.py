@@ -1,0 +1,84 @@
+"""What the page says in a real Chromium, also to those who do not see it."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("aiohttp", reason="needs the extra `play`")
+pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
+
+from experiments.applications.play import recording  # noqa: E402
+from tests.experiments.applications.test_play_page import (  # noqa: E402
+    browsing,  # noqa: F401  a fixture
+    chromium,  # noqa: F401  a fixture
+    edit_page,
+    frames,
+    opened,
+)
+
+
+def test_a_page_without_input_says_why_time_stands_still(browsing):  # noqa: F811
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate("state.input -= 61e3")
+        await page.wait_for_function("!state.running")
+        assert "paused: no input for 60 s" in await page.inner_text("#said")
+        await page.keyboard.press("ArrowUp")
+        await frames(page, 2)
+        assert await page.inner_text("#said") == "" and not page.faults
+
+    browsing(test)
+
+
+def test_what_is_chosen_is_told_without_colours_and_keeps_the_focus(browsing):  # noqa: F811
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        pressed = "[...document.querySelectorAll('[aria-pressed=true]')].map(b => b.ariaLabel)"
+        assert await page.evaluate(pressed) == ["pusher", "start 1"]
+        await page.focus("[data-name=arm]")
+        await page.keyboard.press("Enter")
+        assert await page.evaluate(pressed) == ["arm", "start 1"]
+        await page.focus("[aria-label='start 2']")
+        await page.keyboard.press("Enter")
+        assert await page.evaluate(pressed) == ["arm", "start 2"]
+        assert await page.evaluate("document.activeElement.ariaLabel") == "start 2"
+        assert not page.faults
+
+    browsing(test)
+
+
+def test_frames_say_nothing_again_and_leave_an_error_readable(browsing, monkeypatch):  # noqa: F811
+    edit_page(monkeypatch, "STAYS = 4e3", "STAYS = 1e3")
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate("""window.told = []; for (const id of ["status", "said"])
+            new MutationObserver(() => told.push(id)).observe($(id), {childList: true, subtree: true})""")
+        await frames(page, 5)
+        assert await page.evaluate("told") == []
+        await page.evaluate("tell({type: 'truth', on: true})")
+        await page.wait_for_function("$('said').textContent.includes('no true simulator here')")
+        await frames(page, 3)
+        assert "no true simulator here" in await page.inner_text("#said")
+        await page.wait_for_function("$('said').textContent === ''")
+        assert await page.evaluate("told") == ["said", "said"] and not page.faults
+
+    browsing(test)
+
+
+def test_a_recording_that_is_full_says_so_until_another_begins(browsing, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(recording, "MOST_FRAMES", 4)
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.click("#record")
+        await page.wait_for_selector("text=The recording is full (4 frames)")
+        await frames(page, 2)
+        assert await page.inner_text("#record") == "Record"
+        assert "full (4 frames)" in await page.inner_text("#saved")
+        monkeypatch.setattr(recording, "MOST_FRAMES", 100)
+        await page.click("#record")
+        await page.wait_for_function("state.recording")
+        assert "full" not in await page.inner_text("#saved") and not page.faults
+
+    browsing(test)
