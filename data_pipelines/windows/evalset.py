@@ -21,7 +21,7 @@ from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.counterfactual import CounterfactualFrames
 from data_pipelines.windows.other_actions import OtherWindows
 from data_pipelines.windows.slicer import make_slicer
-from data_pipelines.windows.windows import require_windows, val_windows
+from data_pipelines.windows.windows import least_judged, require_windows, val_windows
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
@@ -148,7 +148,7 @@ def freeze_manifest(
     require(windows_per_dataset >= 1, f"windows_per_dataset must be at least 1, got {windows_per_dataset}")
     require(spacing >= 1, f"spacing must be at least 1, got {spacing}")
     require(len(datasets) >= 1, "no dataset was given to evaluate on")
-    least = frames if prompt is None else min(prompt + 1, frames)
+    least = frames if prompt is None else least_judged(prompt, frames)
     sets = {name: val_windows(store, name, frames, least, rate=rate) for name in sorted(set(datasets))}
     require_windows(sets)
     chosen, shortest, settings = [], frames, ChoiceSettings(windows_per_dataset, prompt)

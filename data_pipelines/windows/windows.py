@@ -92,6 +92,18 @@ class WindowSet:
         )
 
 
+def least_judged(prompt: int, frames: int) -> int:
+    """Real frames of a window to judge, at least: the prompt and one more, or all T that a policy's prompt fills."""
+    return min(prompt + 1, frames)
+
+
+def settings_for_short(stride: int, min_real: int) -> str:
+    """The settings by which episodes that are too short for `min_real` frames at `stride` may give windows, in words;
+    '' if there are none."""
+    rate = ["a higher frame rate (--set rate=HZ)"] * (stride > 1)
+    return " or ".join(rate + ["a shorter prompt (--set eval.prompt_frames=N)"] * (min_real > MIN_TRAIN_FRAMES))
+
+
 def require_windows(sets: Mapping[str, WindowSet]) -> None:
     """Raises DataError, saying what would help, if not one window is left."""
     if any(len(s) for s in sets.values()):
@@ -103,12 +115,8 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
             f"there is no {split} episode for windows. {reasons}. Of a single episode none can be held out: add more. "
             "With several, store.val_fraction, store.min_val and store.max_val set how many are held out."
         )
-    settings = []
-    if any(s.slicer.stride > 1 for s in sets.values()):
-        settings.append("a higher frame rate (--set rate=HZ)")
-    if any(s.min_real > MIN_TRAIN_FRAMES for s in sets.values()):
-        settings.append("a shorter prompt (--set eval.prompt_frames=N)")
-    add = f"Set {' or '.join(settings)}, or add" if settings else "Add"
+    settings = settings_for_short(max(s.slicer.stride for s in sets.values()), max(s.min_real for s in sets.values()))
+    add = f"Set {settings}, or add" if settings else "Add"
     raise DataError(
         f"no {split} episode is long enough for a window. {reasons}. {add} datasets with more or longer episodes."
     )

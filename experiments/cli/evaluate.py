@@ -100,14 +100,14 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             "so only its actions are evaluated",
             soft_wrap=True,
         )
-    left_out = [name for name in trained.table.names if name not in frozen]
-    if left_out:
+    empty = prepared.manifest.empty
+    if absent := [name for name in trained.table.names if name not in frozen and name not in empty]:
+        console.print(f"note: not evaluated, because the study does not have them: {', '.join(absent)}", soft_wrap=True)
+    for name in [name for name in trained.table.names if name in empty]:
+        console.print(f"note: {name} is not evaluated: {empty[name]}", soft_wrap=True)
+    if unseen := [name for name in untrained if name in frozen]:
         console.print(
-            f"note: not evaluated, because the study has no windows of them: {', '.join(left_out)}", soft_wrap=True
-        )
-    if untrained:
-        console.print(
-            f"note: not evaluated, because the model was not trained on them: {', '.join(untrained)}", soft_wrap=True
+            f"note: not evaluated, because the model was not trained on them: {', '.join(unseen)}", soft_wrap=True
         )
     names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
     besides = [name for name in names if setting.data and name not in setting.study.dataset_names()]

@@ -14,7 +14,7 @@ from pathlib import Path
 from experiments.preparing.asked import write_asked
 from experiments.preparing.counterfactual import make_counterfactual
 from experiments.preparing.made_from import Step
-from experiments.preparing.sources import find_sources
+from experiments.preparing.sources import find_sources, say_short_episodes
 from experiments.preparing.store import make_store
 from experiments.preparing.suite import make_suite
 from experiments.preparing.tokenizer import adopt_tokenizer, make_tokenizer
@@ -48,6 +48,8 @@ def prepare(
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     write_asked(study, workspace, sources, tokenizer)
+    if not workspace.manifest.exists():  # else all is known
+        say_short_episodes(study, sources)
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace)
     else:

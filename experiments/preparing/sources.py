@@ -110,6 +110,7 @@ def check_entries(study: Study, data: Sequence[str]) -> None:
 
     sources = find_sources(study, data)
     say_unreached_rates(study, sources)
+    say_short_episodes(study, sources)
     for spec, path in sources:
         resolve_frame_step(spec, study.store.frame_step, study.rate)
         keys = (spec.image_key, spec.action_keys, spec.action_dims)
@@ -128,6 +129,25 @@ def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
     slow = [f"{s.name} ({s.hz:g} Hz, not {rate:g})" for s, rate in asked if rate and rate > s.rate_for(1)]
     if slow:
         say(f"note: a rate above that of the recording is not reached, every frame is taken: {few(slow)}")
+
+
+def say_short_episodes(study: Study, sources: Sequence[Source]) -> None:
+    """Names the datasets of which, as far as their entries say, few episodes or none give a window to evaluate on: how
+    long each is may be known only when it is tokenised, after a tokenizer was trained."""
+    from data_pipelines.windows.windows import least_judged, settings_for_short
+
+    least, short, stride = least_judged(study.eval.prompt_frames, study.model.frames), [], 1
+    for spec, _ in sources:
+        steps, needed = spec.median_steps or spec.mean_steps, least * spec.stride_at(study.rate)
+        if 0 < steps < needed:
+            short.append(f"{spec.name} (about {steps:g} steps an episode; {needed} are needed)")
+            stride = max(stride, spec.stride_at(study.rate))
+    if short:
+        settings = settings_for_short(stride, least)
+        say(
+            "note: by what entries say, many or all episodes are too short for a window to evaluate on: "
+            f"{few(short)}{settings and f'. To use them, set {settings}'}"
+        )
 
 
 def open_source(source: Source, settings: StoreConfig) -> EpisodeSource:

@@ -53,8 +53,9 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
         manifest.save(workspace.manifest)
     summary = summarise(store, names, frames, study.rate)
     write_file(workspace.data_summary, json.dumps(summary, indent=1))
+    empty = {name: f"{reason}{_what_helps(study, store, name)}" for name, reason in manifest.empty.items()}
     for name, facts in summary.items():
-        _remark(name, facts, manifest.empty.get(name, ""))
+        _remark(name, facts, empty.get(name, ""))
     say_padded(summary, frames, workspace.data_summary.name)
     _say_held_out(summary, study.store)
     say_alone(summary)
@@ -69,6 +70,15 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
     return Provenance(store.hash(names), manifest.hash(), identity)
 
 
+def _what_helps(study: Study, store: TokenStore, name: str) -> str:
+    """The end of a note on a dataset without a window: which settings would make one in its short episodes."""
+    from data_pipelines.windows.windows import least_judged, settings_for_short
+
+    manifest, least = store.manifest(name), least_judged(study.eval.prompt_frames, study.model.frames)
+    settings = settings_for_short(manifest.stride_at(study.rate), least) if manifest.val.steps else ""
+    return f"; {settings} may give it windows" if settings else ""
+
+
 def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
     """Whether the windows that are there are those of the tokens that are there."""
     from data_pipelines.tokens.store import TokenStore
@@ -81,8 +91,12 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
     """Raises ConfigError if a dataset that is `judged` has no evaluation window, or any of the study no training
     window: a point of an axis would say of more datasets than it was made with."""
     from data_pipelines.windows.evalset import EvalManifest
+    from data_pipelines.windows.windows import least_judged
 
-    empty = EvalManifest.load(workspace.manifest).empty
+    empty, least = (
+        EvalManifest.load(workspace.manifest).empty,
+        least_judged(study.eval.prompt_frames, study.model.frames),
+    )
     summary = json.loads(workspace.data_summary.read_text())
     names = study.all_names()
     unjudged = [name for name in names if name in empty and name in judged]
@@ -92,7 +106,7 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
         not lines,
         f"{'; '.join(lines)}. Leave it out of the study (of --data, or with --set datasets=...), or change the "
         f"settings of windows: rate={study.rate}, eval.prompt_frames={study.eval.prompt_frames} (held-out windows of at "
-        f"least {min(study.eval.prompt_frames + 1, study.model.frames)} frames), store.min_val={study.store.min_val}",
+        f"least {least} frames), store.min_val={study.store.min_val}",
     )
 
 

@@ -264,6 +264,20 @@ def test_two_directories_of_one_dataset(arm, tmp_path, refused):
 # --- Windows ---------------------------------------------------------------------------------
 
 
+def test_episodes_that_an_entry_says_are_too_short_are_told_before_a_tokenizer_is_trained(
+    arm, tmp_path, monkeypatch, capsys
+):
+    """How long each is, tokenising finds out. Without a word a tokenizer was trained for nothing."""
+    monkeypatch.setattr(tokenizer_training, "train_tokenizer", lambda *_, **__: require(False, "it would be trained"))
+    for steps, told in (8.0, True), (9.0, False), (0.0, False):  # 0: the entry does not say it
+        monkeypatch.setattr(registry_table, "_registered", {ARM.name: replace(ARM, mean_steps=steps)})
+        assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), "--data", str(arm)]) == 2
+        said, note = capsys.readouterr(), f"{ARM.name} (about {steps:g} steps an episode; 9 are needed)"
+        assert "it would be trained" in said.err and (note in said.out) == told
+        assert main(["train", *SMOKE, "--out", str(tmp_path / "new"), "--data", str(arm), "--dry-run"]) == 0
+        assert (note in capsys.readouterr().out) == told
+
+
 def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
     """Its windows are counted; the study goes on without it, through training and evaluation."""
     out, data = study
@@ -271,6 +285,7 @@ def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
     said = capsys.readouterr().out
     assert f"{BASE.name}: 3 of 3 training episodes are too short for any window" in said
     assert "it is not evaluated: a window has at least 3 frames, which at stride 2 need 6 native frames" in said
+    assert "or a shorter prompt (--set eval.prompt_frames=N) may give it windows" in said
     assert f"1 of 2 datasets can be trained on; {BASE.name} has no training window" in said
     facts = json.loads((out / "data.json").read_text())
     assert facts[BASE.name] == {
@@ -487,7 +502,7 @@ def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tm
     other = prepared_otherwise(study, tmp_path, data=(option, arm))
     assert main(["evaluate", str(study[0] / "model"), *SMOKE, "--out", str(other), option, base]) == 0
     said = capsys.readouterr().out
-    assert f"not evaluated, because the study has no windows of them: {BASE.name}" in said
+    assert f"not evaluated, because the study does not have them: {BASE.name}" in said
     assert f"also those of {ARM.name}, which --data does not name" in said
 
 
@@ -508,6 +523,16 @@ def test_evaluation_says_where_its_windows_are_of_other_recordings_than_data_nam
     assert note not in said(arm, base)
     found = said(longer, base)
     assert note in found and "source: " in found and f"({ARM.name})" in found
+
+
+def test_evaluation_says_why_a_dataset_of_the_study_has_no_window(study, tmp_path, monkeypatch, capsys):
+    out, data = study
+    monkeypatch.setattr("experiments.cli.evaluate.step", lambda _: require(False, "it would evaluate"))
+    assert main(["evaluate", str(out / "model"), *SMOKE, "--out", str(out), *data, "--to", str(tmp_path / "to")]) == 2
+    (note,) = [line for line in capsys.readouterr().out.splitlines() if BASE.name in line and "evaluated" in line]
+    assert note.startswith(
+        f"note: {BASE.name} is not evaluated: a window has at least 3 frames, which at stride 2 need 6"
+    )
 
 
 def test_evaluation_with_a_prompt_that_fills_the_window(study, refused):
