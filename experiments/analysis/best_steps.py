@@ -15,6 +15,7 @@ import numpy as np
 
 from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
 from experiments.analysis.changes import METRICS
+from experiments.analysis.compare import lacks_numbers
 from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.analysis.paired import NotComparable, agree, require_same_windows
 from experiments.running.provenance import Provenance
@@ -48,7 +49,7 @@ def judge_at_best(
     sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[BestSteps]:
     """Every point and seed whose trials differ in the number of steps alone, of which there are at least two, where its
-    episodes can be halved. Raises NotComparable."""
+    episodes can be halved and none lacks a loss. Raises NotComparable."""
     rows = []
     for sweep in sweeps:
         if not (sweep.fittable and sweep.has_series) or sweep.interior_minimum:
@@ -64,7 +65,7 @@ def judge_at_best(
             several = {
                 s: tables
                 for s, tables in sorted(seeds.items())
-                if len(tables) > 1 and len(trained[x, s]) == 1 and _halved(tables, sweep.scope)
+                if len(tables) > 1 and len(trained[x, s]) == 1 and _can_choose(tables, sweep.scope)
             }
             if several:
                 rows += _judge(sweep, x, several)
@@ -84,7 +85,7 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
         if not all(metric in t.metrics for t in composed.values()):
             continue
         panel = make_panel([composed], metric, sweep.scope)
-        if not panel.known.any():
+        if lacks_numbers(metric, np.concatenate(panel.points)).any() or not panel.known.any():
             continue
         (i,) = bootstrap_intervals(panel.rows(panel.known))
         rows.append(
@@ -135,8 +136,10 @@ def halves(table: WindowTable) -> np.ndarray:
     return half
 
 
-def _halved(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> bool:
-    return bool(halves(next(iter(tables.values())).among(robots)).any())
+def _can_choose(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> bool:
+    """Whether the episodes can be halved, and every table has a loss of every window."""
+    own = [table.among(robots) for table in tables.values()]
+    return bool(halves(own[0]).any()) and not any(np.isnan(table.metrics[HELD_OUT_LOSS]).any() for table in own)
 
 
 def _mean_of_robots(table: WindowTable, chosen: np.ndarray) -> float:

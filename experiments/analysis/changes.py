@@ -2,7 +2,8 @@
 
 Trials of both sides were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
 robots are judged that are others for every seed, each seed's difference is taken on its own robots, and the error is
-over seeds.
+over seeds. Of a metric that a model lacks where it should have it there is no difference: the page names the model
+(`report.validity`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from experiments.analysis.compare import Difference, Side, overall_difference
 from experiments.analysis.intervals import critical, standard_errors
+from experiments.analysis.paired import NoNumbers
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
@@ -94,13 +96,15 @@ def _change(sweep: Sweep, series: str, ends: Ends, metric: str) -> Change | None
     first, last = ends
     scopes = {seed: point.scope or sweep.scope for seed, (point, _) in ends[last].items()}
     sides = [Side(f"{sweep.axis} {x:g}", {s: table for s, (_, table) in ends[x].items()}, "") for x in (last, first)]
-    if len(set(scopes.values())) == 1:
-        difference = overall_difference(*sides, metric, next(iter(scopes.values())))
-    else:
-        difference = _over_seeds(*sides, metric, scopes)
-    if difference is None:
+    try:
+        if len(set(scopes.values())) == 1:
+            d = overall_difference(*sides, metric, next(iter(scopes.values())))
+        else:
+            d = _over_seeds(*sides, metric, scopes)
+    except NoNumbers:
         return None
-    d = difference
+    if d is None:
+        return None
     return Change(
         sweep.name, series, first, last, metric, d.mean, d.sem, d.low, d.high, d.errors, d.seeds, d.n, d.episodes
     )

@@ -6,14 +6,14 @@ with several it is over seeds and episodes (`bootstrap`), seeds of one name pair
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel
 from experiments.analysis.intervals import NATS, OVERALL, Interval, interval_of, nats_first, overall
-from experiments.analysis.paired import OF_TOKENS, TRUTH, NotComparable, require_same_windows
+from experiments.analysis.paired import OF_TOKENS, TRUTH, NoNumbers, NotComparable, require_same_windows
 from hma_jax.evaluation.controllability import OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
@@ -59,7 +59,8 @@ def compare(a: Side, b: Side) -> list[Difference]:
 
     Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things; of
     retrieval those where the true actions were ranked among another number of others.
-    Raises NotComparable, naming the first window that differs, or that lacks what every window of a sound model has.
+    Raises NotComparable, naming the first window that differs, and NoNumbers, naming the first that lacks what it has
+    in every sound model.
     """
     pairs = _pairs(a, b)
     first = pairs[0][0]
@@ -70,24 +71,8 @@ def compare(a: Side, b: Side) -> list[Difference]:
         foreign |= {m for m in shared if m.startswith("retrieval")}
     found = []
     for metric in nats_first(m for m in shared if m not in (*foreign, *NOT_OF_MODELS)):
-        if metric not in OPTIONAL_METRICS:
-            for side, tables in zip((a, b), zip(*pairs, strict=True), strict=True):
-                _require_numbers(side.name, tables, metric, robots)
-        found += _of_metric(metric, *_panels(pairs, metric, robots))
+        found += _of_metric(metric, *_panels((a, b), pairs, metric, robots))
     return found
-
-
-def _require_numbers(name: str, tables: Iterable[WindowTable], metric: str, robots: Sequence[str]) -> None:
-    """Raises NotComparable, naming the first window without one: left out, it would favour the model that broke."""
-    for table in tables:
-        own = table.among(robots)
-        lacking = np.flatnonzero(np.isnan(own.metrics[metric]))
-        if len(lacking):
-            robot, episode, start = own.names[lacking[0]]
-            raise NotComparable(
-                f"{name} has no {metric} of window ({robot}, episode {episode}, frame {start}) (and {len(lacking) - 1} "
-                "others): what it predicts there is no number. Compare another model, or train this one again"
-            )
 
 
 def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
@@ -99,11 +84,12 @@ def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
 
 
 def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:
-    """Of one metric over the mean of `robots`; None where no window has it on both sides. Raises NotComparable."""
+    """Of one metric over the mean of `robots`; None where no window has it. Raises NotComparable, and NoNumbers where
+    a window has it in one model alone, or a metric that no sound model lacks in none."""
     pairs = _pairs(a, b)
     if not all(metric in table.metrics for pair in pairs for table in pair):
         return None
-    return next(iter(_of_metric(metric, *_panels(pairs, metric, robots), by_robot=False)), None)
+    return next(iter(_of_metric(metric, *_panels((a, b), pairs, metric, robots), by_robot=False)), None)
 
 
 def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
@@ -119,11 +105,31 @@ def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
     return [(a.seeds[seed], b.seeds[seed]) for seed in shared]
 
 
-def _panels(pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robots: Sequence[str]) -> list[Panel]:
-    """One of each side, of the same windows in the same order."""
+def _panels(
+    sides: Sequence[Side], pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robots: Sequence[str]
+) -> list[Panel]:
+    """One of each side, of the same windows in the same order. Raises NoNumbers."""
     both = make_panel([dict(enumerate(side)) for side in zip(*pairs, strict=True)], metric, robots)
-    sides = zip(both.points, both.seeds, strict=True)
-    return [Panel(both.robot, both.episode, (values,), (seeds,)) for values, seeds in sides]
+    lacking = lacks_numbers(metric, np.concatenate(both.points))  # [seeds of both, n]
+    if lacking.any():
+        model, window = np.argwhere(lacking)[0]
+        robot, episode, start = pairs[0][0].among(robots).names[window]
+        raise NoNumbers(
+            f"{sides[model // len(pairs)].name} has no {metric} of window ({robot}, episode {episode}, frame {start}) (and "
+            f"{lacking[model].sum() - 1} others): what it predicts there is no number. Compare another model, or train "
+            "this one again"
+        )
+    return [
+        Panel(both.robot, both.episode, (values,), (seeds,))
+        for values, seeds in zip(both.points, both.seeds, strict=True)
+    ]
+
+
+def lacks_numbers(metric: str, values: np.ndarray) -> np.ndarray:
+    """bool [models, n], of `values` [models, n] of the same windows: where a model has none though every sound one has,
+    or, of OPTIONAL_METRICS, though another of them has. Such windows, left out, would favour the model that broke."""
+    none = np.isnan(values)
+    return none & ~none.all(0) if metric in OPTIONAL_METRICS else none
 
 
 def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[Difference]:

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 from experiments.analysis.changes import METRICS
 from experiments.analysis.compare import Side, overall_difference
+from experiments.analysis.paired import NoNumbers
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of, trial_id
 from experiments.sweeps.robots import UNIFORM
@@ -91,7 +92,10 @@ def _along(
         b, a = (Side(f"{sweep.axis} {x:g}", {s: trials[x][s][1] for s in sorted(seeds)}, "") for x in (first, last))
         for data, robots in groups.items():
             for metric in METRICS if robots else ():
-                d = overall_difference(a, b, metric, robots)
+                try:
+                    d = overall_difference(a, b, metric, robots)
+                except NoNumbers:  # as in `changes`
+                    continue
                 if d is not None:
                     found.append(
                         Growth(

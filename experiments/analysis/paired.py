@@ -26,6 +26,10 @@ class NotComparable(ConfigError):
     """Two trials were judged on different windows."""
 
 
+class NoNumbers(NotComparable):
+    """A model has no number of a window where every sound one has: what it predicts there is none."""
+
+
 def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
     """The robots that both have, in the order of `a`.
 

@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import html
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
+from experiments.analysis.compare import lacks_numbers
 from experiments.analysis.controllability import ROUNDING
 from experiments.analysis.intervals import HELD_OUT_LOSS, standard_errors
 from experiments.analysis.predictions import Outcome
@@ -22,6 +26,7 @@ from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.words import counted
+from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable
 
@@ -107,6 +112,12 @@ def check_numbers(
     wrong = [id for id in results if id in windows and not _follows(results[id], windows[id], group)]
     if wrong:
         return Check(name, "bad", f"The results of {len(wrong)} trials do not follow from their windows: {wrong[0]}.")
+    if broken := _without_numbers(windows):
+        (id, metric), count = next(iter(broken.items()))
+        others = f", nor have {counted(len(broken) - 1, 'more')}" if len(broken) > 1 else ""
+        return Check(
+            name, "bad", f"{id} has no {metric} of {counted(count, 'window')}{others}; no difference is taken of these."
+        )
     missing = [id for id in results if id not in windows]
     if missing or not results:
         what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows."
@@ -114,6 +125,21 @@ def check_numbers(
     count = sum(len(w) for w in windows.values())
     text = f"Table and results of {len(results)} trials were recomputed from {count:,} windows."
     return Check(name, "good", text)
+
+
+def _without_numbers(windows: Mapping[str, WindowTable]) -> dict[tuple[str, str], int]:
+    """{(trial, metric): windows} of which the trial has no number though every sound model has one; trials of the same
+    windows are compared."""
+    same: dict[tuple[str, ...], dict[str, np.ndarray]] = defaultdict(dict)
+    for id, table in windows.items():
+        judged = stable_hash([column.tolist() for column in (table.dataset, table.episode, table.start)])
+        for metric, values in table.metrics.items():
+            same[metric, judged][id] = values
+    found = {}
+    for (metric, _), by_trial in same.items():
+        lacking = lacks_numbers(metric, np.stack([*by_trial.values()])).sum(1)
+        found |= {(id, metric): int(n) for id, n in zip(by_trial, lacking, strict=True) if n}
+    return found
 
 
 def _key(row: Row) -> tuple[Any, ...]:

@@ -168,6 +168,25 @@ def test_results_that_do_not_follow_from_their_windows_are_noticed(copied, numbe
     assert verdict == "bad" and directory.name in text
 
 
+def test_a_model_without_a_number_of_some_windows_is_named_and_not_compared(copied):
+    """Its windows without one were left out of every difference, which favoured it; nothing said so."""
+    workspace, record = copied
+    broken, *_ = trials_of(record, width=16, seed=0)
+
+    def lose(metrics):
+        lost = metrics["cross_entropy"].copy()
+        lost[:3] = np.nan
+        return metrics | {"cross_entropy": lost}
+
+    rejudge(workspace, broken, lose)
+    workspace.results.unlink()
+    draw(workspace, record)
+    verdict, text = verdicts(workspace)["numbers"]
+    assert verdict == "bad" and f"{broken} has no cross_entropy of 3 windows; no difference is taken of these." in text
+    said = workspace.report.read_text()
+    assert "From 8 to 16, paired by window: ΔPSNR (dB) " in said
+
+
 def test_trials_that_kept_no_windows_leave_the_question_open(copied):
     workspace, record = copied
     directory = workspace.trials / trials_of(record, width=8, seed=0)[0]

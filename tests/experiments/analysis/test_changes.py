@@ -55,6 +55,19 @@ def test_other_windows_at_one_end_are_refused():
         changed(tables={**TABLES, of(48, 0): shifted})
 
 
+@pytest.mark.parametrize("own_robots", [False, True])
+def test_a_metric_that_a_model_lacks_somewhere_has_no_difference(own_robots):
+    """The windows without it were left out, which favoured the model that broke."""
+    scopes = [(robot,) if own_robots else () for robot in SWEEP.scope]
+    sweep = replace(SWEEP, points=tuple(replace(p, scope=scopes[p.trial.train.seed % 3]) for p in SWEEP.points))
+    table = TABLES[of(48, 0)]
+    nats = np.where(np.arange(len(table)) == 0, np.nan, table.metrics["cross_entropy"])
+    tables = TABLES | {of(48, 0): replace(table, metrics=table.metrics | {"cross_entropy": nats})}
+    assert changed(sweep) is not None
+    assert changed(sweep, tables) is None
+    assert changed(sweep, tables, "delta_psnr") == changed(sweep, metric="delta_psnr")
+
+
 def test_seeds_that_judge_robots_of_their_own_are_each_compared_on_these():
     robots = SWEEP.scope
     points = tuple(replace(p, scope=(robots[p.trial.train.seed % len(robots)],)) for p in SWEEP.points)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.analysis.compare import Side, compare
+from experiments.analysis.compare import Side, compare, overall_difference
 from experiments.analysis.intervals import OVERALL
-from experiments.analysis.paired import NotComparable
+from experiments.analysis.paired import NoNumbers, NotComparable
 from hma_jax.evaluation.summary import paired_difference
 from tests.experiments.analysis.worlds import intervals, judged, under_seeds, with_loss
 
@@ -64,6 +64,20 @@ def test_a_model_that_broke_on_some_windows_is_refused():
         compare(a, replace(b, seeds={0: broken}))
     other = replace(a, seeds={0: a.seeds[0].among(("r0", "r2"))})
     assert compare(other, replace(b, seeds={0: broken})), "a robot that is not compared"
+
+
+def test_a_metric_that_some_windows_lack_is_lacked_by_both_models_or_refused():
+    """Windows of which one alone had action-nats were left out of both."""
+    a, b = sides()
+    nats = a.seeds[0].metrics["action_nats"].copy()
+    nats[np.flatnonzero(a.seeds[0].dataset == "r2")[1:3]] = np.nan
+    table = a.seeds[0]
+    broken = Side("a", {0: replace(table, metrics=table.metrics | {"action_nats": nats})}, "t")
+    for pair in ((broken, b), (b, broken)):
+        with pytest.raises(NoNumbers, match=r"^a has no action_nats of window \(r2, .*\) \(and 1 others\)"):
+            compare(*pair)
+        with pytest.raises(NoNumbers):
+            overall_difference(*pair, "action_nats", table.datasets)
 
 
 def test_several_seeds_are_paired_by_name_and_their_scatter_counts():
