@@ -12,7 +12,7 @@ import io
 import math
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
 from experiments.rows import OVERALL, Row, curve, difference
@@ -38,7 +38,8 @@ class Expected:
     low: float
     high: float
     commit: str
-    seeds: tuple[int, ...] = ()  # of these alone; (): of all. The column may be left out.
+    seeds: tuple[int, ...] = ()  # of these alone; (): of all. This column and those after it may be left out.
+    known: tuple[int, ...] = ()  # seeds of x that had run when it was written
 
 
 @dataclass(frozen=True)
@@ -67,14 +68,18 @@ def read_expected(path: Path) -> list[Expected]:
     if not path.exists():
         return []
     columns, numbers = [f.name for f in fields(Expected)], ("mean", "low", "high")
+    optional = [f.name for f in fields(Expected) if f.default is not MISSING]
+    needed = columns[: -len(optional)]
     try:
         text = path.read_text(encoding="utf-8-sig")  # as spreadsheets save it, too
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not UTF-8 ({error}); save it in this encoding") from error
     with io.StringIO(text, newline="") as file:
         reader = csv.DictReader(file)
-        known = (columns, columns[:-1])
-        require(reader.fieldnames in known, f"{path}: its columns must be {','.join(known[1])}, and optionally seeds")
+        require(
+            reader.fieldnames in [columns[:n] for n in range(len(needed), len(columns) + 1)],
+            f"{path}: its columns must be {','.join(needed)}, and optionally, in this order, {','.join(optional)}",
+        )
         found: list[Expected] = []
         lines: dict[tuple, int] = {}  # of each number that is spoken of
         for record in reader:
@@ -82,14 +87,19 @@ def read_expected(path: Path) -> list[Expected]:
             try:
                 if None in record.values():
                     raise ValueError("it has too few columns")
-                seeds = tuple(int(seed) for seed in record.pop("seeds", "").split())
-                found.append(Expected(**record | {name: float(record[name]) for name in numbers}, seeds=seeds))
+                of_seeds = {name: tuple(map(int, record.pop(name, "").split())) for name in optional}
+                found.append(Expected(**record | {name: float(record[name]) for name in numbers}, **of_seeds))
             except (TypeError, ValueError) as error:
                 raise ConfigError(f"{path}, line {number}: not a prediction ({error})") from error
             e = found[-1]
             where = f"{path}, line {number}"
             require(e.low <= e.mean <= e.high, f"{where}: low must not be above mean, and mean not above high")
             require(math.isfinite(e.high - e.low), f"{where}: low and high must be finite")
+            some = set(e.known) < set(e.seeds) if e.seeds and e.known else True
+            require(
+                some,
+                f"{where}: known must name some of the seeds, not others and not all, of which nothing is predicted",
+            )
             # A difference the other way round is the same number.
             positions = frozenset(map(_position, (e.x, e.against)))
             require(len(positions) > 1, f"{where}: x must name a point, and against, if given, another point")

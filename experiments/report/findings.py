@@ -68,18 +68,22 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
     for c in own:
         e = c.expected
         where = f"{e.x} beside {e.against}" if e.against else e.x
-        where += f", seed {', '.join(map(str, e.seeds))}" if e.seeds else ""
+        for what, seeds in (("seed {}", e.seeds), ("seed {} known before", e.known)):
+            where += f", {what.format(', '.join(map(str, seeds)))}" if seeds else ""
         predicted = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
         observed = c.lacks if c.observed is None else pm(c.observed, c.seed_sem)
         curve = [html.escape(e.series)] if sweep.has_series else []
         metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
     ran = [c for c in own if c.observed is not None]
+    known = [c for c in ran if c.expected.known]
+    hold = sum(bool(c.inside) for c in known)
+    less = f" Of {len(known)} of them, {hold} of which hold, some seeds were known by then." * bool(known)
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
     head = ["curve"] * sweep.has_series + [sweep.axis, "", "predicted", "observed", "", "seeds"]
     return (
         f"<h4>Preregistered</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals contain the outcome. According "
-        f"to the author they were written before the trials ran, in {commits}. Errors are over seeds.</p>"
+        f"to the author they were written before the trials ran, in {commits}.{less} Errors are over seeds.</p>"
         f"<details><summary>Predicted and observed</summary>{table(head, lines, text=2 + sweep.has_series)}</details>"
     )
 

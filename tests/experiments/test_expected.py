@@ -82,6 +82,17 @@ def test_some_seeds_alone_may_be_meant(rows, tmp_path):
     assert came.observed == pytest.approx((seeds[0] + seeds[2]) / 2) and (came.seeds, came.planned) == (2, 2)
 
 
+def test_seeds_that_were_known_are_read_and_must_leave_something_to_predict(tmp_path):
+    def read(line: str) -> list[Expected]:
+        (tmp_path / FILE).write_text(f"{COLUMNS},seeds,known\nwidth,,8,,cross_entropy,5,4,6,abc1234,{line}\n")
+        return read_expected(tmp_path / FILE)
+
+    assert read(",0") == [replace(WIDTH, known=(0,))] and read("0 2,0")[0].known == (0,)
+    for wrong in ("0 2,0 2", "0 2,1"):
+        with pytest.raises(ConfigError, match="line 2: known must name some of the seeds"):
+            read(wrong)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -197,8 +208,8 @@ def test_the_page_shows_both_at_the_axis(study):
     workspace, record = study
     workspace.predictions.mkdir()
     (workspace.predictions / FILE).write_text(
-        f"{COLUMNS}\nwidth,,8,,cross_entropy,50,40,60,abc1234\nwidth,,8,16,cross_entropy,0,-9,9,abc1234\n"
-        "width,,64,,cross_entropy,1,0,2,abc1234\n"
+        f"{COLUMNS},seeds,known\nwidth,,8,,cross_entropy,50,40,60,abc1234,,\n"
+        "width,,8,16,cross_entropy,0,-9,9,abc1234,,0\nwidth,,64,,cross_entropy,1,0,2,abc1234,,\n"
     )
     workspace.findings.write_text(
         "# What it says\n\nIn short: little.\n\n"
@@ -210,8 +221,11 @@ def test_the_page_shows_both_at_the_axis(study):
     axis, elsewhere = page.index("<h3>Width</h3>"), page.index("<h2>Elsewhere</h2>")
     of_axis = page[axis : page.index("</section>", axis)]
     assert "1 of 2 intervals contain the outcome" in of_axis and "<code>abc1234</code>" in of_axis
+    assert "Of 1 of them, 1 of which hold, some seeds were known by then." in of_axis
     assert (
-        "not planned" in of_axis and "8 beside 16" in of_axis and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
+        "not planned" in of_axis
+        and "8 beside 16, seed 0 known before" in of_axis
+        and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
     )
     assert "<strong>Wide</strong> pays &lt;script&gt;." in of_axis and "<td>1</td>" in of_axis
     assert "its figure" not in page and axis < elsewhere
