@@ -212,7 +212,7 @@ def of_sweep(rows: Iterable[Row], sweep: str) -> list[Row]:
 class CurvePoint:
     """The seeds of one x together.
 
-    `sem` joins the spread over seeds and over episodes. `seed_sem` is the former alone, nan for a
+    `sem` joins the spread over seeds and over episodes (`curve`). `seed_sem` is the former alone, nan for a
     single seed: the error of a comparison on the same windows.
     """
 
@@ -239,8 +239,9 @@ def curve(
     sem^2 = variance over seeds / seeds + mean of each seed's sem^2 over episodes: all seeds are judged
     on the same windows, so that the second part does not shrink with their number. Where robots are `robots_vary` for
     every seed (`Sweep.robots_vary`), windows are others too, and what they do is within the variance over seeds: the
-    first part is all, where there are several.
+    first part is all, where there are several. So it is of the training loss, which every seed has of steps of its own.
     """
+    own_windows = robots_vary or scope == TRAINING
     groups: dict[float, list[Row]] = defaultdict(list)
     for r in rows:
         # Of a hundred thousand rows a few are meant: what most of them fail is asked first.
@@ -251,7 +252,7 @@ def curve(
         means = [r.mean for r in group]
         mean = add_up(means) / len(means)
         spread = add_up((m - mean) ** 2 for m in means) / max(len(means) - 1, 1) / len(means)
-        episodes = add_up(r.sem**2 for r in group) / len(group) if len(group) == 1 or not robots_vary else 0.0
+        episodes = add_up(r.sem**2 for r in group) / len(group) if len(group) == 1 or not own_windows else 0.0
         points.append(
             CurvePoint(
                 x, mean, sem=math.sqrt(spread + episodes),

@@ -6,6 +6,10 @@ parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A budget at w
 has the lowest loss, or whose parabola has no minimum between them, is refused: the best size may lie beyond. A parabola
 through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter, that
 is reported: the error of its minimum is then larger than the bootstrap's.
+
+The parabola is a choice, and no bootstrap knows of it. So the exponent is given a second time, of the parabola through
+the best size and its two neighbours alone, and is doubted where that lies outside its interval, or where one size has
+the lowest loss at every budget: then the form alone says that the best size grows.
 """
 
 from __future__ import annotations
@@ -42,6 +46,7 @@ class Budget:
     parabola: np.ndarray | None = None  # of log loss over log size - `centre`, highest power first
     centre: float = 0.0
     best: Coefficient | None = None  # N_opt
+    near: Coefficient | None = None  # N_opt of the best size and its two neighbours alone, wherever there is a best
     refused: str = ""
     doubt: str = ""
     misfit: str = ""  # whether sizes lie off the parabola by more than seeds scatter
@@ -56,6 +61,11 @@ class Budget:
         """Why there is no best size, or what is doubtful of it."""
         return self.refused or "; ".join(self.doubts)
 
+    @property
+    def lowest(self) -> float:
+        """The size that was measured to have the lowest loss."""
+        return float(self.sizes[np.argmin(self.loss)])
+
     def at(self, sizes: np.ndarray) -> np.ndarray:
         """The parabola's loss."""
         return np.exp(np.polyval(self.parabola, np.log(sizes) - self.centre))
@@ -63,10 +73,30 @@ class Budget:
 
 @dataclass(frozen=True)
 class IsoFlop:
+    """N_opt = k C^a through the best sizes, and the same (`near`) through those that their neighbours alone give."""
+
     budgets: tuple[Budget, ...] = ()
-    exponent: Coefficient | None = None  # a of N_opt = k C^a
+    exponent: Coefficient | None = None  # a
     scale: float = float("nan")  # k
+    near: Coefficient | None = None  # a, wherever there is an exponent
+    near_scale: float = float("nan")  # k
     refused: str = ""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is doubtful of the exponent, beside what is of the best size of a single budget."""
+        a, near, found = self.exponent, self.near, []
+        if a is None:
+            return ()
+        if not a.low <= near.value <= a.high:
+            found.append(f"the three sizes around each best one alone give {near.value:.2g}, outside its interval")
+        lowest = {b.lowest for b in self.budgets if b.best}
+        if len(lowest) == 1 and not a.low <= 0 <= a.high:
+            size = f"{lowest.pop():,.0f} trunk parameters"
+            found.append(
+                f"{size} have the lowest loss at every budget: the form of the fit alone says that more are best"
+            )
+        return tuple(found)
 
 
 def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws: int = DRAWS) -> IsoFlop:
@@ -81,15 +111,21 @@ def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws
     if not len(budgets):
         return IsoFlop(refused=f"no budget that {MIN_SIZES} sizes were trained for")
     fitted = [_fit_budget(lines, flops) for flops in budgets]
-    found, minima = [b for b, _ in fitted], [(b.flops, m) for b, m in fitted if b.best]
+    found, minima = [b for b, _ in fitted], [(b.flops, m) for b, m in fitted if b.best]  # m [2, 1 + R]
     if len(minima) < MIN_BUDGETS:
         why = f"{len(minima)} of {len(found)} budgets have a minimum; the exponent needs at least {MIN_BUDGETS}"
         return IsoFlop(tuple(found), refused=why)
-    flops, optima = np.log([f for f, _ in minima]), np.stack([m for _, m in minima])  # [b], [b, 1 + R]
+    flops, optima = np.log([f for f, _ in minima]), np.stack([m for _, m in minima], 1)  # [b], [2, b, 1 + R]
+    laws = (_law(name, flops, of_form) for name, of_form in zip(("a", "a of three sizes"), optima, strict=True))
+    (exponent, scale), (near, near_scale) = laws
+    return IsoFlop(tuple(found), exponent, scale, near, near_scale)
+
+
+def _law(name: str, flops: np.ndarray, optima: np.ndarray) -> tuple[Coefficient, float]:
+    """(a called `name`, k) of N_opt = k C^a, of log C [b] and log N_opt [b, 1 + R]."""
     slope, level = np.polyfit(flops - flops.mean(), optima, 1)
-    scale = float(np.exp(level[0] - slope[0] * flops.mean()))
-    exponent = Coefficient("a", float(slope[0]), *map(float, interval(slope[1:])))
-    return IsoFlop(tuple(found), exponent, scale)
+    exponent = Coefficient(name, float(slope[0]), *map(float, interval(slope[1:])))
+    return exponent, float(np.exp(level[0] - slope[0] * flops.mean()))
 
 
 class _Line:
@@ -133,14 +169,14 @@ def _common_budgets(lines: list[_Line]) -> np.ndarray:
 
 
 def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
-    """(the budget, log N_opt [1 + R])."""
+    """(the budget, log N_opt [2, 1 + R] of the parabola and of the three sizes around the best)."""
     covering = [line for line in lines if line.covers(flops)]
     sizes = np.array([line.size for line in covering])
     logs = np.stack([line.at(flops) for line in covering]) if covering else np.zeros((0, 1))
     loss = np.exp(logs[:, 0])
     if len(sizes) < MIN_SIZES:
         few = f"{counted(len(sizes), 'size')}; at least {MIN_SIZES} are needed"
-        return Budget(flops, sizes, loss, refused=few), np.array([])
+        return Budget(flops, sizes, loss, refused=few), np.zeros((2, 0))
     least, at_end = int(np.argmin(loss)), np.isin(np.argmin(logs, 0), (0, len(sizes) - 1))  # at_end [1 + R]
     first = max(min(least - NEIGHBOURS, len(sizes) - 2 * NEIGHBOURS - 1), 0)
     near = slice(first, first + 2 * NEIGHBOURS + 1)
@@ -153,17 +189,33 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     # A draw that opens downwards is lowest at the end to which it falls.
     falling = np.where(logs[0] < logs[-1], x[0], x[-1])
     lowest = np.where(opens_up, np.clip(lowest, x[0], x[-1]), falling)
+    both = np.stack([lowest, _lowest_of_three(x, logs)])
     common = dict(parabola=parabolas[:, 0], centre=float(x.mean()))
     if at_end[0] or not opens_up[0] or lowest[0] in (x[0], x[-1]):
         refused = "the parabola has no minimum between the sizes"
         if at_end[0]:
             refused = f"the {'largest' if least else 'smallest'} size is best: the minimum may lie beyond"
-        return Budget(flops, sizes, loss, **common, refused=refused), lowest
+        return Budget(flops, sizes, loss, **common, refused=refused), both
     part = float((at_end[1:] | np.isin(lowest[1:], (x[0], x[-1]))).mean())
     doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OPEN_SHARE else ""
-    best = Coefficient("N_opt", *(float(np.exp(v)) for v in (lowest[0], *interval(lowest[1:]))))
+    best, around = (
+        Coefficient(name, *(float(np.exp(v)) for v in (of_form[0], *interval(of_form[1:]))))
+        for name, of_form in zip(("N_opt", "N_opt of three sizes"), both, strict=True)
+    )
     misfit = _misfit(logs - np.vander(x - x.mean(), 3) @ parabolas, [line.seeds_near(flops) for line in covering[near]])
-    return Budget(flops, sizes, loss, **common, best=best, doubt=doubt, misfit=misfit), lowest
+    return Budget(flops, sizes, loss, **common, best=best, near=around, doubt=doubt, misfit=misfit), both
+
+
+def _lowest_of_three(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """[1 + R]: where the parabola through the least of `logs` [m, 1 + R] and its two neighbours over `x` [m] is lowest,
+    which is between these; where the least is at an end, that end."""
+    least, draw = np.argmin(logs, 0), np.arange(logs.shape[1])
+    middle = np.clip(least, 1, len(x) - 2)
+    (x0, x1, x2), (y0, y1, y2) = ([v(middle + i) for i in (-1, 0, 1)] for v in (x.take, lambda i: logs[i, draw]))
+    left, right = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of three on a line the least is at an end
+        lowest = (x0 + x1) / 2 - left * (x2 - x0) / (2 * (right - left))
+    return np.where(least == middle, lowest, x[least])
 
 
 def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:

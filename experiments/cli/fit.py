@@ -66,9 +66,12 @@ def _show(root: Path) -> None:
     for fitted in numbers.fits:
         table.add_row(*map(escape, (fitted.curve.name, ", ".join(fitted.curve.axes), *_words(fitted))))
     if numbers.isoflop is not None:
-        a = numbers.isoflop.exponent
-        exponent = f"N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" if a else ""
-        doubts = [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
+        laws = {"": numbers.isoflop.exponent, "by three sizes ": numbers.isoflop.near}
+        exponent = ", ".join(
+            f"{form}N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" for form, a in laws.items() if a
+        )
+        doubts = [*numbers.isoflop.doubts]
+        doubts += [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
         table.add_row("isoflop", "training FLOPs", "", exponent, numbers.isoflop.refused or "; ".join(doubts))
     console.print(table)
 

@@ -42,13 +42,13 @@ def fit_rows(fits: Sequence[CurveFit], isoflop: IsoFlop | None) -> list[FitRow]:
         fit, label = fitted.fit, (fitted.curve.name, " x ".join(fitted.curve.axes), len(fitted.fit.trials))
         rows += _rows(label, () if fit.refused else fit.coefficients, fit.refused, fit.doubts)
     if isoflop is not None:
-        coefficients = (isoflop.exponent,) if isoflop.exponent else ()
+        coefficients = filter(None, (isoflop.exponent, isoflop.near))
         best = [b for b in isoflop.budgets if b.best]
-        doubts = tuple(f"{b.flops:.4g} FLOPs: {b.remarks}" for b in best if b.doubts)
+        doubts = (*isoflop.doubts, *(f"{b.flops:.4g} FLOPs: {b.remarks}" for b in best if b.doubts))
         rows += _rows(("isoflop", "training FLOPs", len(best)), coefficients, isoflop.refused, doubts)
         for b in isoflop.budgets:
             label = (f"isoflop {b.flops:.4g}", "trunk parameters", len(b.sizes))
-            rows += _rows(label, (b.best,) if b.best else (), b.refused, b.doubts)
+            rows += _rows(label, filter(None, (b.best, b.near)), b.refused, b.doubts)
     return rows
 
 
@@ -124,20 +124,29 @@ def _isoflop(isoflop: IsoFlop | None) -> str:
         return ""
     lines = []
     for b in isoflop.budgets:
-        best = _with_interval(b.best) if b.best else "–"
-        lines.append([f"{b.flops:.3g}", str(len(b.sizes)), best, html.escape(b.remarks)])
-    a = isoflop.exponent
-    sentence = (
-        f"The best size grows as C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>."
-        if a
-        else f"No power law: {html.escape(isoflop.refused)}."
+        best = [_with_interval(n) if n else "–" for n in (b.best, b.near)]
+        lines.append([f"{b.flops:.3g}", str(len(b.sizes)), *best, html.escape(b.remarks)])
+    sentence = _best_size(isoflop) if isoflop.exponent else f"No power law: {html.escape(isoflop.refused)}."
+    head = ["training FLOPs", "sizes", "best trunk parameters", "by three sizes", "remarks"]
+    return f"<h3>The best size for each compute budget</h3><p>{sentence}</p>{table(head, lines, text=5)}"
+
+
+def _best_size(isoflop: IsoFlop) -> str:
+    """How it grows, by both forms, and what is doubtful of that."""
+
+    def power(a: Coefficient) -> str:
+        return f"C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>".replace("-", "\u2212")
+
+    said = (
+        f"The best size grows as {power(isoflop.exponent)} by a parabola through up to five sizes, and as "
+        f"{power(isoflop.near)} by one through the best size and its two neighbours."
     )
+    if isoflop.doubts:
+        said += f" The exponent is doubtful: {html.escape('; '.join(isoflop.doubts))}."
     best = [b for b in isoflop.budgets if b.best]
-    doubtful = sum(bool(b.doubts) for b in best)
-    if a and doubtful:
-        sentence += (
+    if doubtful := sum(bool(b.doubts) for b in best):
+        said += (
             f" {doubtful} of its {counted(len(best), 'best size')} {'is' if doubtful == 1 else 'are'} doubtful (remarks), "
             "which the interval does not include."
         )
-    head = ["training FLOPs", "sizes", "best trunk parameters", "remarks"]
-    return f"<h3>The best size for each compute budget</h3><p>{sentence}</p>{table(head, lines, text=4)}"
+    return said

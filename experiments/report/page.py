@@ -26,7 +26,7 @@ from experiments.report.findings import Findings, describe_expected, read_findin
 from experiments.report.fits import describe_fits
 from experiments.report.numbers import Numbers
 from experiments.report.pieces import card, contents, picture, section, table
-from experiments.report.plot_style import drawn_metrics
+from experiments.report.plot_style import OVER, drawn_metrics
 from experiments.report.robots import Robot, are_sorted, describe_robots, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import TWO_PERPLEXITIES, AxisStatistics, describe
@@ -93,7 +93,7 @@ def write_report(
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>HMA-JAX study: {html.escape(record.study.name)}</title><style>{CSS}</style></head>\n"
+        f"<title>HMA-JAX study: {html.escape(_name(workspace, record.study))}</title><style>{CSS}</style></head>\n"
         f"<body><main>{headline}{contents(''.join(body))}{''.join(body)}</main></body></html>\n"
     )
     write_file(workspace.report, page)
@@ -148,7 +148,8 @@ def _headline(
     for metric in (m for m in metrics if shown and m in card_notes):
         name, of_untrained = card_notes[metric]
         point = _at_default(rows, shown.sweep, metric)
-        over = "s.e. over episodes and seeds" if point and len(point.seeds) > 1 else "s.e. over episodes of one seed"
+        several = point and len(point.seeds) > 1
+        over = f"s.e. over {OVER[shown.sweep.robots_vary] if several else 'episodes of one seed'}"
         cards.append(card(f"{name}, {shown.name}", point, over))
         untrained = _at_default(rows, shown.sweep, metric, UNTRAINED)
         if untrained or shown.name == REFERENCE:  # of other trials it is not expected
@@ -160,20 +161,27 @@ def _headline(
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
                  f"dB; a control: should be zero within {EACH:g} standard errors"),
         ]  # fmt: skip
-    cards.append(card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"))
+    if quality := _tokenizer_quality(workspace):  # not known of one that was given
+        cards.append(card("tokenizer PSNR", quality, "dB, reconstruction of held-out frames"))
     unfinished = sum(state.event != FINISHED for state in states.values())
     lacking = f"{counted(unfinished, 'trial')} {'has' if unfinished == 1 else 'have'} no result"
     warning = f'<p class="warning">{lacking}; see the table of trials.</p>'
     *others, final = [s.gain or s.axis for s in sweeps]
     gains = f"{', '.join(others)} and {final}" if others else final
     return (
-        f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
+        f"<header><h1>HMA study <em>{html.escape(_name(workspace, study))}</em></h1>"
         f"<p class=lead>What an action-conditioned video model over many robots gains from {html.escape(gains)}: "
         f"{counted(max(len(p.trial.datasets) for s in sweeps for p in s.points), 'dataset')}, "
         f"{all_steps(sweeps)} of {counted(study.train.batch, 'window')} per trial.</p>"
         f"<p class=meta>{html.escape(when)}</p></header>"
         f"<div class=cards>{''.join(cards)}</div>{warning if unfinished else ''}"
     )
+
+
+def _name(workspace: Workspace, study: Study) -> str:
+    """Of the preset, and of the directory where that tells more: studies of one preset would bear one name."""
+    directory = workspace.root.absolute().name
+    return study.name if directory == study.name else f"{study.name} ({directory})"
 
 
 def _finished_when(results: Mapping[str, Mapping[str, Any]], finished: Sequence[str]) -> str:

@@ -9,26 +9,26 @@ from matplotlib.axes import Axes
 
 from experiments.optima import diverged, ends, lowest
 from experiments.report.plot_style import (
-    BARS,
     EXP_OF,
     LABELS,
     MUTED,
     ON_LOG,
     axis_of_points,
-    bars_of,
     count,
     dodge,
     drawn_curve,
     drawn_metrics,
     name_axis,
     plain_log,
+    say_bars,
     show_control,
     show_legend,
+    show_means,
     show_nothing,
     show_tally,
     style_of,
 )
-from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, Row, all_series
+from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, CurvePoint, Row, all_series
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Sweep
 
 ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}
@@ -38,8 +38,9 @@ DRAWN = {
 }
 """Metrics with their scope and label, where curves are compared by where they are lowest."""
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
-PAIRED = f"{BARS}; points are paired, on the same windows"
-CAPTION = f"{PAIRED}\nstar: lowest, hollow at an end of the grid; cross: diverged; dotted: lowest of the base curve"
+OF_TRAINING = "; of the training loss over seeds, of one over steps"
+PAIRED = "; points are paired, on the same windows"
+OF_BASE = "\nstar: lowest, hollow at an end of the grid; cross: diverged; dotted: lowest of the base curve"
 
 
 def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
@@ -53,9 +54,10 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
         len(series), len(metrics), figsize=(4.3 * len(metrics), 0.7 + 2.9 * len(series)),
         layout="constrained", sharex=True, sharey="col", squeeze=False,
     )  # fmt: skip
+    points = []
     for line, role in zip(panels, series, strict=True):
         for panel, metric in zip(line, metrics, strict=True):
-            _draw(panel, rows, sweep, metric, role, series[role])
+            points += _draw(panel, rows, sweep, metric, role, series[role])
             if len(series) > 1:
                 panel.set_title(ROLES[role], loc="left", fontsize=10)
     for column, metric in zip(panels.T, metrics, strict=True):
@@ -65,13 +67,18 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     show_tally(panels[0, -1], rows, sweep.name)
     show_legend(figure, panels.flat)
     lost = any(diverged(rows, sweep.name, role, name) for role, names in series.items() for name in names)
-    plain = PAIRED + "\ncross: a seed diverged, the point is left out" * lost
-    figure.supxlabel(CAPTION if sweep.base else plain, fontsize=8.5, color=MUTED)
+    marks = OF_BASE if sweep.base else "\ncross: a seed diverged, the point is left out" * lost
+    bars = say_bars(points, sweep.robots_vary) + OF_TRAINING * (TRAINING_LOSS in metrics)
+    figure.supxlabel(bars + PAIRED + marks, fontsize=8.5, color=MUTED)
     return figure
 
 
-def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]) -> None:
-    scope, label = (DRAWN if sweep.base else CURVES)[metric]
+def _draw(
+    panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]
+) -> list[CurvePoint]:
+    """The points that are drawn."""
+    drawn = []
+    scope, metric_label = (DRAWN if sweep.base else CURVES)[metric]
     xs = sorted({r.x for r in rows if r.sweep == sweep.name})
     for i, name in enumerate(series):
         style = style_of(i, len(series))
@@ -84,11 +91,12 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str
         if best is None:
             continue
         aside = dict(zip((p.x for p in points), dodge([p.x for p in points], i, len(series), xs), strict=True))
-        panel.errorbar(
-            list(aside.values()), [p.mean for p in points], bars_of(points), **style,
-            markersize=5, linewidth=1.6, capsize=2.5, elinewidth=1.1,
-            label=name + (" (base)" if name == sweep.base else ""),
+        label = name + (" (base)" if name == sweep.base else "")
+        show_means(
+            panel, points, list(aside.values()), label, label, **style,
+            markersize=5, linewidth=1.6, capsize=2.5, elinewidth=1.1, zorder=2,
         )  # fmt: skip
+        drawn += points
         if not sweep.base:
             continue
         open_ended = best.x in ends(rows, sweep.name, role, name)
@@ -103,4 +111,5 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str
     if not panel.containers:
         show_nothing(panel)
     axis_of_points(panel, xs, [count(x) if x >= 1 else f"{x:.2g}" for x in xs], room=1.25)
-    panel.set_ylabel(label)
+    panel.set_ylabel(metric_label)
+    return drawn

@@ -35,6 +35,8 @@ ABREAST = 3
 """Curves beside each other: of more, a page shows nothing that can be read."""
 DOUBTED = {False: "-", True: "--"}
 """Lines by whether something is doubtful of them."""
+ASIDE = 0.04
+"""Part of an axis between a prediction and its outcome."""
 POINTS = dict(marker="o", linestyle="none", markersize=4, alpha=0.6, markeredgewidth=0)
 
 
@@ -78,7 +80,8 @@ def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outco
     )  # fmt: skip
     below.plot(x, 100 * fit.residuals, color=LINE, **POINTS)
     for outcome in outcomes:
-        _draw_outcome(above, outcome)
+        _draw_outcome(above, outcome, line[:, 0])
+        _draw_outcome(below, outcome, line[:, 0], float(fit.at(np.array([outcome.prediction.x]))[0]))
     below.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     above.set_xscale("log")
     plain_log(above, above.yaxis)
@@ -93,14 +96,20 @@ def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outco
     above.legend(loc="best")
 
 
-def _draw_outcome(panel: Axes, outcome: Outcome) -> None:
-    p = outcome.prediction
+def _draw_outcome(panel: Axes, outcome: Outcome, line: np.ndarray, fitted: float | None = None) -> None:
+    """The interval stands beside what was observed, which would hide it, by a part of the axis along `line`. Where the
+    loss that is `fitted` there is given, both are in per cent of it: among other losses they are too small to judge."""
+    p, observed = outcome.prediction, outcome.observed
+    values = np.array([p.mean, p.low, p.high, math.nan if observed is None else observed])
+    mean, low, high, came = values if fitted is None else 100 * np.log(values / fitted)
     panel.errorbar(
-        p.x[0], p.mean, [[p.mean - p.low], [p.high - p.mean]], fmt="_", color=DEFAULT, capsize=4, markersize=9,
-        elinewidth=1.6, zorder=4, label="predicted before it ran",
+        p.x[0] * (line[-1] / line[0]) ** ASIDE, mean, [[mean - low], [high - mean]], fmt="_", color=DEFAULT, capsize=4,
+        markersize=9, elinewidth=1.6, zorder=5, label="predicted before it ran",
     )  # fmt: skip
-    if outcome.observed is not None:
-        panel.plot(p.x[0], outcome.observed, "*", color=INK, markersize=11, zorder=5, label="observed")
+    if observed is not None:
+        panel.plot(
+            p.x[0], came, "*", color=INK, markersize=9, markerfacecolor="white", zorder=4, label="observed"
+        )  # fmt: skip
 
 
 def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
@@ -128,12 +137,15 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
                     budget.flops, best.value, [[best.value - best.low], [best.high - best.value]], **style,
                     markerfacecolor=filling, capsize=3,
                 )  # fmt: skip
+                right.plot(budget.flops, budget.near.value, "x", color=colour, markersize=6, zorder=4)
         if isoflop.exponent:
             flops = np.geomspace(isoflop.budgets[0].flops, isoflop.budgets[-1].flops, 50)
-            a = isoflop.exponent
-            words = f"$C^{{{a.value:.2f}}}$ ({a.low:.2f} to {a.high:.2f})"
-            line = DOUBTED[any(b.doubts for b in isoflop.budgets)]
-            right.plot(flops, isoflop.scale * flops**a.value, color=MUTED, linewidth=1.4, linestyle=line, label=words)
+            doubtful = bool(isoflop.doubts) or any(b.doubts for b in isoflop.budgets)
+            laws = (("parabola", isoflop.exponent, isoflop.scale, DOUBTED[doubtful]),)
+            laws += (("three sizes (crosses)", isoflop.near, isoflop.near_scale, ":"),)
+            for form, a, scale, line in laws:
+                words = f"{form}: $C^{{{a.value:.2f}}}$ ({a.low:.2f} to {a.high:.2f})"
+                right.plot(flops, scale * flops**a.value, color=MUTED, linewidth=1.4, linestyle=line, label=words)
             right.legend(loc="best")
         else:
             right.text(0.5, 0.5, "no power law", transform=right.transAxes, ha="center", color=MUTED)
@@ -145,8 +157,8 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
         left.set_ylabel("loss, nats per token")
         right.set_ylabel(f"best {TRUNK}")
         show_legend(figure, [left])
-        if any(b.doubts for b in isoflop.budgets):
-            words = "hollow and dashed: sizes lie off the parabola, or its minimum may lie at an end (table)"
+        if isoflop.doubts or any(b.doubts for b in isoflop.budgets):
+            words = "hollow or dashed: doubtful (the table says why)"
             figure.supxlabel(words, fontsize=8.5, color=MUTED)
         left.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
         save(figure, path)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from experiments.report.plot_style import (
-    BARS,
     CONTROL_LINE,
     DEFAULT,
     LABELS,
@@ -18,10 +18,11 @@ from experiments.report.plot_style import (
     drawn_curve,
     drawn_metrics,
     plain_log,
+    say_bars,
     show_nothing,
     show_tally,
 )
-from experiments.rows import Row
+from experiments.rows import CurvePoint, Row
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 CAPTION = (
@@ -32,6 +33,11 @@ CAPTION = (
 JUDGED = {False: "all judged on the same windows", True: "each seed judged on robots of its own"}
 WHOSE = {False: "", True: " and its robots: do not compare it with the means"}
 """Both by whether judged robots are drawn anew for every seed."""
+DOTS: dict[bool, dict[str, Any]] = {
+    True: dict(alpha=0.45, markersize=4, markeredgewidth=0),
+    False: dict(markersize=4.5, markerfacecolor="white", zorder=4),
+}
+"""Of seeds, by whether there are several: a single one lies on the mean."""
 
 
 def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
@@ -41,26 +47,28 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
         1, len(metrics), figsize=(2.4 + 3.4 * len(metrics), 1.8 + 0.36 * len(sweep.labels)),
         layout="constrained", sharey=True, squeeze=False,
     )  # fmt: skip
+    points = []
     for panel, metric in zip(panels[0], metrics, strict=True):
-        _draw(panel, rows, sweep, metric)
+        points += _draw(panel, rows, sweep, metric)
     panels[0, 0].set_yticks(range(len(sweep.labels)), sweep.labels)
     panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
     panels[0, 0].get_yticklabels()[int(sweep.reference_x)].set(color=DEFAULT, fontweight="bold")
     figure.supxlabel(
-        CAPTION.format(bars=BARS, judged=JUDGED[sweep.robots_vary], whose=WHOSE[sweep.robots_vary]),
+        CAPTION.format(
+            bars=say_bars(points, sweep.robots_vary, "hollow dot"), judged=JUDGED[sweep.robots_vary],
+            whose=WHOSE[sweep.robots_vary],
+        ),
         fontsize=8.5, color=MUTED,
     )  # fmt: skip
     return figure
 
 
-def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> list[CurvePoint]:
+    """The points that are drawn."""
     points = drawn_curve(rows, sweep, metric)
     for p, bar in zip(points, bars_of(points), strict=True):
         colour = DEFAULT if p.x == sweep.reference_x else MUTED
-        panel.plot(
-            list(p.seeds.values()), [p.x] * len(p.seeds), "o",
-            color=colour, alpha=0.45, markersize=4, markeredgewidth=0,
-        )  # fmt: skip
+        panel.plot(list(p.seeds.values()), [p.x] * len(p.seeds), "o", color=colour, **DOTS[len(p.seeds) > 1])
         panel.errorbar(
             p.mean, p.x, xerr=bar or None, color=colour, marker="|", markersize=13,
             markeredgewidth=2.2, capsize=3.5, elinewidth=1.5,
@@ -76,3 +84,4 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     show_tally(panel, rows, sweep.name)
     panel.grid(axis="y", visible=False)
     panel.set_xlabel(LABELS[metric])
+    return points

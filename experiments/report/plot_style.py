@@ -42,8 +42,9 @@ ON_LOG = ("perplexity", "diffusion_loss")
 EXP_OF = {"perplexity": HELD_OUT_LOSS}
 """{what is drawn: the metric of which it is exp of the mean}. The release's perplexity, which tables have, is a mean of
 exponentials: of a few hard robots, so that it may rank models otherwise than nats do."""
-BARS = "bars: s.e. over seeds and episodes"
-ERROR = "mean ± s.e. over seeds and episodes"
+OVER = {False: "seeds and episodes", True: "seeds, each with its own robots"}
+"""What errors of several seeds are over, by whether judged robots are drawn anew for every seed."""
+ONE_SEED = "one seed: s.e. over episodes"
 MARKERS = "o^DvPXs"
 SHADES = 0.55
 """Where the colours of curves end on viridis: beyond it they are too light for white paper."""
@@ -94,6 +95,30 @@ def _exp(p: CurvePoint) -> CurvePoint:
     mean = math.exp(p.mean)
     seeds = {seed: math.exp(value) for seed, value in p.seeds.items()}
     return replace(p, mean=mean, sem=mean * p.sem, seed_sem=mean * p.seed_sem, seeds=seeds)
+
+
+def show_means(
+    panel: Axes, points: Sequence[CurvePoint], xs: Sequence[float], several: str, one: str, **style: Any
+) -> None:
+    """Means at `xs` with their standard errors, joined by a line; hollow where there is one seed, since what its error
+    lacks would make it the surest of all. `several` and `one` are what the legend calls them."""
+    line = {name: style[name] for name in ("color", "zorder")} | {"linewidth": style.pop("linewidth")}
+    panel.plot(xs, [p.mean for p in points], **line)
+    for label, face, alone in ((several, style["color"], False), (one, "white", True)):
+        own = [(x, p) for x, p in zip(xs, points, strict=True) if (len(p.seeds) == 1) == alone]
+        if own:
+            panel.errorbar(
+                [x for x, _ in own], [p.mean for _, p in own], bars_of(p for _, p in own), linestyle="none",
+                markerfacecolor=face, label=label, **style,
+            )  # fmt: skip
+
+
+def say_bars(points: Collection[CurvePoint], robots_vary: bool, what: str = "hollow") -> str:
+    """What the bars of `points` are; `what` shows those of one seed."""
+    alone = [len(p.seeds) == 1 for p in points]
+    if alone and all(alone):
+        return f"bars, {ONE_SEED}"
+    return f"bars: s.e. over {OVER[robots_vary]}" + f"; {what}: one seed, over episodes" * any(alone)
 
 
 def bars_of(points: Iterable[CurvePoint]) -> list[float]:

@@ -17,13 +17,13 @@ from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import (
     COLOURS,
-    ERROR,
     LABELS,
     MUTED,
     ON_LOG,
+    ONE_SEED,
+    OVER,
     STYLE,
     axis_of_points,
-    bars_of,
     count,
     drawn_curve,
     drawn_metrics,
@@ -32,6 +32,7 @@ from experiments.report.plot_style import (
     save,
     show_control,
     show_legend,
+    show_means,
     show_nothing,
     show_tally,
 )
@@ -83,18 +84,17 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
 
 
 def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
-    """One curve with standard errors, every seed's point, and the reference lines."""
+    """One curve with standard errors, the points of several seeds, and the reference lines."""
     points = drawn_curve(rows, sweep, metric)
     colour = COLOURS[metric]
     if points:
-        xs = [p.x for p in points]
-        panel.errorbar(
-            xs, [p.mean for p in points], bars_of(points), color=colour, marker="o", markersize=5.5,
-            linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3, label=ERROR,
+        show_means(
+            panel, points, [p.x for p in points], f"mean ± s.e. over {OVER[sweep.robots_vary]}", ONE_SEED, color=colour,
+            marker="o", markersize=5.5, linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3,
         )  # fmt: skip
-        if any(len(p.seeds) > 1 for p in points):
+        if several := [p for p in points if len(p.seeds) > 1]:
             panel.plot(
-                [p.x for p in points for _ in p.seeds], [v for p in points for v in p.seeds.values()],
+                [p.x for p in several for _ in p.seeds], [v for p in several for v in p.seeds.values()],
                 "o", color=colour, alpha=0.45, markersize=3.5, markeredgewidth=0, zorder=4, label="seeds",
             )  # fmt: skip
         _x_axis(panel, points, sweep)

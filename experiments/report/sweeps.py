@@ -15,7 +15,7 @@ from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.optima import Optimum
 from experiments.report.pieces import pm, table
 from experiments.report.plot_families import ROLES
-from experiments.report.plot_style import USUAL, choose_metrics
+from experiments.report.plot_style import OVER, USUAL, choose_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.words import counted
@@ -133,27 +133,41 @@ def _controls(sweep: Sweep, rows: Sequence[Row]) -> str:
     """The trials on shuffled actions, beside all curves of several."""
     lines = _lines(sweep, rows, CONTROL)
     heading = f"{sweep.beside_controls}, shuffled actions" if sweep.beside_controls else "Trained on shuffled actions"
-    return f"<h4>{html.escape(heading)}</h4>" + table(_head(sweep, rows), lines) if lines else ""
+    return f"<h4>{html.escape(heading)}</h4>{_table(sweep, rows, lines)}" if lines else ""
 
 
 def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series: str = "") -> str:
     """A line per point, one per point on shuffled actions, and the change from end to end."""
-    numbers = table(_head(sweep, rows), _lines(sweep, rows) + _lines(sweep, rows, CONTROL, ", shuffled actions"))
-    return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
+    lines = _lines(sweep, rows) + _lines(sweep, rows, CONTROL, ", shuffled actions")
+    own = [c for c in changes if (c.sweep, c.series) == (sweep.name, series)]
+    return _table(sweep, rows, lines) + _change(own, sweep.robots_vary)
 
 
-def _head(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
-    return [sweep.axis, "parameters, all robots", *(HEADINGS[m] for m in _columns(sweep, rows)), "seeds"]
+def _table(sweep: Sweep, rows: Sequence[Row], lines: Sequence[Sequence[str]]) -> str:
+    """`lines` of `_lines`."""
+    return _with_parameters([sweep.axis, *(HEADINGS[m] for m in _columns(sweep, rows)), "seeds"], lines)
+
+
+def _with_parameters(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table of `lines` that end with their numbers of parameters: these stand last, since on a phone only the first
+    columns are seen, and below the table where all lines have one number."""
+    distinct = {parameters for *_, parameters in lines if parameters}
+    if len(distinct) != 1:
+        return table([*head, "parameters, all robots"], lines)
+    return (
+        table(head, [cells for *cells, _ in lines])
+        + f"<p>All have {distinct.pop()} parameters, all robots together.</p>"
+    )
 
 
 def _lines(sweep: Sweep, rows: Sequence[Row], role: str = POINT, remark: str = "") -> list[list[str]]:
-    """A line of a table for each point of one curve."""
+    """A line of a table for each point of one curve, its parameters at the end."""
     columns, lines = _columns(sweep, rows, role), []
     for x in sorted({x for column in columns.values() for x in column}):
         here = [column.get(x) for column in columns.values()]
         known = next(p for p in here if p)
         values = [pm(p.mean, p.sem) if p else "–" for p in here]
-        lines.append([f"{x:,}{remark}", _parameters(known), *values, str(len(known.seeds))])
+        lines.append([f"{x:,}{remark}", *values, str(len(known.seeds)), _parameters(known)])
     return lines
 
 
@@ -162,14 +176,14 @@ def _parameters(point: CurvePoint) -> str:
     return " to ".join(f"{n:,}" for n in dict.fromkeys((point.parameters[0], point.parameters[-1])))
 
 
-def _change(changes: Sequence[Change]) -> str:
+def _change(changes: Sequence[Change], robots_vary: bool) -> str:
     """One sentence: what changes from one end of a curve to the other, window by window."""
     if not changes:
         return ""
     ends = changes[0]
     differences = ", ".join(f"{CHANGED[c.metric]} {_with_interval(c, '+', '95 % interval ')}" for c in changes)
     over = (
-        f"seeds ({ends.seeds}) and episodes"
+        OVER[robots_vary].replace("seeds", f"seeds ({ends.seeds})")
         if ends.seeds > 1
         else "episodes of one seed and leaves out the scatter of seeds"
     )
@@ -197,18 +211,18 @@ def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> 
         known = next((p for p in here.values() if p), None)
         if known is None:
             continue
-        cells = [_bold(label, x == sweep.reference_x), _parameters(known)]
+        cells = [_bold(label, x == sweep.reference_x)]
         for metric, p in here.items():
             cells.append(pm(p.mean, p.sem) if p else "–")
             if metric != "perplexity":
                 cells.append(_difference(p, columns[metric].get(sweep.reference_x), apart.get((metric, x))))
-        lines.append([*cells, str(len(known.seeds))])
+        lines.append([*cells, str(len(known.seeds)), _parameters(known)])
     if any(controls.values()):
         cells = []
         for metric, points in controls.items():
             cells += [pm(points[0].mean, points[0].sem) if points else "–", *[""] * (metric != "perplexity")]
-        lines.append(["default, shuffled actions", "", *cells, "1"])
-    head = [sweep.axis, "parameters, all robots"]
+        lines.append(["default, shuffled actions", *cells, "1", ""])
+    head = [sweep.axis]
     for metric in columns:
         head += [HEADINGS[metric], *["minus the default"] * (metric != "perplexity")]
     over, whose = "seeds and episodes, of one seed over episodes alone", ""
@@ -217,7 +231,7 @@ def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> 
         whose = (
             " The default trained on shuffled actions has one seed and its robots: do not compare it with the means."
         )
-    return table([*head, "seeds"], lines) + (
+    return _with_parameters([*head, "seeds"], lines) + (
         f"<p>Bold: the default. Differences are paired by seed and window. Errors are standard errors over {over}."
         f"{whose * any(controls.values())}</p>"
     )

@@ -19,7 +19,7 @@ from experiments.report.numbers import Numbers
 from experiments.report.pieces import picture, pm
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
-from experiments.report.plot_style import ERROR, LogTicks, count, drawn_curve, save
+from experiments.report.plot_style import ONE_SEED, LogTicks, count, drawn_curve, save
 from experiments.report.robots import describe_robots, read_data, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import AxisStatistics, describe
@@ -129,8 +129,8 @@ def test_errors_of_robots_drawn_for_every_seed_count_their_windows_once(drawn, t
     monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
     points = [replace(p, scope=STUDY.dataset_names()[p.trial.train.seed :]) for p in sweep.points]
     plots.plot_sweep(rows, replace(sweep, points=tuple(points)), tmp_path / "width.png")
-    bars = {c.get_label(): c for c in kept[0].axes[0].containers}[ERROR]
-    low, high = bars.lines[2][0].get_segments()[1][:, 1]
+    bars = {c.get_label(): c for c in kept[0].axes[0].containers}["mean ± s.e. over seeds, each with its own robots"]
+    low, high = bars.lines[2][0].get_segments()[0][:, 1]
     assert high - low == pytest.approx(2 * several.seed_sem * math.exp(several.mean))
 
 
@@ -166,6 +166,14 @@ def test_a_page_has_links_to_its_sections_and_what_its_parts_are(drawn):
     assert page.count("<th ") == len(re.findall("<th scope=(?:row|col)", page)) and "<th>" not in page
     assert 'alt="Scaling curves, of which the tables below have the numbers"' in page
     assert page.count("<span class=still>") == page.count("<span class=moving>") == 3
+
+
+def test_a_page_bears_the_name_of_its_directory_and_no_card_without_a_number(drawn):
+    """Studies of one preset had one title, and a tokenizer that was given a card with a dash."""
+    page = drawn.report.read_text()
+    assert f"<h1>HMA study <em>{STUDY.name} ({drawn.root.name})</em></h1>" in page
+    assert f"<title>HMA-JAX study: {STUDY.name} ({drawn.root.name})</title>" in page
+    assert "tokenizer PSNR" not in page
 
 
 def test_a_page_is_dated_by_all_of_its_trials():
@@ -211,8 +219,10 @@ def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
     for metric, panel in panels.items():
         bars = {c.get_label(): c for c in panel.containers}
         points = drawn_curve(rows, sweep, metric)
-        shown = bars[ERROR].lines[0].get_xydata()
+        one, several = (bars[name].lines[0] for name in (ONE_SEED, "mean ± s.e. over seeds and episodes"))
+        shown = [*one.get_xydata(), *several.get_xydata()]
         np.testing.assert_allclose(shown, [(p.x, p.mean) for p in points])
+        assert one.get_markerfacecolor() == "white" != several.get_markerfacecolor()
         assert bars["trained on shuffled actions, one seed"].lines[0].get_xdata().tolist() == [sweep.reference_x]
         low, high = sorted(panel.get_ylim())
         labelled = [t for t in panel.yaxis.get_ticklabels() if t.get_text() and low <= t.get_position()[1] <= high]
@@ -313,9 +323,9 @@ def test_the_page_speaks_of_fits_where_a_trial_has_the_loss_that_is_fitted(drawn
 def test_the_error_of_one_seed_is_not_said_to_be_over_seeds(drawn):
     sweep = plan_width(STUDY)
     rows = rows_of(drawn, [sweep])
-    for own, said in ((rows, "and seeds"), ([r for r in rows if r.seed == 0], "of one seed")):
+    for own, said in ((rows, "seeds and episodes"), ([r for r in rows if r.seed == 0], "episodes of one seed")):
         cards = page._headline(drawn, record_of(), [sweep], own, {}, page._ShownTrials(sweep, "reference"), "")
-        assert f"s.e. over episodes {said}<" in cards
+        assert f"s.e. over {said}<" in cards
 
 
 @pytest.mark.parametrize("base", ["", "width 16"])
@@ -439,13 +449,22 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
     lost = {(8, "delta_psnr"), (16, "perplexity")}
     rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
     lines = re.findall(
-        r"<tr><th scope=row class=text>(\d+)</th><td>([\d,]+)</td>(.*?)</tr>",
+        r"<tr><th scope=row class=text>(\d+)</th>(.*?)<td>([\d,]+)</td></tr>",
         describe(sweep, rows, [], AxisStatistics()),
     )
-    assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [
-        ("8", "6,400", 1),
-        ("16", "25,600", 1),
+    assert [(x, cells.count("–"), parameters) for x, cells, parameters in lines] == [
+        ("8", 1, "6,400"),
+        ("16", 1, "25,600"),
     ]
+
+
+def test_numbers_of_parameters_stand_below_a_table_in_which_they_are_one_number(drawn):
+    """They stood before the results, in every line."""
+    rows = rows_of(drawn, [plan_datasets(STUDY)])
+    said = describe(plan_datasets(STUDY), rows, [], AxisStatistics())
+    (number,) = {f"{r.parameters:,}" for r in rows if r.parameters}
+    assert f"</table></div><p>All have {number} parameters, all robots together.</p>" in said
+    assert said.count(number) == 1 and "parameters, all robots</th>" not in said
 
 
 def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():

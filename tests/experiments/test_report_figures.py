@@ -21,7 +21,7 @@ from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, dodge, style_of
 from experiments.report.sweeps import AxisStatistics, describe
-from experiments.rows import Row, curve
+from experiments.rows import TRAINING, TRAINING_LOSS, Row, curve
 from experiments.running.trial import trial_id
 from experiments.sweeps.conditioning import plan as plan_conditioning
 from experiments.sweeps.episodes import plan as plan_episodes
@@ -94,6 +94,44 @@ def test_errors_of_variants_count_seeds_and_episodes():
     assert high - low == pytest.approx(2 * point.sem) and "s.e. over seeds and episodes" in figure.get_supxlabel()
 
 
+def test_the_error_of_a_training_loss_is_over_seeds_alone():
+    """It joined the scatter of single steps, which is within that of seeds: rates that all seeds told apart had bars
+    that lay over each other."""
+    sweep = plan_lr_horizon(CPU_FULL)
+    x = max(p.x for p in sweep.points)
+    rows = [
+        replace(r, scope=TRAINING, sem=0.07, mean=4 + 0.01 * r.seed, episodes=0)
+        for r in rows_of(sweep, lambda _: {TRAINING_LOSS: 4.0})
+    ]
+    rows += rows_of(sweep, lambda _: {"cross_entropy": 4.0})
+    series = next(r.series for r in rows)
+    point = next(p for p in curve(rows, sweep.name, TRAINING_LOSS, scope=TRAINING, series=series) if p.x == x)
+    assert len(point.seeds) == 3 and point.sem == point.seed_sem < 0.01
+    assert "of the training loss over seeds" in plot_family(rows, sweep).get_supxlabel()
+    alone = next(
+        p for p in curve([r for r in rows if r.seed == 0], sweep.name, TRAINING_LOSS, scope=TRAINING, series=series)
+    )
+    assert alone.sem == pytest.approx(0.07)
+
+
+def test_points_of_one_seed_are_hollow_and_said_to_be():
+    """Their bars lack the spread of seeds, and looked the surest of all."""
+    sweep = plan_lr_horizon(CPU_FULL)
+    last = max(p.x for p in sweep.points)
+    rows = [r for r in rows_of(sweep, lambda _: {"cross_entropy": 4.0}) if r.x < last or r.seed == 0]
+    figure = plot_family(rows, sweep)
+    faces = [c.lines[0].get_markerfacecolor() == "white" for c in figure.axes[0].containers]
+    assert faces == [False, True] * 2 and "hollow: one seed, over episodes" in figure.get_supxlabel()
+    only = plot_family([r for r in rows if r.seed == 0], sweep).get_supxlabel()
+    assert only.startswith("bars, one seed: s.e. over episodes")
+    names = plan_conditioning(CPU_FULL)
+    of_names = [r for r in rows_of(names, lambda _: {"cross_entropy": 4.0}) if r.x > 0 or r.seed == 0]
+    figure = plot_names(of_names, names)
+    dots = [line.get_markerfacecolor() == "white" for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert dots == [True] + [False] * (len(names.labels) - 1)
+    assert "hollow dot: one seed, over episodes" in figure.get_supxlabel()
+
+
 def test_several_curves_are_shown_with_their_controls():
     sweep = plan_episodes(CPU_FULL)
     rows = rows_of(sweep, lambda p: {"cross_entropy": 5.3 if p.role == CONTROL else 4.0, "perplexity": 90.0})
@@ -161,19 +199,62 @@ def test_a_fit_that_is_doubtful_is_drawn_so(doubts, tmp_path, monkeypatch):
     assert [t.get_text() for t in panel.texts] == [d.split(":")[0] for d in doubts]
 
 
+def test_whether_a_prediction_holds_can_be_seen(tmp_path, monkeypatch):
+    """The star of what was observed covered the interval that it was to be judged by."""
+    points = measured(sizes(6), power(sizes(6), 2.0, (1.0, 0.5)), 1e-3, 3, np.random.default_rng(0))
+    fit, kept = fit_power(points, 20), []
+    x, loss = points.x.max(), float(fit.at(np.array([[points.x.max()]]))[0])
+    predicted = SimpleNamespace(curve="width", x=(x,), mean=loss, low=0.99 * loss, high=1.01 * loss)
+    monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
+    plot_fits.plot_fits(
+        [curve_fit(fit, points)], [SimpleNamespace(prediction=predicted, observed=0.995 * loss)], tmp_path / "fits.png"
+    )
+    kept[0].canvas.draw()
+    for panel, star_at in zip(kept[0].axes, (0.995 * loss, 100 * math.log(0.995)), strict=True):
+        (star,) = (line for line in panel.lines if line.get_label() == "observed")
+        assert star.get_ydata()[0] == pytest.approx(star_at)
+        ends = panel.containers[0].lines[2][0].get_segments()[0]
+        pixels = panel.transData.transform([star.get_xydata()[0], *ends])
+        assert abs(pixels[0, 0] - pixels[1, 0]) > star.get_markersize() / 2 * kept[0].dpi / 72
+    low, high = panel.containers[0].lines[2][0].get_segments()[0][:, 1]
+    assert (low, high) == pytest.approx((100 * math.log(0.99), 100 * math.log(1.01)))
+
+
 def test_a_best_size_that_is_doubtful_is_drawn_and_said_to_be(tmp_path, monkeypatch):
     best, kept = Coefficient("N_opt", 2e4, 1.9e4, 2.1e4), []
-    budget = Budget(1e12, np.array([1e4, 2e4, 4e4]), np.array([4.0, 3.9, 4.0]), np.array([0.1, 0.0, 1.36]), 9.9, best)
-    fit = IsoFlop(
-        (budget, replace(budget, flops=2e12, misfit="sizes lie off")), Coefficient("a", 0.28, 0.22, 0.35), 1.0
+    budget = Budget(
+        1e12, np.array([1e4, 2e4, 4e4]), np.array([4.0, 3.9, 4.0]), np.array([0.1, 0.0, 1.36]), 9.9, best, best
     )
+    more = replace(budget, flops=2e12, loss=np.array([4.1, 4.0, 3.9]))
+    law = Coefficient("a", 0.28, 0.22, 0.35)
+    fit = IsoFlop((budget, replace(more, misfit="sizes lie off")), law, 1.0, law, 1.0)
     monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
     plot_fits.plot_isoflop(fit, tmp_path / "isoflop.png")
     left, right = kept[0].axes
     stars = [line.get_markerfacecolor() == "white" for line in left.lines if line.get_marker() == "*"]
-    assert stars == [False, True] and [line.get_linestyle() for line in right.lines][-1] == "--"
+    assert stars == [False, True] and line_of_parabolas(right) == "--"
     assert "1 of its 2 best sizes is doubtful" in describe_fits([], fit, [], "")
-    assert "doubtful" not in describe_fits([], replace(fit, budgets=(budget,)), [], "")
+    assert "doubtful" not in describe_fits([], replace(fit, budgets=(budget, more)), [], "")
+
+
+def line_of_parabolas(panel) -> str:
+    (line,) = (line for line in panel.lines if line.get_label().startswith("parabola: "))
+    return line.get_linestyle()
+
+
+def test_a_growth_of_the_best_size_that_three_sizes_do_not_have_is_drawn_and_said_to_be_doubtful(tmp_path, monkeypatch):
+    """Of the exponent alone: of no budget anything is doubtful."""
+    best, law, kept = Coefficient("N_opt", 2e4, 1.9e4, 2.1e4), Coefficient("a", 0.28, 0.22, 0.35), []
+    sizes, loss, parabola = np.array([1e4, 2e4, 4e4]), np.array([4.0, 3.9, 4.0]), np.array([0.1, 0.0, 1.36])
+    first, last = (Budget(flops, sizes, loss, parabola, 9.9, best, best) for flops in (1e12, 2e12))
+    fit = IsoFlop((first, replace(last, loss=loss[[2, 0, 1]])), law, 1.0, replace(law, value=0.09), 1.0)
+    monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
+    plot_fits.plot_isoflop(fit, tmp_path / "isoflop.png")
+    assert line_of_parabolas(kept[0].axes[1]) == "--" and "doubtful" in kept[0].get_supxlabel()
+    said = describe_fits([], fit, [], "")
+    assert (
+        "C<sup>0.09</sup>" in said and "three sizes around each best one alone give 0.09, outside its interval" in said
+    )
 
 
 @pytest.mark.parametrize(("high", "interval"), [(3.1e-4, ""), (1.4, " <span class=sem>[0, 1.4]</span>")])

@@ -71,9 +71,34 @@ def test_sizes_off_the_parabola_are_said(steeper, seeds):
     assert all(said) if steeper and seeds > 1 else not any(said)
     page = describe_fits([], fit, [], "")
     assert page.count("off the parabola by more than seeds scatter") == sum(said)
-    exponent, *best = fit_rows([], fit)
+    exponent, _, *best = fit_rows([], fit)
+    best = [row for row in best if row.coefficient == "N_opt"]
     assert ["off the parabola" in row.doubts for row in best] == said
     assert exponent.doubts.count("off the parabola") == sum(said)
+
+
+def saturating(steeper):
+    """Losses [runs] that are lowest at one size whatever the budget; the smallest is worse than a parabola through the
+    others has it, by `steeper` more with every budget."""
+    sizes = np.geomspace(1e4, 1e6, 5)
+    x = np.array([(n, c) for n in sizes for c in BUDGETS])
+    lack = steeper * np.searchsorted(BUDGETS, x[:, 1]) * (x[:, 0] == sizes[0])
+    return measured(x, 3 * np.exp(0.02 * np.log(x[:, 0] / sizes[1]) ** 2 + lack), 1e-3, 3, np.random.default_rng(0))
+
+
+def test_a_best_size_that_only_a_saturating_small_one_moves_is_doubted():
+    """It bends the parabola, whose minimum then moves though the lowest loss does not."""
+    fit = fit_isoflop(saturating(0.02), BUDGETS, draws=100)
+    assert fit.exponent.low > 0.02 and fit.near.value < fit.exponent.low
+    outside, still = fit.doubts
+    assert f"give {fit.near.value:.2g}, outside its interval" in outside
+    assert "31,623 trunk parameters have the lowest loss at every budget" in still
+    assert all(doubt in fit_rows([], fit)[0].doubts for doubt in fit.doubts)
+
+
+def test_a_best_size_that_stays_where_the_lowest_loss_does_is_not_doubted():
+    fit = fit_isoflop(saturating(0.0), BUDGETS, draws=100)
+    assert fit.exponent.low < 0 < fit.exponent.high and not fit.doubts
 
 
 def test_noise_that_leaves_no_minimum_is_said():
@@ -104,14 +129,16 @@ def fit_exactly(value, draw, budgets=GRID[[1, 3, 5]] ** 2):
 
 
 def test_values_come_from_the_losses_and_intervals_from_the_draws():
-    fit = fit_exactly(valley(lambda c: c**0.5), valley(lambda c: 1e4 * (c / 1e8) ** 0.7))
-    assert (fit.exponent.value, fit.exponent.low, fit.exponent.high) == pytest.approx((0.5, 0.7, 0.7))
-    assert fit.scale == pytest.approx(1)
+    fit = fit_exactly(valley(lambda c: c**0.5), valley(lambda c: 1e4 * (c / 1e8) ** 0.6))
+    for a in (fit.exponent, fit.near):
+        assert (a.value, a.low, a.high) == pytest.approx((0.5, 0.6, 0.6))
+    assert (fit.scale, fit.near_scale) == pytest.approx((1, 1))
     for budget, first in zip(fit.budgets, (0, 1, 2), strict=True):  # the best size and two on either side, or five
         assert budget.sizes == pytest.approx(GRID[first : first + 5])
         assert (budget.best.value, budget.best.low) == pytest.approx(
-            (budget.flops**0.5, 1e4 * (budget.flops / 1e8) ** 0.7)
+            (budget.flops**0.5, 1e4 * (budget.flops / 1e8) ** 0.6)
         )
+        assert budget.near.value == pytest.approx(budget.best.value)
         assert budget.loss == pytest.approx(np.exp(0.1 * np.log(budget.sizes / budget.flops**0.5) ** 2))
 
 
