@@ -26,7 +26,9 @@ from hma_jax.config import ConfigError, require
 from hma_jax.runtime.parent import die_with
 
 GENERATOR_VERSION = 8
-"""Raise it when simulation, rendering or encoding change: datasets of older versions are then made again."""
+"""Raise it when simulation, rendering or encoding change: datasets of older versions are then made again.
+Committed studies rest on 8. Left for the next one: starts at which the goal is reached (`World`), and episodes that the
+clock ends as terminal (`write`)."""
 
 MIN_EPISODES = 8
 """Training episodes of the smallest datasets, at any scale, unless `fewest` says otherwise."""
@@ -61,7 +63,8 @@ def episode_count(spec: EmbodimentSpec, scale: float, fewest: int = MIN_EPISODES
 def fingerprint(
     spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION, fewest: int = MIN_EPISODES
 ) -> str:
-    """Hash of everything the bytes of this dataset depend on."""
+    """Hash of what the bytes of this dataset depend on, except the versions of numpy (what its random generators draw)
+    and of simplejpeg: with other ones it stays in use."""
     text = repr((GENERATOR_VERSION, spec, episode_count(spec, scale, fewest), validation, seed))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

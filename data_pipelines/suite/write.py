@@ -116,7 +116,7 @@ def _features(
     if rollout.success[i]:
         reward[rollout.reached[i]] = 1.0
     features: dict[str, np.ndarray | list[bytes]] = {
-        **step_features(reward, [spec.instruction] * steps),
+        **step_features(reward, [spec.instruction] * steps),  # is_terminal at the end, though the clock ends it
         f"steps/observation/{IMAGE_KEY}": [encode_jpeg(frame) for frame in frames],
         "steps/observation/state": rollout.q[i, :steps].astype(np.float32).ravel(),
         "steps/observation/position": positions.ravel(),

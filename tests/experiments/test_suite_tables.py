@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
+from data_pipelines.suite.rollout import episode_seeds, simulate
+from data_pipelines.suite.world import World
 from experiments.suite import explained as explained_module
 from experiments.suite.clips import animation, clip
 from experiments.suite.explained import explained, read_table
@@ -35,6 +37,25 @@ def test_the_simulator_still_gives_the_committed_shares(name):
     now, then = explained(BY_NAME[name]), read_table()[name]
     assert now.share == pytest.approx(then.share, abs=2e-3)
     assert now.moved == pytest.approx(then.moved, abs=0.05)
+
+
+@pytest.mark.slow
+def test_as_many_episodes_begin_with_their_goal_reached_as_the_page_says():
+    page = " ".join((Path(__file__).parents[2] / "docs/suite.md").read_text().split())
+    rates = {}
+    for spec in EMBODIMENTS:
+        begun = World(spec, episode_seeds(spec, 2000, 0, "val")).success().mean()
+        rates.setdefault(spec.family, []).append(round(100 * begun))
+    often = [rate for name in ("gripper", "humanoid", "pusher", "rover", "omni") for rate in rates.pop(name)]
+    both = rates.pop("bimanual")
+    assert f"{min(often)} to {max(often)} % of those of the families" in page
+    assert f"{min(both)} to {max(both)} % of `bimanual`" in page
+    assert max(max(each) for each in rates.values()) <= 1
+    spec = BY_NAME["pusher_sand"]
+    rollout = simulate(spec, episode_seeds(spec, 500, 0, "val"))
+    begun = World(spec, rollout.seeds).success()
+    assert f"{100 * rollout.success.mean():.0f} % succeed, and two fifths of these began so" in page
+    assert begun[rollout.success].mean() == pytest.approx(0.4, abs=0.02)
 
 
 def test_actions_that_do_nothing_explain_nothing(monkeypatch):

@@ -10,8 +10,12 @@ import pytest
 
 from experiments.applications.judging.agreement import LOWEST, pearson, rate_interval, share, spearman
 from experiments.applications.judging.outcomes import read_outcomes, successes
+from experiments.applications.judging.rollouts import make_starts
 from experiments.applications.judging.summary import COLUMNS, COMPARED, CONTROL, MODEL, REFERENCE, shown
 from experiments.applications.policies import find_task, record
+from experiments.applications.policies.tasks import held, world_of
+from experiments.applications.simulators import true_worlds
+from hma_jax.simulator.robots import Robot
 from tests.pages import rows_below, table
 
 ROOT = Path(__file__).parents[4]
@@ -143,6 +147,24 @@ def test_what_the_expert_can_do_is_as_the_page_says():
     )  # fmt: skip
     assert f"reaches the mark in {worst} to 100 % of 50 true episodes" in page
     assert f"two grippers in {most} and 100 %" in page and f"in {fewest} to {hard} %." in page
+
+
+@pytest.mark.slow
+def test_a_gripper_that_keeps_still_carries_the_puck_from_no_start():
+    task = find_task("gripper_wood")
+    starts = make_starts(task, 50, 8, 1)
+    outcomes = read_outcomes(ROOT / "experiments/results/judge-gripper_wood-carry/outcomes.csv")
+    assert {(o.start, o.number) for o in outcomes} == set(enumerate(start.seed for start in starts))
+    simulator = true_worlds([Robot(task.robot, 1, (-9.0,) * 4, (9.0,) * 4, (0.0,) * 4)], episodes=50, image_size=8)
+    simulator.reset(starts)
+    world = world_of(task.spec, [simulator.state(b) for b in range(50)])
+    still = np.concatenate([c.encode(world.body, world.q, world.q, world.dt) for c in task.spec.controls], 1)
+    reached = []
+    for _ in range(task.frames):
+        world.step(still)
+        reached.append(world.success())
+    assert not held(np.stack(reached, 1), task.hold).any()
+    assert "a gripper that keeps still succeeds from none" in " ".join(PAGE.read_text().split())
 
 
 ROBOTS = "pusher_sand", "arm_chalk"
