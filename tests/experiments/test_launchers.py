@@ -3,6 +3,8 @@
 The engines are fakes that run attempts in threads; `tests.stress.slurm_sweep` and `ray_sweep` use real ones.
 """
 
+import errno
+import os
 import pickle
 import signal
 import subprocess
@@ -337,6 +339,24 @@ def test_a_ray_worker_that_dies_is_a_lost_trial(tmp_path):
     died.set_exception(engine.exceptions.RayError("the node died\nmore"))
     ended = place.ended(ray.Task(tmp_path, died))
     assert outcome(tmp_path, ended).event == "lost" and "the node died" in ended.why
+
+
+def test_a_cancelled_ray_task_has_not_ended_while_the_lock_of_its_trial_cannot_be_read(tmp_path, monkeypatch):
+    """One stale handle of a shared disk ended the sweep."""
+    engine = FakeRay()
+    place, cancelled = RayLauncher(tmp_path, None, engine=engine), Future()
+    cancelled.set_exception(engine.exceptions.TaskCancelledError())
+    task, answers = ray.Task(tmp_path, cancelled), iter([OSError(errno.ESTALE, os.strerror(errno.ESTALE)), False])
+
+    def is_alive(directory: Path) -> bool:
+        answer = next(answers)
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(ray, "is_alive", is_alive)
+    assert place.ended(task) is None
+    assert place.ended(task).code == -signal.SIGTERM
 
 
 def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):

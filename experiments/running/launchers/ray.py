@@ -93,7 +93,7 @@ class RayLauncher(Launcher):
         try:
             return AttemptEnd(self._ray.get(handle.reference))
         except self._ray.exceptions.TaskCancelledError:
-            return None if is_alive(handle.directory) else AttemptEnd(-signal.SIGTERM)
+            return None if _may_be_alive(handle.directory) else AttemptEnd(-signal.SIGTERM)
         except self._ray.exceptions.RayError as error:
             return AttemptEnd(None, f"Ray says: {str(error).strip().splitlines()[0]}")
 
@@ -109,6 +109,14 @@ class RayLauncher(Launcher):
 
     def __exit__(self, *exc: object) -> None:
         self._ray.shutdown()
+
+
+def _may_be_alive(directory: Path) -> bool:
+    """Also true while the shared disk does not answer: whether the trial has ended is asked again soon."""
+    try:
+        return is_alive(directory)
+    except OSError:
+        return True
 
 
 def run(attempt: Attempt) -> int:
