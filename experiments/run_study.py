@@ -61,7 +61,7 @@ def run_study(
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
-    from experiments.scale import say_points, say_prepared_here, say_scale, say_unused
+    from experiments.scale import say_average, say_points, say_prepared_here, say_scale, say_unused
     from experiments.trainable import require_trainable
 
     study, workspace = setting.study, setting.workspace
@@ -74,6 +74,7 @@ def run_study(
         say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
         say_unused(study)
         say_points(setting, sweeps)
+    say_average(point.trial.train for sweep in sweeps for point in sweep.points)
     say_prepared_here(setting, launcher_options)
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked():

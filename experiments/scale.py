@@ -1,9 +1,9 @@
-"""What a person with data of their own should know before hours pass: how large a model is trained, on how much of
-the data, and where its tokenizer is trained."""
+"""What a person should know before hours pass: how large a model is trained, on how much of their data, where its
+tokenizer is trained, and which setting has no effect in so few steps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from experiments.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, get_preset
@@ -15,6 +15,7 @@ from experiments.setting import Setting
 from experiments.study import Study, count_trained_on, most_trajectories
 from experiments.sweeps.sweep import Sweep
 from experiments.words import counted, few, in_thousands
+from hma_jax.config import TrainConfig
 
 PROCESSOR = 1e12
 """FLOP/s of one device that no processor sustains: a study with more is made for accelerators."""
@@ -38,6 +39,24 @@ def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
         f"{width} pixels, for {longest} of {counted(widest.train.batch, 'window')}, with {most} "
         f"trajectories of each dataset{advice}"
     )
+
+
+def say_average(configs: Iterable[TrainConfig]) -> None:
+    """A line where a decay of the moving average is larger than any that a run comes to, so that others would have the
+    same effect."""
+    from hma_jax.training.average import risen_decay
+
+    last = {(config.ema_decay, config.steps): risen_decay(config.steps - 1) for config in configs}
+    short = [
+        f"{decay:g} in {counted(steps, 'step')} ({last[decay, steps]:.6g} at the end)"
+        for decay, steps in sorted(last)
+        if last[decay, steps] < decay
+    ]
+    if short:
+        say(
+            "note: the decay of the moving average rises with the steps and does not come to train.ema_decay: "
+            f"{few(short)}. Every larger value has the same effect"
+        )
 
 
 def say_prepared_here(setting: Setting, launcher_options: LauncherOptions) -> None:

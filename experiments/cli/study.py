@@ -80,7 +80,7 @@ def _run(
         from experiments.done import find_done
         from experiments.plan_table import Devices, plan_table
         from experiments.preparing.sources import check_entries
-        from experiments.scale import say_points, say_prepared_here, say_scale, say_unused
+        from experiments.scale import say_average, say_points, say_prepared_here, say_scale, say_unused
         from experiments.trainable import check_launched
 
         sweeps = plan_asked(setting.study, axes, setting.workspace.root)
@@ -94,6 +94,7 @@ def _run(
             say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
             say_unused(setting.study)
             say_points(setting, sweeps)
+        say_average(point.trial.train for sweep in sweeps for point in sweep.points)
         say_prepared_here(setting, launcher_options)
         return
     from experiments.run_study import run_study

@@ -73,6 +73,7 @@ def train(
     trained = None if initial is None else _load_initial(initial, run)
     setting = make_setting(arguments) if trained is None else setting_of(initial, trained, arguments)
     _say_swept(setting)
+    _say_average(setting)
     if trained is not None:
         require_known(initial, trained, setting)
         require_other_directory(initial, run)
@@ -179,6 +180,7 @@ def adapt_model(
         not study.train.only,
         "leave out train.only: `hma adapt` trains only the new robots' parameters, or all with --everything",
     )
+    _say_average(setting)
     run = run or setting.workspace.root / "model"
     require_other_directory(source, run)
     origin = _check(setting, run, trajectories, options, trained)
@@ -351,6 +353,12 @@ def _say_scale(setting: Setting, trajectories: int | None) -> None:
 
     if setting.data:
         say_scale(setting, [_single_trial(setting, trajectories)])
+
+
+def _say_average(setting: Setting) -> None:
+    from experiments.scale import say_average
+
+    say_average([setting.study.train])
 
 
 def _single_trial(setting: Setting, trajectories: int | None) -> Trial:

@@ -184,7 +184,8 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
     only: tuple[str, ...] = ()  # train only these robots' own parameters; []: train everything
-    # Decay of a moving average of the weights, which is kept too; 0: none. In the first steps it decays faster.
+    # Decay of a moving average of the weights, which is kept too; 0: none. It rises to this value, which a short run
+    # does not reach: after t steps it is at most (1 + t) / (10 + t), such as 0.99 after 890 and 0.999 after 8,990.
     ema_decay: float = 0.0
     action_scale: ActionScale = "deviation"  # how actions of new robots are normalised
 

@@ -184,6 +184,18 @@ def test_it_is_said_before_anything_is_made(command, lines, data, capsys, tmp_pa
     assert len(said) == lines and "take --preset accelerator" in said[0]
 
 
+@pytest.mark.parametrize("command", ["train", "sweep width"])
+@pytest.mark.parametrize("steps", [8990, 8991])
+def test_a_decay_that_a_run_does_not_come_to_is_named(command: str, steps: int, capsys, tmp_path):
+    """Runs that compare larger ones are equal to the bit."""
+    settings = ["--set", "train.ema_decay=0.999", "--set", f"train.steps={steps}"]
+    said = said_by(
+        capsys, *command.split(), "--dry-run", "--preset", "smoke", *settings, "--out", str(tmp_path / "out")
+    )
+    named = [line for line in said if "does not come to train.ema_decay: 0.999 in 8,990 steps" in line]
+    assert len(said) == len(named) == (steps == 8990)
+
+
 def test_presets_for_a_processor_name_one_that_is_larger():
     for name, other in ON_ACCELERATORS.items():
         assert PRESETS[other].flops_per_second > 1e12 > PRESETS[name].flops_per_second
