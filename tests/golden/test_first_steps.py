@@ -10,7 +10,7 @@ import pytest
 from tests.golden.first_steps import COMMAND, MODELS, RECORD, first_steps
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "latents")) for n in MODELS])
+@pytest.mark.parametrize("name", MODELS)
 def test_first_steps_give_the_metrics_on_record(name: str, tmp_path: Path):
     recorded, found = json.loads(RECORD.read_text())[name], first_steps(name, tmp_path)
     wrong = [

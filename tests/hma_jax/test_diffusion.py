@@ -235,27 +235,26 @@ def test_the_weighed_loss_of_a_token_is_the_error_times_its_weight_and_the_bound
     np.testing.assert_allclose(weighed, plain + (weight - 1) * np.square(noise).mean(-1), rtol=1e-4, atol=1e-5)
 
 
-def test_every_repeat_noises_a_token_anew():
-    """A denoiser that says 0 errs by the noise: the mean of two repeats tells what the second one drew."""
+def test_the_loss_of_a_token_is_the_mean_over_repeats_that_noise_it_anew():
+    """A denoiser that says 0 errs by the noise: each loss tells what was drawn."""
     x0, keys = jnp.ones((2, 3, 4, 3)), jax.random.split(jax.random.key(0), 2)
 
-    @jax.jit
-    def losses():
-        return [
-            frame_diffusion_loss(
-                SimpleNamespace(
-                    config=SimpleNamespace(diffusion=DiffusionConfig(channels=3, patch=1, repeats=repeats)),
-                    denoiser=lambda x, t, z: jnp.concatenate([jnp.zeros_like(x)] * 2, axis=-1),
-                ),
-                x0,
-                x0,
-                keys,
-            )
-            for repeats in (1, 2)
-        ]
+    def network(x, *_):
+        return jnp.concatenate([jnp.zeros_like(x)] * 2, axis=-1)
 
-    first, mean = map(np.asarray, losses())
-    assert np.all(np.abs(2 * mean - first - first) > 1e-4)
+    def loss(repeats):
+        diffusion = DiffusionConfig(channels=3, patch=1, repeats=repeats)
+        model = SimpleNamespace(config=SimpleNamespace(diffusion=diffusion), denoiser=network)
+        return frame_diffusion_loss(model, x0, x0, keys)
+
+    def repeat(number):
+        time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, number), x0.shape[1:], 1000))(keys)
+        return sum(diffusion_loss(network, x0, time, noise, FULL))
+
+    first, mean, *each = map(np.asarray, jax.jit(lambda: [loss(1), loss(2), repeat(0), repeat(1)])())
+    np.testing.assert_allclose(first, each[0], rtol=1e-5)
+    np.testing.assert_allclose(mean, np.mean(each, axis=0), rtol=1e-5)
+    assert np.all(np.abs(each[0] - each[1]) > 1e-4)
 
 
 def test_shifted_steps_are_drawn_as_often_as_the_shift_says():

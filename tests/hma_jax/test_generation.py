@@ -252,14 +252,20 @@ def long_batch(config, seed: int = 0) -> dict:
     return random_batch(seed, model_config(frames=LONG, diffusion=config.diffusion), 2)
 
 
-def whole_rollouts(config, decode: DecodeConfig, prompt: int, hidden=None) -> tuple[np.ndarray, np.ndarray]:
-    """Past the window: (`rollout`'s frames, `rollout_naive`'s)."""
+def past_the_window(config, decode: DecodeConfig, prompt: int, hidden=None):
+    """(params, params -> (`rollout`'s frames, `rollout_naive`'s))."""
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
     batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
     start, rest = batch["tokens"][:, :prompt], (batch["embodiment"], keys, decode)
     fast = jax.jit(lambda p: rollout(declared.merge(p), start, batch["actions"][:, None], *rest, hidden_BT=hidden))
     naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, batch["actions"], *rest, hidden_BT=hidden))
-    return np.asarray(fast(params))[:, 0], np.asarray(naive(params))
+    return params, lambda p: (np.asarray(fast(p))[:, 0], np.asarray(naive(p)))
+
+
+def whole_rollouts(config, decode: DecodeConfig, prompt: int, hidden=None) -> tuple[np.ndarray, np.ndarray]:
+    """Past the window: (`rollout`'s frames, `rollout_naive`'s)."""
+    params, both = past_the_window(config, decode, prompt, hidden)
+    return both(params)
 
 
 @pytest.mark.exact
@@ -328,12 +334,16 @@ def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions()
     np.testing.assert_allclose(got, want, atol=2e-3)
 
 
-def test_streaming_is_exact_while_the_window_fills_and_an_approximation_after():
-    config = model_config()
-    streamed, exact = whole_rollouts(config, DecodeConfig(2, slide="streaming"), 3)
-    inside = config.frames - 3
+def test_streaming_is_exact_but_for_what_a_finished_frame_had_seen_and_where_it_stood():
+    """In one layer its keys and values are those of itself and its position: without positions they never change."""
+    config, prompt = shallow_config(), 3
+    params, both = past_the_window(config, DecodeConfig(2, slide="streaming"), prompt)
+    streamed, exact = both(params)
+    inside = config.frames - prompt
     np.testing.assert_array_equal(streamed[:, :inside], exact[:, :inside])
     assert (streamed[:, inside:] != exact[:, inside:]).any()
+    streamed, exact = both(params | {"positions": jnp.zeros_like(params["positions"])})
+    np.testing.assert_array_equal(streamed, exact)
 
 
 @pytest.mark.exact

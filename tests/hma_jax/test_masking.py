@@ -67,6 +67,14 @@ def test_frame_zero_is_always_shown():
         assert not np.asarray(masked.masked)[:, 0].any() and np.asarray(masked.masked)[:, 1:].any()
 
 
+def test_how_many_actions_are_hidden_says_nothing_of_how_many_ids_are_corrupted():
+    """Each has random numbers of its own."""
+    masking = MaskingConfig(setting="full", non_mlm_ratio=0.0)
+    data, masked = masked_batch(shallow_config(), masking, batch=512)
+    corrupted = (np.asarray(masked.inputs) != data["tokens"]).mean((1, 2))
+    assert abs(np.corrcoef(corrupted, np.asarray(masked.hidden_T).mean(1))[0, 1]) < 0.15
+
+
 def test_an_example_s_masks_do_not_depend_on_its_batch():
     config = shallow_config()
     data, whole = masked_batch(config, MaskingConfig(setting="full"), batch=8)

@@ -9,6 +9,7 @@ from jax.sharding import AbstractMesh, AxisType
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.model.initial import input_fan_out
 from hma_jax.model.params import Initializer, declare, normal, param, stack, xavier_uniform, zeros
 from hma_jax.runtime.sharding import MESH_AXES, find_layouts
 from tests.tiny import TABLE, model_config
@@ -71,6 +72,16 @@ def test_every_robot_s_own_parameter_is_known_by_its_axis():
     parts = ("stem", "conditioning", "action_head")
     assert own == {name for name in leaves if any(part in name for part in parts)}
     assert all(leaves[n].shape[leaves[n].embodiment_axis] == TABLE.size for n in own)
+
+
+def test_a_stem_s_first_layer_starts_as_large_as_its_own_robot_s_chunk_asks_for():
+    """However wide the widest robot's is."""
+    config = model_config()
+    kernel_EUD = declare_model(config, TABLE).init(0)["stem"]["into"]["kernel"]
+    for kernel, entry in zip(np.asarray(kernel_EUD), TABLE.entries, strict=True):
+        bound = config.stem_gain * np.sqrt(6 / (entry.chunk + input_fan_out(config)))
+        assert 0.97 * bound < np.abs(kernel[: entry.chunk]).max() <= 1.000001 * bound
+        assert not kernel[entry.chunk :].any()
 
 
 @pytest.mark.parametrize("axes", [("batch", "copies"), ("data", "model"), ("data", "fsdp", "tensor")], ids="-".join)

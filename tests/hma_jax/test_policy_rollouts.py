@@ -7,39 +7,48 @@ import pytest
 
 from hma_jax.config import DecodeConfig, SamplerConfig
 from hma_jax.generation import predict_actions, predict_next_actions, rollout_naive, rollout_policy
-from tests.tiny import DIFFUSION, lively_params, model_config, random_batch
+from tests.tiny import DIFFUSION, SMALLER, lively_params, model_config, random_batch
+
+LONG = (pytest.mark.exact, pytest.mark.slow)
 
 
-@pytest.mark.exact
 @pytest.mark.parametrize(
-    "alignment, diffusion",
-    [("causal", None), ("released", DIFFUSION)],
-    ids=["causal-discrete", "released-continuous"],
+    "changes",
+    [
+        pytest.param(SMALLER | {"action_alignment": "causal"}, id="smallest"),
+        pytest.param({"action_alignment": "causal", "frames": 5}, id="causal-discrete", marks=LONG),
+        pytest.param({"diffusion": DIFFUSION, "frames": 5}, id="released-continuous", marks=LONG),
+    ],
 )
-@pytest.mark.slow
-def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(alignment: str, diffusion):
+def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(changes):
     """The cached loop against whole-window calls of `predict_actions` and `rollout_naive`."""
-    config = model_config(action_alignment=alignment, frames=5, diffusion=diffusion)
+    config = model_config(**changes)
     declared, params = lively_params(config, scale=0.05)
-    hma = declared.merge(params)
     batch = random_batch(0, config, 2)
     keys = jax.random.split(jax.random.key(0), 2)
     decode = DecodeConfig(1, sampler=SamplerConfig(steps=4, temperature=0.0))
-    prompt, robots = 2, batch["embodiment"]
-    frames, chunks = jax.jit(
-        lambda p: rollout_policy(declared.merge(p), batch["tokens"][:, :prompt], batch["actions"], robots, keys, decode)
-    )(params)
+    robots = batch["embodiment"]
+    prompt = batch["tokens"][:, : max(config.frames - 3, 1)]
 
-    window, actions = jnp.asarray(batch["tokens"][:, :prompt]), jnp.asarray(batch["actions"])
-    for t in range(prompt, config.frames):
-        hidden = jnp.broadcast_to(jnp.arange(t) >= t - 1, (2, t))
-        chosen = predict_actions(hma, window, actions[:, :t], robots, hidden, keys, decode)[:, t - 1]
-        actions = actions.at[:, t - 1].set(chosen)
-        unknown = jnp.broadcast_to(jnp.arange(t + 1) >= t, (2, t + 1))
-        new = rollout_naive(hma, window, actions[:, : t + 1], robots, keys, decode, hidden_BT=unknown)
-        window = jnp.concatenate([window, new], axis=1)
-    np.testing.assert_allclose(chunks, actions, atol=1e-3)
-    np.testing.assert_allclose(frames, window[:, prompt:], atol=1e-3)
+    @jax.jit
+    def by_itself(params):
+        return rollout_policy(declared.merge(params), prompt, batch["actions"], robots, keys, decode)
+
+    @jax.jit
+    def by_turns(params):
+        hma, window, actions = declared.merge(params), jnp.asarray(prompt), jnp.asarray(batch["actions"])
+        for t in range(prompt.shape[1], config.frames):
+            hidden = jnp.broadcast_to(jnp.arange(t) >= t - 1, (2, t))
+            chosen = predict_actions(hma, window, actions[:, :t], robots, hidden, keys, decode)[:, t - 1]
+            actions = actions.at[:, t - 1].set(chosen)
+            unknown = jnp.broadcast_to(jnp.arange(t + 1) >= t, (2, t + 1))
+            new = rollout_naive(hma, window, actions[:, : t + 1], robots, keys, decode, hidden_BT=unknown)
+            window = jnp.concatenate([window, new], axis=1)
+        return window[:, prompt.shape[1] :], actions
+
+    (frames, chunks), (imagined, chosen) = by_itself(params), by_turns(params)
+    np.testing.assert_allclose(chunks, chosen, atol=1e-3)
+    np.testing.assert_allclose(frames, imagined, atol=1e-3)
 
 
 @pytest.mark.parametrize("alignment", ["released", "causal"])

@@ -72,9 +72,11 @@ def test_order_does_not_change_between_releases():
     assert smallest_hashes("arm", np.arange(100), 3, "subset/0").tolist() == [11, 29, 68]
 
 
-def test_random_below_is_even():
-    counts = np.bincount([random_below(10, i, seed=3) for i in range(5000)], minlength=10)
+def test_random_below_is_even_and_other_for_every_seed():
+    ours, others = ([random_below(10, i, seed) for i in range(5000)] for seed in (3, 4))
+    counts = np.bincount(ours, minlength=10)
     assert counts.min() > 420 and counts.max() < 580
+    assert 420 < np.equal(ours, others).sum() < 580
 
 
 def test_held_out_depends_on_the_dataset_not_on_order():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,13 @@ def measured(
         seed=np.array([seed for (seed,) in names]),
         value=resample(panel, 1, over_seeds=False, over_episodes=False).value, panel=panel,
     )  # fmt: skip
+
+
+def of_one_run(x: Sequence[float], seed: Sequence[int], value: Sequence[float]) -> Measurements:
+    """Losses of branches of one run at `x`, exactly, without windows that they are means of."""
+    trials = tuple(f"t{i}" for i in range(len(x)))
+    run = np.array(["run"] * len(x))
+    return Measurements(("windows",), np.array(x, float)[:, None], run, trials, np.array(seed), np.array(value), None)
 
 
 def scaled(points: Measurements, factors: dict[int, float]) -> Measurements:

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.analysis.best_steps import cross_fit, halves, judge_at_best
+from experiments.analysis.best_steps import _judge, cross_fit, halves, judge_at_best
 from experiments.analysis.paired import NotComparable
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.running.trial import trial_id
 from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import POINT
+from experiments.sweeps.sweep import POINT, Sweep
 from tests.experiments.analysis.worlds import judged, with_loss
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, windows_of
@@ -52,6 +52,17 @@ def test_the_better_steps_are_found_and_every_window_is_judged_once():
         assert not sides[0] & sides[1] and len(sides[0]) == len(sides[1]) == 4
     with pytest.raises(NotComparable):
         cross_fit({100: table, 200: replace(table, episode=table.episode + 1)}, ROBOTS)
+
+
+def test_steps_at_either_end_of_those_tried_are_said_to_be():
+    """Fewer or more may be better still."""
+    table = judged(np.random.default_rng(0), robots=2, episodes=4)
+    sweep = Sweep("episodes", "episodes", ROBOTS, ())
+    edges = []
+    for best in (100, 200, 300):
+        tables = {n: with_loss(table, np.full(len(table), 9.0 if n != best else 1.0)) for n in (100, 200, 300)}
+        edges.append({row.edge for row in _judge(sweep, 1.0, {0: tables})})
+    assert edges == [{"edge"}, {""}, {"edge"}]
 
 
 def test_robots_of_one_episode_take_turns_to_choose_and_to_judge():

@@ -68,6 +68,14 @@ def test_three_seeds_have_the_variance_of_their_mean_not_two_thirds_of_it():
     assert drawn.var() == pytest.approx(np.var([0, 1, 5], ddof=1) / 3, rel=0.05)
 
 
+def test_seeds_are_drawn_apart_from_episodes():
+    """As many seeds as episodes: drawn alike, their deviations would add up, and not their variances."""
+    apart = np.array([0.0, 1.0, 5.0])
+    panel = panel_of("aaa", [0, 1, 2], apart[:, None] + apart)
+    both, seeds = (resample(panel, 20_000, over_episodes=e).drawn.var() for e in (True, False))
+    assert both == pytest.approx(2 * seeds, rel=0.05)
+
+
 def test_a_robot_of_one_episode_is_taken_to_scatter_as_the_others():
     table = judged(np.random.default_rng(1), robots=3, episodes=6)
     kept = table.rows(np.flatnonzero((table.dataset != "r2") | (table.episode == 100)))

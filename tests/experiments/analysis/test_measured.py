@@ -9,7 +9,7 @@ import scipy.stats
 from experiments.analysis.fits import fit_power
 from experiments.analysis.measured import Measurements, NoLevel, Position, measure
 from hma_jax.evaluation.windows import WindowTable
-from tests.experiments.analysis.curves import power, sizes
+from tests.experiments.analysis.curves import of_one_run, power, sizes
 
 POINTS, SEEDS, NOISE, HARD = 4, 3, 0.004, 0.3
 X = sizes(POINTS, span=8.0)
@@ -48,6 +48,17 @@ def test_a_loss_is_the_mean_over_windows_then_over_robots():
     points = measure(("trunk parameters",), positions, {"0": table, "1": table})
     assert points.value.tolist() == [4, 4] and points.levels == 0
     assert points.draw(20, np.random.default_rng(0), episodes=False).tolist() == [[4, 4]] * 20
+
+
+def test_where_every_position_scatters_alike_its_noise_is_the_deviation_of_a_sample():
+    points = of_one_run([1, 1, 2, 2], [0, 1, 0, 1], np.exp([-0.1, 0.1, 0.4, 0.6]))
+    np.testing.assert_allclose(points.noise(), np.std([-0.1, 0.1], ddof=1))
+
+
+def test_branches_of_a_run_draw_the_same_seeds_in_whatever_order_they_come():
+    drawn = of_one_run([1, 1, 2, 2], [0, 1, 1, 0], [3.0, 5.0, 5.0, 3.0]).draw(50, np.random.default_rng(0))
+    np.testing.assert_allclose(drawn[:, :2].mean(1), drawn[:, 2:].mean(1))
+    assert drawn[:, :2].mean(1).std() > 0.5
 
 
 def test_seeds_of_robots_of_their_own_have_one_level_their_geometric_mean():

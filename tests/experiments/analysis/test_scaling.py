@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.intervals import critical
+from experiments.analysis.measured import PRIOR
 from experiments.analysis.scaling import (
     TRUNK,
     WINDOWS,
@@ -25,7 +26,7 @@ from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
 from hma_jax.config import ModelConfig
 from hma_jax.evaluation.windows import WindowTable
-from tests.experiments.analysis.curves import measured, only, sizes
+from tests.experiments.analysis.curves import measured, of_one_run, only, sizes
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE
 
@@ -204,3 +205,13 @@ def test_the_scatter_of_few_seeds_is_known_no_better_than_by_as_many(seeds):
         inside.append(abs(0.01 * rng.standard_normal()) < critical(freedom, 0.9) * noise)
     assert freedom == sum(seeds) - 4
     assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
+
+
+def test_the_noise_near_a_position_is_that_of_the_nearest_by_ratio():
+    points = of_one_run([1, 1, 100, 100], [0, 1, 0, 1], [1.0, 1.1, 1.0, 2.0])
+    assert noise_near(points, np.array([30.0]))[0] == points.noise()[2] > points.noise()[0]
+
+
+def test_what_other_positions_tell_of_a_position_s_noise_counts_as_the_prior_does():
+    points = of_one_run(np.repeat(np.arange(1, 11), 2), [0, 1] * 10, [1.0, 1.1] * 10)
+    assert points.freedom == 10 and noise_near(points, np.array([3.0]))[1] == 1 + PRIOR

@@ -148,6 +148,16 @@ def test_actions_differ_from_the_chunk_that_leads_to_the_first_predicted_frame(p
     assert (jax.random.key_data(keys) != jax.random.key_data(other_keys)).any(-1).all()
 
 
+def test_random_actions_follow_the_statistics_of_the_batch():
+    """Those of all recorded actions, which the table of a model that saw few trajectories does not know."""
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    mean, std = (np.full((4, TABLE.action_width), value, np.float32) for value in (5, 0.5))
+    given = batch | {"action_mean": mean, "action_std": std}
+    sequences, _ = evaluation_inputs(given, TABLE, replace(EVAL, random_actions=64))
+    drawn = np.asarray(sequences[:, 1:, EVAL.first_predicted - 1 :])
+    assert drawn.mean() == pytest.approx(5, abs=0.05) and drawn.std() == pytest.approx(0.5, abs=0.05)
+
+
 NEWCOMERS = (
     Embodiment("humanoid", 26, 3, (0.1,) * 26, (2.0,) * 26),  # wider than anyone before
     Embodiment("film", 0, 1, (), ()),  # no actions at all

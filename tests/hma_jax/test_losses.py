@@ -1,0 +1,77 @@
+"""The terms of the loss: what is compared with what, and over what their means are."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import MaskingConfig
+from hma_jax.model.hma import declare_model
+from hma_jax.objective.losses import action_loss_per_step, masked_loss
+from tests.hma_jax.test_masking import MIXED, masked_batch
+from tests.tiny import DIFFUSION, TABLE, random_batch, shallow_config
+
+KEYS = jax.random.split(jax.random.key(0), 8)
+
+
+def test_labels_are_smoothed_by_as_much_as_is_configured(monkeypatch):
+    config, masking, seen = shallow_config(), MaskingConfig(label_smoothing=0.3), []
+
+    def cross_entropy(logits, labels, smoothing):
+        seen.append(smoothing)
+        return jnp.zeros(logits.shape[:-2]), jnp.zeros(logits.shape[:-2], bool)
+
+    monkeypatch.setattr("hma_jax.objective.losses.smoothed_cross_entropy", cross_entropy)
+    declared, (data, masked) = declare_model(config, TABLE), masked_batch(config, masking, batch=8)
+    inputs = masked, data["tokens"], data["actions"], data["embodiment"], masking, KEYS
+    jax.eval_shape(lambda params: masked_loss(declared.merge(params), *inputs), declared.shapes())
+    assert seen == [0.3]
+
+
+def test_robots_without_actions_are_shown_none_where_others_are_shown_theirs(monkeypatch):
+    """As at inference: zeros that were shown in training alone would be another input."""
+    masking, seen = MaskingConfig(teacher_forcing=True), []
+
+    class Seen(Exception):
+        pass
+
+    def forced_pass(model, past, inputs, masked, actions, robots, hidden, **_):
+        seen.append(hidden)
+        raise Seen
+
+    monkeypatch.setattr("hma_jax.objective.losses.teacher_forced_pass", forced_pass)
+    data, masked = masked_batch(shallow_config(), masking, MIXED, batch=8)
+    robots, model = data["embodiment"], SimpleNamespace(table=MIXED)
+    with pytest.raises(Seen):
+        masked_loss(model, masked, data["tokens"], data["actions"], robots, masking, KEYS)
+    np.testing.assert_array_equal(np.all(seen[0], axis=1), np.array(MIXED.chunks)[robots] == 0)
+
+
+def action_losses(config, action_head):
+    """Of `action_head(target, *its arguments)` in a model's place."""
+    batch = random_batch(0, config)
+    robots, actions = jnp.asarray(batch["embodiment"]), batch["actions"]
+    target = TABLE.normalise(actions, robots)
+    model = SimpleNamespace(config=config, table=TABLE, action_head=lambda *given: action_head(target, *given))
+    return action_loss_per_step(model, jnp.zeros((*actions.shape[:2], 1)), actions, robots, robots, KEYS), robots
+
+
+def test_the_error_of_actions_is_the_mean_over_a_robot_s_own_live_values():
+    """However wide the widest robot's are."""
+    error, _ = action_losses(shallow_config(), lambda target, *_: target + 2)
+    np.testing.assert_allclose(error, 4, rtol=1e-5)
+
+
+def test_action_values_without_a_signal_are_not_noised():
+    """As where actions are sampled (`generation.policy`): else what is learnt would depend on the widest robot."""
+    seen = []
+
+    def head(target, x, time, *_):
+        seen.append(x)
+        return jnp.zeros((*x.shape[:-1], 2 * x.shape[-1]))
+
+    _, robots = action_losses(shallow_config(diffusion=DIFFUSION), head)
+    (noised,) = seen
+    np.testing.assert_array_equal(noised != 0, np.broadcast_to(TABLE.alive()[robots][:, None], noised.shape))
