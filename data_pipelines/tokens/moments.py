@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import tokenize
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.errors import DataError
-from data_pipelines.sources.rlds.location import retry
+from data_pipelines.tokens.beside import read_beside
 
 
 @dataclass(frozen=True)
@@ -80,36 +78,14 @@ def moments_row(actions: np.ndarray) -> np.ndarray:
     return np.asarray([one.count, *one.mean, *one.square], np.float64)
 
 
-def moments_path(part: Path) -> Path:
-    """The file with one row per episode of a part, in their order; `part` is the part's file of records."""
-    return part.with_suffix(".moments.npy")
+MOMENTS = "moments"
+"""The file beside a part with one row per training episode, in their order."""
 
 
 def read_moments(part: Path, episodes: int) -> np.ndarray | None:
-    """float64 [episodes, 1 + 2 A], memory-mapped; None if there is no such file beside `part`.
-
-    Raises DataError for a damaged file, UnreachableError where the disk fails.
-    """
-    path = moments_path(part)
-
-    def read() -> np.ndarray:
-        try:
-            return np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
-            raise DataError(
-                f"{path}: the action statistics cannot be read ({error}). Remove the file, and they are computed again."
-            ) from error
-
-    try:
-        rows = retry(path, read)
-    except FileNotFoundError:
-        return None
-    if rows.ndim != 2 or len(rows) != episodes or rows.dtype != np.float64:
-        raise DataError(
-            f"{path}: {rows.dtype} {list(rows.shape)} cannot be the action statistics of {episodes} episodes. Remove "
-            "the file, and they are computed again."
-        )
-    return rows
+    """float64 [episodes, 1 + 2 A]; None in a store of earlier versions. Raises as `read_beside`."""
+    of = f"the action statistics of {episodes} episodes"
+    return read_beside(part, MOMENTS, episodes, np.float64, of, "they are computed again")
 
 
 def merge_exactly(rows: np.ndarray, dim: int) -> Moments:

@@ -6,6 +6,7 @@ on the source alone, so that any number of processes, killed and restarted at wi
     <dataset>/train-00003-of-00120.array_record   its training episodes, if any
     <dataset>/train-00003-of-00120.moments.npy    statistics of the actions of each of these
     <dataset>/val-00003-of-00120.array_record     its held-out episodes, if any
+    <dataset>/val-00003-of-00120.actions.npy      the actions of all of these, where their records hold frames
     <dataset>/parts/00003.json                    its facts, written after the other files
 """
 
@@ -24,12 +25,16 @@ from array_record.python import array_record_module
 
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.files import sync
+from data_pipelines.tokens.beside import read_beside, write_beside
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, SkippedEpisodes, part_name
-from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row, read_moments
+from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, moments_row, read_moments
 from data_pipelines.tokens.row_sample import RowSample, RowSampler, rows_of_part
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
+
+ACTIONS = "actions"
+"""The file beside a part whose records hold frames, with the native actions of its episodes one after the other."""
 
 FACTS = "parts"
 """Directory of the facts of all parts."""
@@ -86,6 +91,7 @@ def write_part(
     }
     skipped: list[SkippedEpisodes] = []
     moments, rows, sampler = [], [], RowSampler(rows_of_part(part.count))
+    actions: dict[str, list[np.ndarray]] = {}
     for item in items:
         if isinstance(item, SkippedEpisodes):
             skipped.append(item)
@@ -96,23 +102,24 @@ def write_part(
             sampler.add(episode.actions, episode.episode)
         if split == "train":
             rows.append(moments_row(episode.actions))
+        if split in keep_frames:
+            actions.setdefault(split, []).append(np.asarray(episode.actions, np.float32))
         writers[split].add(episode)
+    paths = {split: directory / part_name(split, part.number, part.count) for split in SPLITS}
     if rows:
-        beside = scratch / moments_path(Path(part_name("train", part.number, part.count))).name
-        np.save(beside, np.stack(rows))
-        sync(beside)
-        os.replace(beside, directory / beside.name)
+        write_beside(paths["train"], MOMENTS, np.stack(rows), scratch)
+    for split, own in actions.items():
+        write_beside(paths[split], ACTIONS, np.concatenate(own), scratch)
     splits = [writers[split].close() for split in SPLITS]
     facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(skipped), sampler.sample())
     new_facts = scratch / "facts.json"
     new_facts.write_text(json.dumps(to_dict(facts)))
     sync(new_facts)
     for split, values in zip(SPLITS, splits, strict=True):
-        path = directory / part_name(split, part.number, part.count)
         if values.size:
-            os.replace(scratch / path.name, path)
+            os.replace(scratch / paths[split].name, paths[split])
         else:
-            path.unlink(missing_ok=True)
+            paths[split].unlink(missing_ok=True)
     sync(directory)
     os.replace(new_facts, _facts_path(directory, part))
     sync(directory / FACTS)
@@ -136,6 +143,13 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
     if facts.train.episodes and not _has_moments(directory, part, len(facts.train.episodes)):
         return None
     return facts if facts.part == part else None
+
+
+def read_actions(part: Path, steps: int) -> np.ndarray | None:
+    """float32 [steps, A]: the native actions of a part's episodes; None where they stand in the records alone. Raises
+    as `read_beside`."""
+    of = f"the actions of {steps} steps"
+    return read_beside(part, ACTIONS, steps, np.float32, of, "they are read with the frames")
 
 
 def _has_moments(directory: Path, part: Part, episodes: int) -> bool:

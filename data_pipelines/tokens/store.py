@@ -24,6 +24,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
+from data_pipelines.tokens.part_files import read_actions
 from data_pipelines.tokens.row_sample import ActionRange, RowSampler, quantiles_vary, sampled_episodes
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
@@ -114,6 +115,19 @@ class TokenStore:
             raise DataError(
                 f"{path}: episode {at} cannot be read: {error}. Remove {path.parent} and tokenise the dataset again."
             ) from error
+
+    def actions(self, name: str, split: str, i: int) -> np.ndarray:
+        """float32 [N, A], a copy: the native actions of episode `i` of a split, without its frames where they stand
+        beside them. Raises as `episode`."""
+        part, at = self._locate(name, split, i)
+        facts = self.manifest(name).split(split)
+        steps = np.asarray(facts.steps[i - at :][: facts.parts[part]], np.int64)
+        kept = read_actions(self._path(name, split, part), int(steps.sum()))
+        if kept is None:
+            return self.episode(name, split, i).actions.copy()  # a view would keep the whole record
+        self._check_not_replaced(name)  # not before: it might be replaced in between
+        first = int(steps[:at].sum())
+        return np.array(kept[first : first + steps[at]])
 
     def action_range(self, name: str, episodes: Sequence[int]) -> ActionRange:
         """The range of the actions of these training episodes alone (positions in the store).

@@ -35,8 +35,7 @@ class OtherWindows:
     def __init__(self, store: TokenStore, slicers: dict[str, WindowSlicer], frames: int, rate: float | None, seed: int):
         self._store, self._slicers, self._frames, self._rate, self._seed = store, slicers, frames, rate, seed
         self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray, np.ndarray]] = {}
-        # Copied: a view would keep the whole record, which may hold hundreds of frames.
-        self._actions = lru_cache(CACHED_EPISODES)(lambda name, split, i: store.episode(name, split, i).actions.copy())
+        self._actions = lru_cache(CACHED_EPISODES)(store.actions)
 
     def choose(self, name: str, episode: int, start: int, count: int) -> list[OtherWindow]:
         """Up to `count` windows for the held-out window at `start` of `episode` (position in the store).

@@ -383,8 +383,8 @@ def test_damaged_statistics_are_named(store_root, tmp_path):
     path = next((tmp_path / "store").glob("arm/*.moments.npy"))
     whole = path.read_bytes()
     for damaged, words in (
-        (whole[:50], "the action statistics cannot be read"),
-        (whole.replace(b"'shape'", b"'shape(", 1), "the action statistics cannot be read"),
+        (whole[:50], r"the action statistics of \d+ episodes cannot be read"),
+        (whole.replace(b"'shape'", b"'shape(", 1), r"the action statistics of \d+ episodes cannot be read"),
         (whole.replace(b"<f8", b"<i8", 1), r"int64 \[\d+, 7\] cannot be the action statistics of \d+ episodes"),
     ):
         path.write_bytes(damaged)

@@ -17,8 +17,9 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.output_lock import lock_output
+from data_pipelines.tokens.beside import beside
 from data_pipelines.tokens.dataset_writer import cut_parts
-from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row, read_moments
+from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, moments_row, read_moments
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import write_rlds
@@ -103,9 +104,9 @@ def test_damaged_part_is_made_again(rlds, undisturbed, tmp_path, damage):
     work = begin(rlds, tmp_path)
     record, facts = sorted(work.glob("train-*.array_record"))[1], sorted(work.glob("parts/*.json"))
     if damage == "statistics":
-        moments_path(record).write_bytes(moments_path(record).read_bytes()[:-1])
+        beside(record, MOMENTS).write_bytes(beside(record, MOMENTS).read_bytes()[:-1])
     elif damage == "no statistics":
-        moments_path(record).unlink()
+        beside(record, MOMENTS).unlink()
     elif damage == "truncated":
         record.write_bytes(record.read_bytes()[:-1])
     elif damage == "missing":
@@ -339,7 +340,7 @@ def test_moments_of_pieces_are_those_of_the_whole():
 
 def test_moments_of_an_episode_of_one_action_and_of_as_many_episodes_as_asked_for(tmp_path):
     np.testing.assert_array_equal(moments_row(np.array([[3.0, 4.0]])), [1, 3, 4, 0, 0])
-    np.save(moments_path(tmp_path / "part.array_record"), np.zeros((3, 5)))
+    np.save(beside(tmp_path / "part.array_record", MOMENTS), np.zeros((3, 5)))
     for episodes in (2, 4):
         with pytest.raises(DataError, match=f"of {episodes} episodes"):
             read_moments(tmp_path / "part.array_record", episodes)

@@ -16,7 +16,10 @@ from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, png, write_rlds
 
 SPEC = make_spec(hz=4)  # stride 2
-FILES = ["train-00000-of-00001.array_record", "train-00000-of-00001.moments.npy", "val-00000-of-00001.array_record"]
+FILES = [
+    *("train-00000-of-00001.array_record", "train-00000-of-00001.moments.npy"),
+    *("val-00000-of-00001.actions.npy", "val-00000-of-00001.array_record"),
+]
 
 
 @pytest.fixture

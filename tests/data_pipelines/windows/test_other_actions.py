@@ -9,6 +9,8 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.sampling.order import hash64, stream_seed
+from data_pipelines.tokens import store as store_module
+from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.counterfactual import CounterfactualFrames
 from data_pipelines.windows.evalset import eval_batches, freeze_manifest
 from data_pipelines.windows.other_actions import OtherWindow, OtherWindows
@@ -81,6 +83,35 @@ def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monke
     again = OtherWindows(store, {name: make_slicer(store, name, 4, 2.0)}, 4, 2.0, 1)
     orders = [(others, 0, 0), (others, 0, 4), (others, 0, 8), (again, 0, 0)]
     assert len({tuple(by.choose(name, episode, start, 5)) for by, episode, start in orders}) == 4
+
+
+def test_no_frames_are_read_to_get_their_actions(tmp_path, monkeypatch):
+    """An episode's record holds all its frames, and its actions are a thousandth of it."""
+    small_store(tmp_path, lengths=(20,) * 8, min_val=4, max_val_fraction=0.5)
+    records, decode = [], store_module.decode_episode
+    monkeypatch.setattr(store_module, "decode_episode", lambda data: records.append(data) or decode(data))
+
+    def read(count: int):
+        """(the batch, records read for it)."""
+        before = len(records)
+        _, batch = batches(TokenStore(tmp_path / "s"), count)
+        return batch, len(records) - before
+
+    (_, alone), (batch, with_others) = read(0), read(3)
+    assert alone == with_others == len(set(batch["episode"].tolist())) > 0
+    for path in (tmp_path / "s").glob("*/val-*.actions.npy"):  # of an earlier version, which had them in records alone
+        path.unlink()
+    same, more = read(3)
+    np.testing.assert_array_equal(same["other_actions"], batch["other_actions"])
+    assert more > alone
+
+
+def test_actions_beside_a_part_that_are_damaged_are_named(tmp_path):
+    store = small_store(tmp_path)
+    (path,) = store.root.glob("toy/*.actions.npy")
+    np.save(path, np.load(path)[1:])
+    with pytest.raises(DataError, match=r"val-.*.actions.npy: float32 \[\d+, 3\] cannot be the actions of \d+ steps"):
+        store.actions("toy", "val", 0)
 
 
 def test_of_each_episode_the_smallest_hash_comes_first_and_no_others_are_sorted(tmp_path, monkeypatch):

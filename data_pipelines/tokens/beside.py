@@ -1,0 +1,52 @@
+"""Arrays that stand beside a part's file of records: what is asked for more often than the records, and is far smaller.
+
+Owns their files. Stores of earlier versions lack some; whoever reads then reads the records.
+"""
+
+from __future__ import annotations
+
+import os
+import tokenize
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from data_pipelines.publishing.files import sync
+from data_pipelines.sources.rlds.location import retry
+
+
+def write_beside(part: Path, kind: str, rows: np.ndarray, scratch: Path) -> None:
+    """Writes `rows`, whole or not at all; `scratch` is a directory on the same disk. Raises OSError."""
+    path = beside(part, kind)
+    np.save(scratch / path.name, rows)
+    sync(scratch / path.name)
+    os.replace(scratch / path.name, path)
+
+
+def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, otherwise: str) -> np.ndarray | None:
+    """[rows, ...] of `dtype`, memory-mapped; None if there is no such file beside `part`.
+
+    `of` says what of ("the actions of 12 steps") and `otherwise` what is done without the file, for messages. Raises
+    DataError for a damaged file, UnreachableError where the disk fails.
+    """
+    path = beside(part, kind)
+
+    def read() -> np.ndarray:
+        try:
+            return np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
+            raise DataError(f"{path}: {of} cannot be read ({error}). Remove the file, and {otherwise}.") from error
+
+    try:
+        found = retry(path, read)
+    except FileNotFoundError:
+        return None
+    if found.ndim != 2 or len(found) != rows or found.dtype != dtype:
+        raise DataError(f"{path}: {found.dtype} {list(found.shape)} cannot be {of}. Remove the file, and {otherwise}.")
+    return found
+
+
+def beside(part: Path, kind: str) -> Path:
+    """The file; `part` is the part's file of records."""
+    return part.with_suffix(f".{kind}.npy")
