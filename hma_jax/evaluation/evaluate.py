@@ -23,7 +23,7 @@ from hma_jax.evaluation.lpips import load_lpips
 from hma_jax.evaluation.protocol import Predicted, make_predictor
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable, join
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import ActionUnits, EmbodimentTable
 from hma_jax.model.given import require_known
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, require_params
@@ -37,7 +37,10 @@ T = TypeVar("T")
 REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
 """Arrays of a batch that go to the devices."""
 
-OPTIONAL_ARRAYS = ("real", "action_mean", "action_std", "other_actions", "other_valid", "other_images", "other_seen")
+STATISTICS = ("action_mean", "action_std")
+"""Further ones, by default the table's."""
+
+OPTIONAL_ARRAYS = ("real", "other_actions", "other_valid", "other_images", "other_seen")
 """Further ones, where a batch has them."""
 
 MetricParams = tuple[Params, Params | None]
@@ -80,12 +83,14 @@ def evaluate(
     `make_predictor` and `lpips.load_lpips`.
     """
     mesh = make_mesh(execution.mesh)
-    evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
-    declared = declare_model(model, table, execution)
+    # The robots' statistics are no constants of the program, so that models trained on other episodes share it.
+    known, means, stds = table.standardised(), *table.statistics()
+    evaluator = make_evaluator(model, known, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
+    declared = declare_model(model, known, execution)
     require_params(declared, params, "these parameters are not those of the model")
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
-    metric_params = lay_out(metric_params, NamedSharding(mesh, PartitionSpec()))
+    metric_params, units = lay_out((metric_params, table.scale()), NamedSharding(mesh, PartitionSpec()))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
         compiled = None
@@ -95,12 +100,14 @@ def evaluate(
             require_known(model, table, *(np.asarray(batch[name]) for name in ("tokens", "actions", "embodiment")))
             groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, devices_per_batch(mesh))
             _check_lengths(batch, config, setting)
-            arrays = (*REQUIRED_ARRAYS, *(name for name in OPTIONAL_ARRAYS if name in batch))
-            on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
+            robots = np.asarray(batch["embodiment"])
+            given = {"action_mean": means[robots], "action_std": stds[robots]} | batch
+            arrays = (*REQUIRED_ARRAYS, *STATISTICS, *(name for name in OPTIONAL_ARRAYS if name in batch))
+            on_devices = _put({name: given[name] for name in arrays}, groups * rows, mesh)
             with jax.set_mesh(mesh):
                 if compiled is None:
-                    compiled = compiled_by_all("evaluation", evaluator, weights, metric_params, on_devices)
-                found = compiled(weights, metric_params, on_devices)
+                    compiled = compiled_by_all("evaluation", evaluator, weights, metric_params, units, on_devices)
+                found = compiled(weights, metric_params, units, on_devices)
             yield batch, found
 
     tables: list[WindowTable] = []
@@ -127,8 +134,8 @@ def make_evaluator(
     execution: ExecutionConfig,
     decode: Decode,
     piece: int,
-) -> Callable[[Params, MetricParams, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
-    """A jitted f(parameters, MetricParams, batch with images) -> (metrics {name: [B]}, Predicted).
+) -> Callable[[Params, MetricParams, ActionUnits, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
+    """A jitted f(parameters, MetricParams, ActionUnits, batch with images) -> (metrics {name: [B]}, Predicted).
 
     Runs under `jax.set_mesh`. Of B windows `plan_groups` says how many are in memory at a time; B is a
     multiple of that. Raises ConfigError as `make_predictor`.
@@ -142,9 +149,9 @@ def make_evaluator(
         (decoder_params, lpips_params), (images, real, others) = metric_params, recorded
         return image_metrics(decode, piece, decoder_params, predicted, images, config, real, others, lpips_params)
 
-    def evaluate_group(params: Params, metric_params: MetricParams, batch: dict[str, jax.Array]):
+    def evaluate_group(params: Params, metric_params: MetricParams, units: ActionUnits, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
-        metrics, predicted = predict(params, batch)
+        metrics, predicted = predict(params, batch, units)
         if predicted is None:
             return metrics, None
         others = (batch["other_images"], batch["other_seen"]) if "other_images" in batch else None
@@ -152,9 +159,9 @@ def make_evaluator(
         compared = _on_each_device(compare, mesh)(metric_params, predicted, recorded)
         return metrics | compared | {"finite": metrics["finite"] & compared["finite"]}, predicted
 
-    def evaluate_batch(params: Params, metric_params: MetricParams, batch: dict[str, jax.Array]):
+    def evaluate_batch(params: Params, metric_params: MetricParams, units: ActionUnits, batch: dict[str, jax.Array]):
         groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, devices_per_batch(mesh))
-        return in_groups(lambda rows: evaluate_group(params, metric_params, rows), batch, groups)
+        return in_groups(lambda rows: evaluate_group(params, metric_params, units, rows), batch, groups)
 
     return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
 

@@ -41,7 +41,7 @@ from hma_jax.evaluation.controllability import action_metrics, for_each_sequence
 from hma_jax.evaluation.draws import Purpose, random_actions, table_statistics, window_keys
 from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
-from hma_jax.model.embodiments import EmbodimentTable, normalise
+from hma_jax.model.embodiments import ActionUnits, EmbodimentTable, normalise
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
@@ -115,9 +115,10 @@ def make_predictor(
     config: EvalConfig,
     setting: Setting = "forward",
     execution: ExecutionConfig = ExecutionConfig(),
-) -> Callable[[Params, Batch], tuple[dict[str, jax.Array], Predicted | None]]:
-    """f(params, batch) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. Where the model was
-    trained for actions alone, no Predicted.
+) -> Callable[..., tuple[dict[str, jax.Array], Predicted | None]]:
+    """f(params, batch, units) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. Where the model
+    was trained for actions alone, no Predicted. `units`, by default the table's, are the ActionUnits that the model was
+    trained with.
 
     `finite`, bool [B], says whether likelihoods and, where there are actions to predict, their error are numbers: ids
     are whole numbers even where they were chosen by logits that are none.
@@ -136,8 +137,10 @@ def make_predictor(
     )
     declared = declare_model(model, table, execution)
 
-    def predict(params: Params, batch: Batch) -> tuple[dict[str, jax.Array], Predicted | None]:
-        hma, real = declared.merge(params), batch.get("real")
+    def predict(
+        params: Params, batch: Batch, units: ActionUnits = table.scale()
+    ) -> tuple[dict[str, jax.Array], Predicted | None]:
+        hma, real = declared.merge(params).given_in(units), batch.get("real")
         window = batch["tokens"][:, : model.frames], batch["actions"][:, : model.frames], batch["embodiment"]
         seen = None if real is None else real[:, : model.frames]
 

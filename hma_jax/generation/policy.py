@@ -89,7 +89,7 @@ def read_actions(
         normalised = _sample_actions(model, out.actions, embodiment_B, key_B, decode)
     else:
         normalised = model.action_head(out.actions, embodiment_B)
-    return model.table.unnormalise(normalised, embodiment_B)
+    return model.unnormalise(normalised, embodiment_B)
 
 
 def _sample_actions(

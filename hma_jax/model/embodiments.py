@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -90,6 +90,28 @@ def _as_tuple(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
     return values if isinstance(values, tuple) else tuple(np.asarray(values).tolist())
 
 
+class ActionUnits(NamedTuple):
+    """The scale that actions are normalised on: a table's (`EmbodimentTable.scale`), or inputs of a program that tables
+    of other statistics share."""
+
+    centre_EU: jax.Array | np.ndarray  # the raw values that are normalised to 0
+    unit_EU: jax.Array | np.ndarray  # the raw differences that are normalised to 1; 0: no signal
+
+    def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """Raw chunks [B, ..., U] on each robot's own scale."""
+        return normalise(actions, *self._of(embodiment_B, actions.ndim))
+
+    def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """The inverse of `normalise`: raw units; dead dimensions take their centre."""
+        centre, unit = self._of(embodiment_B, actions.ndim)
+        return actions * unit + centre
+
+    def _of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, ...]:
+        """(centre, unit) of each example's robot, shaped to meet [B, ..., U]."""
+        shape = (-1, *(1,) * (ndim - 2), self.centre_EU.shape[1])
+        return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self)
+
+
 @dataclass(frozen=True)
 class EmbodimentTable:
     """Embodiments in the order of the E axis."""
@@ -131,9 +153,9 @@ class EmbodimentTable:
         """(mean_EU, std_EU), float32; both are 0 in the padding, std also in dead dimensions."""
         return self._tiled([(e.mean, e.std) for e in self.entries])
 
-    def scale(self) -> tuple[np.ndarray, np.ndarray]:
-        """(centre_EU, unit_EU) that normalise actions, float32, with zeros where `statistics` has them."""
-        return self._tiled([(e.centre, e.unit) for e in self.entries])
+    def scale(self) -> ActionUnits:
+        """What normalises actions, float32, with zeros where `statistics` has them."""
+        return ActionUnits(*self._tiled([(e.centre, e.unit) for e in self.entries]))
 
     def _tiled(self, values: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[np.ndarray, np.ndarray]:
         """One (zero, one) of single actions per robot, as float32 [E, U]; `one` is 0 in dead dimensions."""
@@ -166,17 +188,11 @@ class EmbodimentTable:
         which turns rounding noise on a constant dimension into values of order 100 (reference
         section 5.6).
         """
-        return normalise(actions, *self._scale_of(embodiment_B, actions.ndim))
+        return self.scale().normalise(actions, embodiment_B)
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """The inverse of `normalise`: raw units; dead dimensions take their centre."""
-        centre, unit = self._scale_of(embodiment_B, actions.ndim)
-        return actions * unit + centre
-
-    def _scale_of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, jax.Array]:
-        """(centre, unit) of each example's robot, shaped to meet [B, ..., U]."""
-        shape = (-1, *(1,) * (ndim - 2), self.action_width)
-        return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.scale())
+        return self.scale().unnormalise(actions, embodiment_B)
 
 
 def normalise(actions: Array, centre: Array, unit: Array, xp: Any = jnp) -> Array:

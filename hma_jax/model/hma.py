@@ -17,7 +17,7 @@ from hma_jax.config import ExecutionConfig, ModelConfig
 from hma_jax.config.training import ActionLeak
 from hma_jax.kernels.pointwise import over_tokens, replaced, shifted
 from hma_jax.model.conditioning import ActionFeature
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import ActionUnits, EmbodimentTable
 from hma_jax.model.frames import Recall, factorise, make_embed, make_frame_head
 from hma_jax.model.heads import Denoiser, make_action_head
 from hma_jax.model.layers import FINE_EPS, LayerNorm
@@ -47,6 +47,7 @@ class HMA(nnx.Module):
 
     def __init__(self, config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig):
         self.config, self.table, self.dtype = config, table, jnp.dtype(execution.dtype)
+        self._units: ActionUnits | None = None  # the table's
         self.embed = make_embed(config)
         self.embed.mask.set_metadata(use="frames_predicted")  # no token is masked but to be predicted
         self.recall = used("frames_predicted", Recall(config)) if config.recall else None
@@ -110,7 +111,7 @@ class HMA(nnx.Module):
             x = self.recall(x, unknown, self._a_frame_earlier(frames, unknown, before))
         action = None
         if actions_BTU is not None:
-            feature = self.stem(actions_BTU, embodiment_B, slice_B, self.dtype)
+            feature = self.stem(self.normalise(actions_BTU, embodiment_B).astype(self.dtype), slice_B)
             from_blocks = hidden_BT if leak == "none" else self._hidden_through_leaks(hidden_BT, positions)
             action = ActionFeature(feature, None if from_blocks is None else ~from_blocks)
             if config.concat:
@@ -146,6 +147,20 @@ class HMA(nnx.Module):
             vectors_TD = jnp.take(self.action_mask.get_value(), positions, axis=0)
             feature_BTD = replaced(feature_BTD, hidden_BT, vectors_TD)
         return over_tokens(feature_BTD, self.config.action_tokens)
+
+    def given_in(self, units: ActionUnits) -> HMA:
+        """This model, made within a traced function, whose actions are normalised on another scale than its table's:
+        with inputs of the program for constants."""
+        self._units = nnx.data(units)
+        return self
+
+    def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """Raw chunks [B, ..., U] as the model computes with them: see `EmbodimentTable.normalise`."""
+        return (self._units or self.table.scale()).normalise(actions, embodiment_B)
+
+    def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """The inverse of `normalise`."""
+        return (self._units or self.table.scale()).unnormalise(actions, embodiment_B)
 
     def logits(self, predictions: jax.Array, ids: jax.Array) -> jax.Array:
         """Logits [..., Q, V] of each factor from the `predictions` of tokens [...]; with chained factors, given the

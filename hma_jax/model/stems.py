@@ -1,4 +1,4 @@
-"""The stems: every robot's raw action chunks as features of the trunk's width.
+"""The stems: every robot's action chunks as features of the trunk's width.
 
 Reference section 1.3. What the trunk does with a feature is in `conditioning`. The paper's text
 gives one Xavier gain, 0.1, for "action projectors"; the release has it for the modulation and
@@ -8,7 +8,6 @@ gives one Xavier gain, 0.1, for "action projectors"; the release has it for the 
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
@@ -21,11 +20,10 @@ from hma_jax.model.params import bias, ones, param, uniform
 
 
 class Stem(nnx.Module):
-    """Raw action chunks of any robot to features: Linear, layer norm, ReLU, Linear."""
+    """Normalised action chunks of any robot to features: Linear, layer norm, ReLU, Linear."""
 
     def __init__(self, config: ModelConfig, table: EmbodimentTable):
         size, width = table.size, config.width
-        self.table = table
 
         def first_layer(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
             # Each robot's slice has the fan-in of its own chunk. Rows of padding are zero and
@@ -41,11 +39,8 @@ class Stem(nnx.Module):
         init = hidden_init(config, width, width, config.stem_gain)
         self.out = EmbodimentLinear(size, (width, width), ("D", "D_out"), init=init, role="hidden")
 
-    def __call__(
-        self, actions_BTU: jax.Array, embodiment_B: jax.Array, slice_B: jax.Array, dtype: jnp.dtype
-    ) -> jax.Array:
-        """Raw, zero-padded actions -> features a_BTD in `dtype`."""
-        x = self.table.normalise(actions_BTU, embodiment_B).astype(dtype)
-        x = layer_norm(self.into(x, slice_B), BLOCK_EPS)
+    def __call__(self, actions_BTU: jax.Array, slice_B: jax.Array) -> jax.Array:
+        """Normalised, zero-padded actions -> features a_BTD in their type."""
+        x = layer_norm(self.into(actions_BTU, slice_B), BLOCK_EPS)
         x = shifted(scaled(x, robot_vectors(self.gain, slice_B, x)), robot_vectors(self.bias, slice_B, x))
         return self.out(jax.nn.relu(x), slice_B)

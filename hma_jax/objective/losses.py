@@ -206,7 +206,7 @@ def action_loss_per_step(
     DIFFERS: the release compares with raw actions and averages over everything times the mean
     of the mask (reference section 1.8).
     """
-    target = model.table.normalise(actions_BTU, embodiment_B)
+    target = model.normalise(actions_BTU, embodiment_B)
     alive_BTU = jnp.broadcast_to(jnp.asarray(model.table.alive())[embodiment_B][:, None], target.shape)
     if model.config.diffusion:
         keys = jax.vmap(lambda k: jax.random.fold_in(k, 2**20))(key_B)  # not one of the repeats'

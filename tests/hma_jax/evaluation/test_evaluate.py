@@ -17,7 +17,7 @@ from hma_jax.evaluation.protocol import evaluation_inputs
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
 from hma_jax.generation import next_frame_outputs, rollout
-from hma_jax.model.embodiments import Embodiment
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import declare_model
 from hma_jax.model.readout import choose_likeliest
@@ -387,6 +387,30 @@ def test_what_cannot_be_evaluated_is_refused(params):
         evaluate(params, CONFIG, TABLE, TOKENIZER, [batch | {"images": batch["images"][:, :, 1:]}], EVAL)
 
 
+@pytest.mark.parametrize("setting", ["forward", "policy"])
+def test_models_that_differ_in_the_statistics_of_their_actions_are_evaluated_by_one_program(
+    setting, params, monkeypatch
+):
+    """So that a sweep over how many trajectories there are compiles once, and each is judged by its own statistics."""
+    programs, numbers = set(), []
+
+    def noting(_, evaluator, *given):
+        programs.add(evaluator.lower(*given).as_text())
+        return evaluator
+
+    monkeypatch.setattr(module, "compiled_by_all", noting)
+    scaled = EmbodimentTable(
+        tuple(replace(e, mean=[m + 0.7 for m in e.mean], std=[2 * s for s in e.std]) for e in TABLE.entries)
+    )
+    for table in (TABLE, scaled):
+        (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+        found = evaluate(
+            params, CONFIG, table, TOKENIZER, [batch], replace(EVAL, decode=DecodeConfig(1)), setting=setting
+        )
+        numbers.append(found.windows.metrics["cross_entropy" if setting == "forward" else "action_error_of_mean"])
+    assert len(programs) == 1 and (numbers[0] != numbers[1]).all()
+
+
 # --- Groups, order, memory --------------------------------------------------------------------
 
 
@@ -476,7 +500,7 @@ def test_memory_is_that_of_the_windows_at_once_not_of_the_batch(params):
         evaluator = make_evaluator(CONFIG, TABLE, quick, "forward", execution, decoder.decode_uint8_fn, decoder.piece)
         (batch,) = make_batches(CONFIG, names=("arm",), batch=rows, each=rows)
         compiled = evaluator.lower(
-            params, (decoder.params, None), {k: batch[k] for k in module.REQUIRED_ARRAYS}
+            params, (decoder.params, None), TABLE.scale(), {k: batch[k] for k in module.REQUIRED_ARRAYS}
         ).compile()
         return compiled.memory_analysis().temp_size_in_bytes
 
