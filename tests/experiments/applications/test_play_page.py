@@ -534,3 +534,14 @@ def test_it_fits_a_phone(browsing):
         assert not page.faults
 
     browsing(test)
+
+
+def test_it_fits_a_laptop(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address, viewport={"width": 1280, "height": 720})
+        pad = await page.locator(".pads").bounding_box()
+        assert pad["y"] + pad["height"] <= 720, "the picture and the pad are on one screen"
+        picture = await page.locator("#seen").bounding_box()
+        assert picture["width"] >= 340 and not page.faults
+
+    browsing(test)
