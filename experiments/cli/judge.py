@@ -51,7 +51,8 @@ def judge(
     the frames. To test the head, it also judges true frames; as a control, a policy's actions are replaced by those of
     another episode. A robot without a true simulator is evaluated in the model only, with a head trained on recordings.
     Writes a table, the agreement with intervals, a page with clips, and a page on which a person can label successes
-    blindly. Run the same command again after an interruption: it continues. docs/judging.md explains the results.
+    without knowing the policy. Run the same command again after an interruption: it continues. docs/judging.md
+    explains the results.
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.

@@ -1,4 +1,7 @@
-"""A page on which a person labels successes without knowing the policy or the world, and what the labels say."""
+"""A page on which a person labels successes without knowing the policy or what the judges say, and what the labels say.
+
+The world is not named, but can be seen: true frames are sharp, the model's are not. True ones are shown as the judges
+see them; decoded by the tokenizer they would be blurred too, but have none of the errors that the model makes."""
 
 from __future__ import annotations
 
