@@ -21,7 +21,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from hma_jax.evaluation.metrics import mean_over_frames, psnr
+from hma_jax.evaluation.metrics import difference, mean_over_frames, psnr
 
 OPTIONAL_METRICS = (
     "action_nats",
@@ -86,6 +86,6 @@ def counterfactual(
     found = {
         "counterfactual_psnr": mean_over_frames(of_frames[:, 0], real_BT),
         "counterfactual_copy": mean_over_frames(psnr(jnp.broadcast_to(before, truth.shape), truth), real_BT),
-        "counterfactual_gain": mean_over_frames(of_frames[:, 0] - of_frames[:, 1], real_BT),
+        "counterfactual_gain": mean_over_frames(difference(of_frames[:, 0], of_frames[:, 1]), real_BT),
     }
     return {name: jnp.where(seen_B, x, jnp.nan) for name, x in found.items()}

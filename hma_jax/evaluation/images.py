@@ -12,7 +12,7 @@ import numpy as np
 from hma_jax.config import EvalConfig, require
 from hma_jax.evaluation.controllability import counterfactual
 from hma_jax.evaluation.lpips import lpips
-from hma_jax.evaluation.metrics import last_frames, mean_over_frames, psnr, ssim
+from hma_jax.evaluation.metrics import difference, last_frames, mean_over_frames, psnr, ssim
 from hma_jax.evaluation.protocol import Predicted
 from hma_jax.model.params import Params
 
@@ -83,7 +83,7 @@ def image_metrics(
         "psnr": mean_over_frames(psnr(shown, future), real),
         "psnr_last": psnr_last,
         "psnr_random": psnr_random.mean(1),
-        "delta_psnr": (psnr_last[:, None] - psnr_random).mean(1),
+        "delta_psnr": difference(psnr_last[:, None], psnr_random).mean(1),
         "psnr_copy": mean_over_frames(psnr(copied, future), real),
         "ssim": mean_over_frames(ssim(shown, future), real),
         "finite": _finite(tokens[:, :made], real) & _finite(predicted.random_last, None),
