@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ from hma_jax.generation import (
     rollout_naive,
     start,
 )
-from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, shallow_config
+from hma_jax.generation.rollout import Sequences
+from tests.tiny import DIFFUSION, SMALLER, TABLE, lively_params, model_config, random_batch, shallow_config
 
 SAMPLER = SamplerConfig(steps=5)
 
@@ -165,6 +167,12 @@ def test_equal_actions_give_equal_rollouts_even_when_sampled():
     np.testing.assert_array_equal(got[:, 0], got[:, 1])
 
 
+def test_every_frame_of_every_example_is_drawn_with_random_numbers_of_its_own():
+    sequences = Sequences(None, None, None, jax.random.split(jax.random.key(0), 2))
+    keys = [jax.random.key_data(sequences.keys_at(t)).tolist() for t in (1, 2)]
+    assert len({tuple(key) for at in keys for key in at}) == 4
+
+
 def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
     def first_frame_to_change(alignment: str, chunk: int) -> int:
         config = model_config(action_alignment=alignment)
@@ -249,7 +257,7 @@ LONG = 14  # frames, of models whose window has 6
 
 
 def long_batch(config, seed: int = 0) -> dict:
-    return random_batch(seed, model_config(frames=LONG, diffusion=config.diffusion), 2)
+    return random_batch(seed, replace(config, frames=LONG), 2)
 
 
 def past_the_window(config, decode: DecodeConfig, prompt: int, hidden=None):
@@ -346,25 +354,41 @@ def test_streaming_is_exact_but_for_what_a_finished_frame_had_seen_and_where_it_
     np.testing.assert_array_equal(streamed, exact)
 
 
-@pytest.mark.exact
+LATER = (pytest.mark.exact, pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
-    "slide, alignment, prompt",
+    "changes, decode, prompt",
     [
+        pytest.param(SMALLER, DecodeConfig(1, 1.0, slide="streaming"), 4, id="smallest"),
         # In every run tests/hma_jax/simulator compares episodes, frame by frame, with rollouts.
-        pytest.param("exact", "causal", 3, marks=pytest.mark.slow),
-        pytest.param("streaming", "causal", 2, marks=pytest.mark.slow),
-        pytest.param("exact", "released", 8, marks=pytest.mark.slow),
+        pytest.param({"action_alignment": "causal"}, DecodeConfig(2), 3, id="exact", marks=LATER),
+        pytest.param(
+            {"action_alignment": "causal"}, DecodeConfig(2, slide="streaming"), 2, id="streaming", marks=LATER
+        ),
+        pytest.param({}, DecodeConfig(2, 1.0), 8, id="long-prompt", marks=LATER),
     ],
 )
-def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignment: str, prompt: int):
-    config, decode = model_config(action_alignment=alignment), DecodeConfig(2, slide=slide)
+def test_a_session_makes_the_frames_of_a_rollout_one_by_one(changes, decode: DecodeConfig, prompt: int):
+    """Of one episode whose actions are shown and of one whose are hidden."""
+    config = model_config(**changes)
     declared, params = lively_params(config)
     batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
-    actions, tokens = jnp.asarray(batch["actions"]), batch["tokens"][:, :prompt]
-    whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt)(params)[:, 0]
+    actions, tokens, robots = jnp.asarray(batch["actions"]), batch["tokens"][:, :prompt], batch["embodiment"]
+    hidden_B = jnp.array([False, True])
+    hidden = jnp.repeat(hidden_B[:, None], LONG, axis=1)
+    whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt, hidden_BT=hidden)(params)[:, 0]
 
-    begin = jax.jit(lambda p: start(declared.merge(p), tokens, actions[:, : prompt - 1], batch["embodiment"]))
-    step = jax.jit(lambda p, s, a, b: advance(declared.merge(p), s, a, keys, decode, next_chunk_BU=b), donate_argnums=1)
+    @jax.jit
+    def begin(params):
+        between, unseen = actions[:, : prompt - 1], hidden[:, : prompt - 1]
+        return start(declared.merge(params), tokens, between, robots, hidden_BT=unseen)
+
+    @partial(jax.jit, donate_argnums=1)
+    def step(params, session, chunk, following):
+        rest = dict(next_chunk_BU=following, hidden_B=hidden_B)
+        return advance(declared.merge(params), session, chunk, keys, decode, **rest)
+
     session, frames = begin(params), []
     for t in range(prompt, LONG):
         session, frame = step(params, session, actions[:, t - 1], actions[:, t])

@@ -35,11 +35,11 @@ def measured(
     )  # fmt: skip
 
 
-def of_one_run(x: Sequence[float], seed: Sequence[int], value: Sequence[float]) -> Measurements:
-    """Losses of branches of one run at `x`, exactly, without windows that they are means of."""
-    trials = tuple(f"t{i}" for i in range(len(x)))
-    run = np.array(["run"] * len(x))
-    return Measurements(("windows",), np.array(x, float)[:, None], run, trials, np.array(seed), np.array(value), None)
+def of_one_run(x: np.ndarray | Sequence, seed: Sequence[int], value: Sequence[float]) -> Measurements:
+    """Losses [n] of branches of one run at `x` [n] or [n, K], as they are: without windows that they are means of."""
+    x, trials = np.array(x, float).reshape(len(x), -1), tuple(f"t{i}" for i in range(len(x)))
+    names, run = ("trunk parameters", "windows")[: x.shape[1]], np.array(["run"] * len(x))
+    return Measurements(names, x, run, trials, np.array(seed), np.array(value), None)
 
 
 def scaled(points: Measurements, factors: dict[int, float]) -> Measurements:

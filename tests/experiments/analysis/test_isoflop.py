@@ -4,10 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 
-from experiments.analysis.isoflop import fit_isoflop
+from experiments.analysis.isoflop import _Line, _misfit, fit_isoflop
 from experiments.report.fits import describe_fits, fit_rows
-from tests.experiments.analysis.curves import measured, only, power
+from tests.experiments.analysis.curves import measured, of_one_run, only, power
 
 SIZES, BUDGETS = np.geomspace(1e4, 1e7, 7), np.geomspace(6e10, 6e12, 5)
 
@@ -192,3 +193,15 @@ def test_where_one_size_has_one_seed_nothing_is_said_of_the_parabola():
     fewer = only(points, (points.seed == 0) | (points.x[:, 0] != sizes[2]))
     said = ["off the parabola" in b.remarks for p in (points, fewer) for b in fit_isoflop(p, BUDGETS, draws=50).budgets]
     assert said == [True] * 5 + [False] * 5
+
+
+def test_a_misfit_has_the_freedom_of_sizes_beyond_a_parabola_s_three_and_of_seeds_beyond_each_size_s_first():
+    residuals = np.zeros((5, 3))
+    residuals[0], residuals[1] = np.sqrt(5), [0, 1, 1]  # squares: 5 in all of the values, 1 around them of each draw
+    assert f"(F = 5.0, p = {scipy.stats.f.sf(5, 2, 10):.2g})" in _misfit(residuals, [3] * 5)
+
+
+@pytest.mark.parametrize(("flops", "seeds"), [(2e3, 1), (5e5, 2)])
+def test_a_size_has_the_seeds_of_its_nearest_budget_by_ratio(flops, seeds):
+    points = of_one_run([(1, 1e3), (1, 1e6), (1, 1e6)], [0, 0, 1], [3.0, 2.0, 2.1])
+    assert _Line(points, points.value[None], 1.0).seeds_near(flops) == seeds
