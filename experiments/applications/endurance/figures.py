@@ -11,10 +11,10 @@ from PIL import Image
 
 from experiments.applications.endurance.films import SHOWN, Film
 from experiments.applications.endurance.tables import Row, over_robots
-from experiments.report.plot_style import CONTROL_LINE, STYLE, save
+from experiments.report.plot_style import CONTROL_LINE, MUTED, STYLE, save, show_legend
 
 PANELS = {
-    "psnr": ("PSNR against the truth (dB)", "psnr_still", "still picture"),
+    "psnr": ("PSNR against the truth (dB)", "psnr_still", "PSNR of a still picture"),
     "tool_close": ("tools found where they are (share)", "true_tool_close", "true simulator"),
     "object_found": ("objects found at all (share)", "", ""),
     "object_close": ("objects found where they are (share)", "true_object_close", "true simulator"),
@@ -40,8 +40,9 @@ def draw_curves(rows: Sequence[Row], path: Path) -> None:
             panel.set(title=title, xlabel="minutes of simulated time", xlim=(0, None))
             if name != "psnr":
                 panel.set_ylim(0, 1.02)
-        for panel in (panels[0, 0], panels[0, 1]):
-            panel.legend()
+        words = "bands: 95 % intervals over robots, by Student's t, cut where shares and correlations end"
+        figure.supxlabel(words, fontsize=8.5, color=MUTED)
+        show_legend(figure, panels.flat)
         path.parent.mkdir(parents=True, exist_ok=True)
         save(figure, path)
 

@@ -28,7 +28,13 @@ from hma_jax.runtime.files import write_file
 CLIPS = 6
 """Episodes that are shown."""
 
-OWN_COLOUR = "#2f7d4f"
+COLOURS = {
+    "cloned": ("blue: cloned", "#2b5c8a"),
+    "diffusion": ("orange: diffusion policies", "#b3541e"),
+    "own": ("green: your own", "#2f7d4f"),
+    "": ("grey: others", MUTED),
+}
+"""Kind of a policy, by how its name begins -> how the caption names it, and its colour."""
 
 CORNERS = ((4, 4), (-4, 4), (4, -4), (-4, -4))
 """Where a name may stand beside its point, in printer's points."""
@@ -61,6 +67,8 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
             1, len(upwards), figsize=(4.8 * len(upwards), 4.7), sharex=True, sharey=True, squeeze=False
         )
         labels: list[dict[str, Annotation]] = []
+        kinds = {name: "own" if name in summary["own"] else name.split("-")[0] for name in summary["policies"]}
+        kinds = {name: kind if kind in COLOURS else "" for name, kind in kinds.items()}
         for panel, column in zip(panels[0], upwards, strict=True):
             panel.plot([0, 1], [0, 1], color=MUTED, linewidth=1, zorder=1)
             words = {}
@@ -72,11 +80,9 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
                     [[x["mean"] - x["low"]], [x["high"] - x["mean"]]],
                     [[y["mean"] - y["low"]], [y["high"] - y["mean"]]],
                 )
-                made = {"cloned": "#2b5c8a", "diffusion": "#b3541e"}.get(name.split("-")[0], MUTED)
-                colour = OWN_COLOUR if name in summary["own"] else made
                 panel.errorbar(
                     x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
-                    color=colour, elinewidth=0.8, markersize=5,
+                    color=COLOURS[kinds[name]][1], elinewidth=0.8, markersize=5,
                 )  # fmt: skip
                 words[name] = panel.annotate(
                     name, (x["mean"], y["mean"]), CORNERS[0], textcoords="offset points", fontsize=7, color=INK,
@@ -86,6 +92,8 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
             panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), title=titles[column], xlabel=AXES[across])
             labels.append(words)
         panels[0, 0].set_ylabel("success in the model, by the head")
+        legend = (words for kind, (words, _) in COLOURS.items() if kind in kinds.values())
+        figure.supxlabel(f"lines: 95 % intervals; {', '.join(legend)}", fontsize=8.5, color=MUTED)
         figure.tight_layout()
         figure.canvas.draw()
         for panel, words in zip(panels[0], labels, strict=True):

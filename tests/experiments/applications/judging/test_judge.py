@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.applications.judging import judge
+from experiments.applications.judging import page as judge_page
 from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
 from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.ground_truth import SimulatedTruth
@@ -200,7 +201,7 @@ def test_frames_that_no_policy_could_look_at_are_refused_before_anything_is_reco
     assert not (root / "small").exists()
 
 
-def test_table_summary_and_page(judged, few_draws):
+def test_table_summary_and_page(judged, few_draws, monkeypatch):
     root, found = judged
     out = root / "out"
     write_outcomes(found.outcomes, out / "outcomes.csv")
@@ -210,6 +211,10 @@ def test_table_summary_and_page(judged, few_draws):
     head = summary["agreement"]["the head alone, on true frames"]["starts"]["bias"]
     assert head["low"] <= head["mean"] <= head["high"]
     draw_scatter(summary, out / "scatter.png")
+    kept = []
+    monkeypatch.setattr(judge_page, "save", lambda figure, _: kept.append(figure.get_supxlabel()))
+    draw_scatter(summary, out / "scatter.png")
+    assert kept == ["lines: 95 % intervals; blue: cloned, grey: others"]
     page = write_page(found, summary, out, "hma judge").read_text()
     assert page.count("<figure") == 4 and "cloned-3" in page and "http" not in page
 
