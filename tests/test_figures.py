@@ -19,7 +19,7 @@ from experiments.analysis.intervals import Interval
 from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
-from experiments.rows import OVERALL, Row, read_csv
+from experiments.rows import OVERALL, Row, curve, read_csv
 from hma_jax.config import EvalConfig
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
@@ -59,6 +59,44 @@ def test_the_study_s_figures():
             found = "psnr_copy" if label.startswith("copying") and metric == "psnr" else metric
             assert cell in ("", shown(rows[(*TRAINED[label], found)], DIGITS[metric])), (label, metric)
         assert cells[-1], f"{label} shows nothing"
+
+
+def test_the_figure_beside_the_study_s_table_has_the_perplexity_that_the_page_says():
+    (nats,) = (
+        r.mean
+        for r in read_csv(STUDY / "results.csv")
+        if (r.sweep, r.x, r.role, r.scope, r.metric) == ("width", 48, "point", OVERALL, "cross_entropy")
+    )
+    said = f"The figure draws exp of the mean nats (the reference: {np.exp(nats):.0f}), the table"
+    assert said in " ".join(RESULTS.read_text().split())
+
+
+def test_errors_of_settings_and_conditioning_are_over_what_the_page_says():
+    """It said that they treated windows as independent; they have none."""
+    rows = read_csv(ROOT / "experiments" / "results" / "ablations" / "results.csv")
+    metrics = {"perplexity": 2, "delta_psnr": 3, "psnr": 2}
+    found = {m: {p.label: p for s in ("settings", "conditioning") for p in curve(rows, s, m)} for m in metrics}
+    for label, cells in table(RESULTS, "| | perplexity | ΔPSNR (dB) | PSNR (dB) |").items():
+        points = {m: of[label] for m, of in found.items()}
+        shown = [f"{p.mean:.{metrics[m]}f} ± {p.seed_sem:.{metrics[m]}f}" for m, p in points.items()]
+        assert cells == [text.replace("-0.000", "0.000") for text in shown], label
+    of_windows = [(p.sem**2 - p.seed_sem**2) ** 0.5 for p in found["perplexity"].values()]
+    said = f"are over seeds alone; windows add {min(of_windows):.2f} to {max(of_windows):.2f} to that of a perplexity"
+    assert said in " ".join(RESULTS.read_text().split()), said
+
+
+def test_a_power_law_is_quoted_with_an_interval_and_with_what_is_doubtful():
+    """README gave three digits of a law that lost a third of its exponent with one of five points."""
+    with (ROOT / "experiments" / "results" / "cpu-full" / "fits.csv").open(newline="") as file:
+        (row,) = (r for r in csv.DictReader(file) if (r["curve"], r["coefficient"]) == ("width", "alpha"))
+    value, low, high = (f"{float(row[name]):.2f}" for name in ("value", "low", "high"))
+    without = re.fullmatch(r"without the first position alpha is ([\d.]+) and E [\d.]+", row["doubts"])[1]
+    said = f"falls as N^-{value} in trunk parameters N ({low} to {high}; {without} without the narrowest width, so the"
+    assert said in RESULTS.read_text()
+    for path in (README, RESULTS):
+        for line in path.read_text().splitlines():
+            for law in re.finditer(r"\b[NDC]\^-?\d\.\d+", line):
+                assert re.search(r"\d to \d", line), f"{path.name}: {law[0]} without its interval"
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "experiments" / "results").rglob("results.csv")), ids=str)
@@ -283,6 +321,8 @@ def test_the_page_of_simulators_gives_the_nats_of_its_table():
     assert f"**the control {nats['width', 64, 'control']:.3f}, which is better**" in page
     few, more, all_there = (nats["trajectories", x, "point"] for x in (4, 8, 480))
     assert f"({few:.3f}, {more:.3f} and {all_there:.3f} nats" in page
+    sixteen = nats["trajectories", 16, "point"]
+    assert sixteen == all_there and "the caps of 16 and of 480 in the CSV are one training under two names" in page
     widths = ", ".join(f"{nats['width', x, 'point']:.3f}" for x in (24, 32, 64, 96))
     assert f"({widths} at widths 24, 32, 64 and 96)" in page
     assert f"from {nats['datasets', 5, 'point']:.3f} nats alone to {nats['datasets', 40, 'point']:.3f} when" in page

@@ -137,12 +137,12 @@ def _best_size(isoflop: IsoFlop) -> str:
     def power(a: Coefficient) -> str:
         return f"C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>".replace("-", "\u2212")
 
+    grows = "How the best size grows is doubtful: as" if isoflop.doubts else "The best size grows as"
     said = (
-        f"The best size grows as {power(isoflop.exponent)} by a parabola through up to five sizes, and as "
-        f"{power(isoflop.near)} by one through the best size and its two neighbours."
+        f"{grows} {power(isoflop.exponent)} by a parabola through up to five sizes, as {power(isoflop.near)} by one "
+        "through the best size and its two neighbours."
     )
-    if isoflop.doubts:
-        said += f" The exponent is doubtful: {html.escape('; '.join(isoflop.doubts))}."
+    said += "".join(f" {html.escape(doubt[0].upper() + doubt[1:])}." for doubt in isoflop.doubts)
     best = [b for b in isoflop.budgets if b.best]
     if doubtful := sum(bool(b.doubts) for b in best):
         said += (

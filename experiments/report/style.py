@@ -58,12 +58,14 @@ td.text:last-child:nth-child(n+4) { white-space: normal; min-width: 11rem; }
 nav ul { columns: 15rem; padding: 0; margin: 0 0 1.4rem; list-style: none; font-size: .9rem; }
 nav li { break-inside: avoid; } nav a { color: inherit; text-decoration-color: var(--muted); }
 tbody th { color: inherit; font-weight: inherit; } .sem { white-space: nowrap; }
-@media screen { tbody th, .findings tbody td:first-child { position: sticky; left: 0; background: var(--paper); } }
+thead th { white-space: normal; vertical-align: bottom; }
+th:first-child, .findings td:first-child { white-space: normal; min-width: 7rem; }
+@media screen { th:first-child, .findings td:first-child { position: sticky; left: 0; background: var(--paper); } }
 .pause { font-size: .86rem; color: var(--muted); }
 .moving, .still { display: contents; } .still, body:has(#pause:checked) .moving { display: none; }
 body:has(#pause:checked) .still { display: contents; }
 @media (prefers-reduced-motion: reduce) { .moving, .pause { display: none; } .still { display: contents; } }
-@media (max-width: 560px) { tbody th, .findings tbody td:first-child { white-space: normal; max-width: 9rem; }
+@media (max-width: 560px) { th:first-child, .findings td:first-child { max-width: 9rem; }
   main { padding: 1.2rem .9rem 3rem; } h1 { font-size: 1.5rem; }
   .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); }
   .card { padding: .6rem .7rem; } .card b { font-size: 1.15rem; } .card b .sem { font-size: .8rem; }

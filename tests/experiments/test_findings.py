@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from experiments.applications.detector import CLOSE_PX
 from experiments.applications.in_place import in_place
 from experiments.report.findings import read_findings
 from experiments.rows import OVERALL, CurvePoint, all_series, curve, difference
+from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
@@ -291,20 +293,36 @@ def test_what_sharing_and_company_cost_is_as_findings_say():
 def test_what_was_found_is_as_readme_says():
     root = RESULTS / "cpu-full"
     text = readme()
-    with open(root / "fits.csv", newline="") as file:
-        fits = [(r["curve"], r["coefficient"], float(r["value"])) for r in csv.DictReader(file) if r["value"]]
-    law, best = ({name: value for of, name, value in fits if of == which} for which in ("width", "isoflop"))
-    assert f"{law['E']:.2f} + {law['A']:.0f} N^-{law['alpha']:.2f} in trunk parameters" in text
-    predicted = json.loads((root / "predictions" / "width-64.json").read_text())["mean"]
+    width_64 = json.loads((root / "predictions" / "width-64.json").read_text())
+    predicted = "{mean:.3f} nats ({low:.3f} to {high:.3f})".format(**width_64)
     came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
-    assert f"predicted at {predicted:.3f} nats before it ran, came to {came}" in text
+    assert f"predicted at {predicted} before it ran, came to {came}" in text
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
     assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
     poor = {p.label: p for p in curve(rows_of(root.name), "newcomers", "cross_entropy")}
     gained, error = difference(poor["alone"], poor["all robots"])
     assert f"{gained:.2f} if the five have 8 trajectories each" in text
     assert f"**Training with all robots is worth {gained:.2f} ± {error:.2f} nats**" in findings()
-    assert f"best trunk grows as C^{best['a']:.2f}" in text
+
+
+def test_which_size_is_best_for_a_budget_is_as_readme_and_findings_say():
+    """It was said to grow, with an interval that the form of the fit had made: the lowest loss is at one width."""
+    budgets = all_series(rows_of(), "compute")[POINT]
+    curves = [curve(rows_of(), "compute", "cross_entropy", series=series) for series in budgets]
+    assert {min(points, key=lambda p: p.mean).x for points in curves} == {24}
+    assert {len(points) for points in curves} == {5} and len(curves) == 4
+    assert "best of five widths: 24 at all four budgets; whether it grows is undecided |" in readme()
+    with open(RESULTS / "cpu-full" / "fits.csv", newline="") as file:
+        law, near = (
+            {name: float(r[name]) for name in ("value", "low", "high")} | {"doubts": r["doubts"]}
+            for r in csv.DictReader(file)
+            if r["curve"] == "isoflop"
+        )
+    for doubt in ("the three sizes around each best one alone give", "have the lowest loss at every budget"):
+        assert doubt in law["doubts"]
+    said = "as C^{value:.2f} ({low:.2f} to {high:.2f} with 90 %) by parabolas through all five sizes, as".format(**law)
+    said += " C^{value:.2f} ({low:.2f} to {high:.2f}) by those through the three around the best one".format(**near)
+    assert said in " ".join(findings().split()), said
 
 
 def test_the_curve_over_robots_in_the_mixture_is_as_findings_say():
@@ -509,6 +527,40 @@ def test_what_stands_between_the_tables_is_as_findings_say():
     said = f"4 trajectories come to {shuffled:.2f} nats where true ones come to {true:.2f}, at {frames[0]:.2f} and"
     shuffled, true = seed_0("horizon", "cross_entropy", 4000)
     assert f"{said} {frames[1]:.2f} dB. With all trajectories true ones are {shuffled - true:.2f} ahead." in page
+
+
+WRITTEN = {
+    "cf4c56d": "2026-11-23 19:28:07",
+    "8eb94f8": "2026-11-23 22:56:16",
+    "3b2a34a": "2026-11-24 02:15:29",
+    "57fc8b1": "2026-11-24 02:45:13",
+    "e228d04": "2026-11-24 02:47:35",
+    "ceeb3d9": "2026-11-24 09:55:45",
+    "48418f4": "2026-11-24 12:30:01",
+    "f6dfe0d": "2026-11-25 01:17:35",
+    "27d7987": "2026-11-24 21:25:20",
+    "1828eaa": "2026-11-24 22:06:09",
+    "b067155": "2026-11-25 00:33:35",
+    "8663244": "2026-11-25 04:31:55",
+    "e323bb1": "2026-11-25 16:48:04",
+    "0c65072": "2026-11-25 21:27:03",
+    "64e33cf": "2026-11-25 21:35:14",
+}
+"""Commit of an expectation -> when it was made, as `git log` has it."""
+
+
+@pytest.mark.parametrize("study", ["cpu-full", "cpu-full-continuous", "ladder"])
+def test_what_had_run_when_it_was_expected_is_marked_as_known(study):
+    """Two intervals for three seeds were written around the first, which had run: both counted as predictions."""
+    points = defaultdict(dict)
+    for r in rows_of(study):
+        if r.role == POINT:
+            points[r.sweep, r.series, r.label or f"{r.x:g}"][r.seed] = r.trial
+    for e in read_expected(RESULTS / study / "predictions" / FILE):
+        trials = points[e.sweep, e.series, e.x]
+        ended = {s: read_result(RESULTS / study / "trials" / trials[s])["run"]["finished"] for s in e.seeds or trials}
+        before = {s for s, end in ended.items() if end < f"{WRITTEN[e.commit]} +0000"}
+        assert before == set(e.known) and all(end.endswith(" +0000") for end in ended.values()), e
 
 
 @pytest.mark.parametrize("study", ["cpu-full", "cpu-full-continuous", "ladder"])

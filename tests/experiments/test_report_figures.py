@@ -252,9 +252,8 @@ def test_a_growth_of_the_best_size_that_three_sizes_do_not_have_is_drawn_and_sai
     plot_fits.plot_isoflop(fit, tmp_path / "isoflop.png")
     assert line_of_parabolas(kept[0].axes[1]) == "--" and "doubtful" in kept[0].get_supxlabel()
     said = describe_fits([], fit, [], "")
-    assert (
-        "C<sup>0.09</sup>" in said and "three sizes around each best one alone give 0.09, outside its interval" in said
-    )
+    assert "How the best size grows is doubtful: as C<sup>0.28</sup>" in said and "as C<sup>0.09</sup>" in said
+    assert "The three sizes around each best one alone give 0.09, outside its interval." in said
 
 
 @pytest.mark.parametrize(("high", "interval"), [(3.1e-4, ""), (1.4, " <span class=sem>[0, 1.4]</span>")])
