@@ -27,10 +27,32 @@ from tests.experiments.fakes import PROVENANCE
 FAMILY = {e.name: e.family for e in EMBODIMENTS}
 SWEEPS = dict(zip(CPU_FULL.axes, plan_sweeps(CPU_FULL, CPU_FULL.axes), strict=True))
 LONG = set(CPU_FULL.designs.long)
+TWICE = replace(PAPER, seeds=(0, 1))
+BOTH = (*SWEEPS.values(), *plan_sweeps(TWICE, TWICE.axes))
 
 
 def points(axis: str, role: str = POINT):
     return [p for p in SWEEPS[axis].points if p.role == role]
+
+
+POSITIONS = {
+    ("datasets", "dilution", "transfer"): lambda trial: len(trial.datasets),
+    ("trajectories", "fewshot"): lambda trial: trial.max_trajectories,
+    ("width", "compute"): lambda trial: trial.model.width,
+    ("horizon",): lambda trial: trial.train.steps,
+    ("lr", "lr_horizon"): lambda trial: trial.train.optimizer.learning_rate,
+}
+
+
+@pytest.mark.parametrize("axes", POSITIONS, ids=" ".join)
+def test_the_position_of_a_point_is_the_number_that_its_trial_has(axes):
+    found = [(p.x, POSITIONS[axes](p.trial)) for sweep in BOTH for p in sweep.points if sweep.name in axes]
+    assert found and all(x == number for x, number in found)
+
+
+def test_every_point_is_averaged_over_robots_that_it_evaluates():
+    for sweep in BOTH:
+        assert all({*(p.scope or sweep.scope)} <= {*p.trial.evaluated} for p in sweep.points), sweep.name
 
 
 @pytest.mark.parametrize("axis", CPU_FULL.axes)
@@ -112,6 +134,7 @@ def test_newcomers_are_whole_and_of_the_kin_that_is_said():
         assert not ("strangers" in label and kin)
         assert "siblings" not in label or {FAMILY[name] for name in added} <= {FAMILY[name] for name in judged}
         assert len(added) == {"alone": 0, "20": 15, "all robots": 35}[label.split(",")[0]]
+        assert p.trial.train.steps == (4000 if "as long" in label else 100 * len(p.trial.datasets)), label
 
 
 def test_rates_come_down_at_every_point_of_equal_compute():

@@ -344,13 +344,14 @@ def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions()
 
 def test_streaming_is_exact_but_for_what_a_finished_frame_had_seen_and_where_it_stood():
     """In one layer its keys and values are those of itself and its position: without positions they never change."""
-    config, prompt = shallow_config(), 3
-    params, both = past_the_window(config, DecodeConfig(2, slide="streaming"), prompt)
+    config, prompt, hidden = shallow_config(), 3, np.random.default_rng(0).random((2, LONG)) < 0.5
+    params, both = past_the_window(config, DecodeConfig(2, slide="streaming"), prompt, hidden)
     streamed, exact = both(params)
     inside = config.frames - prompt
     np.testing.assert_array_equal(streamed[:, :inside], exact[:, :inside])
     assert (streamed[:, inside:] != exact[:, inside:]).any()
-    streamed, exact = both(params | {"positions": jnp.zeros_like(params["positions"])})
+    anywhere = {name: jnp.zeros_like(params[name]) for name in ("positions", "action_mask")}
+    streamed, exact = both(params | anywhere)
     np.testing.assert_array_equal(streamed, exact)
 
 
@@ -360,7 +361,7 @@ LATER = (pytest.mark.exact, pytest.mark.slow)
 @pytest.mark.parametrize(
     "changes, decode, prompt",
     [
-        pytest.param(SMALLER, DecodeConfig(1, 1.0, slide="streaming"), 4, id="smallest"),
+        pytest.param(SMALLER | {"frames": 5}, DecodeConfig(1, 1.0, slide="streaming"), 6, id="smallest"),
         # In every run tests/hma_jax/simulator compares episodes, frame by frame, with rollouts.
         pytest.param({"action_alignment": "causal"}, DecodeConfig(2), 3, id="exact", marks=LATER),
         pytest.param(
@@ -370,12 +371,12 @@ LATER = (pytest.mark.exact, pytest.mark.slow)
     ],
 )
 def test_a_session_makes_the_frames_of_a_rollout_one_by_one(changes, decode: DecodeConfig, prompt: int):
-    """Of one episode whose actions are shown and of one whose are hidden."""
+    """Of one episode whose actions are hidden and of one whose are shown."""
     config = model_config(**changes)
-    declared, params = lively_params(config)
+    declared, params = lively_params(config, scale=0.5)
     batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
     actions, tokens, robots = jnp.asarray(batch["actions"]), batch["tokens"][:, :prompt], batch["embodiment"]
-    hidden_B = jnp.array([False, True])
+    hidden_B = jnp.array([True, False])
     hidden = jnp.repeat(hidden_B[:, None], LONG, axis=1)
     whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt, hidden_BT=hidden)(params)[:, 0]
 

@@ -1,3 +1,6 @@
+from dataclasses import replace
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +14,7 @@ from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
 from hma_jax.model.hma import causal_mask, declare_model
 from hma_jax.model.params import declare
-from tests.tiny import TABLE, lively_params, model_config, random_batch, shallow_config
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, shallow_config
 
 
 def logits_of(config, declared, params, batch, actions=True):
@@ -155,3 +158,28 @@ def test_mup_scales_attention_with_the_head_and_the_readout_with_the_width():
     linear = params["frame_head"]["linear"]
     plain = x @ linear["kernel"] / 2 + linear["bias"]
     np.testing.assert_allclose(hma.frame_head(x).reshape(1, -1), plain, rtol=1e-5)
+
+
+@pytest.mark.parametrize("changes", [{"chain_factors": True}, {"diffusion": DIFFUSION}], ids=["ids", "latents"])
+def test_every_head_reads_of_a_wider_trunk_as_much_less_as_it_is_wider(changes):
+    """What the same matrices, times m, read without this part of muP."""
+    mup = MupConfig(base_width=32)
+    config = model_config(width=64, mup=mup, **changes)
+    declared, params = lively_params(config, scale=0.05)
+    wider = jax.tree.map(lambda x, spec: 2 * x if spec.role == "output" else x, params, declared.specs)
+    batch, z = random_batch(0, config, 2), jax.random.normal(jax.random.key(0), (2, 6, 9, 64))
+    tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
+
+    def read(config, params):
+        hma = declare_model(config, TABLE).merge(params)
+        if config.diffusion is None:
+            return hma.logits(z, tokens), hma.action_head(z[:, :, 0], robots)
+        time = jnp.full(tokens.shape[:3], 5)
+        return hma.denoiser(tokens, time, z), hma.action_head(actions, time[:, :, 0], z[:, :, 0], robots)
+
+    divided, whole = (
+        jax.jit(partial(read, c)) for c in (config, replace(config, mup=replace(mup, without=("readout",))))
+    )
+    for a, b, without in zip(divided(wider), whole(params), whole(wider), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+        assert not np.allclose(a, without, rtol=1e-2, atol=1e-2)

@@ -161,6 +161,17 @@ def test_a_step_shares_out_matrices_of_the_size_that_the_mesh_s_settings_say(mon
     assert set(sizes) == {7}
 
 
+def test_a_step_clips_to_the_norm_that_is_configured(monkeypatch):
+    config, limits = shallow_config(), []
+    declared = declare_model(config, TABLE)
+    train = TrainConfig(steps=1, batch=8, optimizer=replace(CONFIG, warmup_steps=0, clip_norm=7.0))
+    clip = lambda grads, limit: limits.append(limit) or clip_by_global_norm(grads, limit)  # noqa: E731
+    monkeypatch.setattr("hma_jax.training.step.clip_by_global_norm", clip)
+    state = jax.eval_shape(lambda: init_state(declared, TABLE, 0))
+    jax.eval_shape(make_train_step(declared, TABLE, config, train), state, random_batch(0, config))
+    assert limits == [7.0]
+
+
 def test_under_mup_muon_s_updates_keep_their_spectral_norm_at_every_width():
     def norms(width: int) -> dict[str, float]:
         config = shallow_config(width=width, mup=MupConfig(base_width=32))
@@ -192,6 +203,16 @@ def test_mup_divides_the_rate_of_hidden_matrices_only():
     for name in ("stem/into/kernel", "frame_head/linear/kernel", "embed/tables", "positions"):
         assert name not in scaled
     assert all(s.role == "hidden" for n, s in leaves.items() if n in scaled)
+
+
+def test_mup_leaves_decay_as_it_is():
+    """Of a hidden matrix muP scales it up as much as the rate down."""
+    specs = {"matrix": declare_model(shallow_config(), TABLE).leaves()["trunk/blocks/mlp_in/kernel"]}
+    params = {"matrix": jnp.ones(specs["matrix"].shape)}
+    nothing, state = jax.tree.map(jnp.zeros_like, params), init_adam(params, TABLE.size)
+    here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, jnp.ones(TABLE.size, bool)))
+    new, _ = apply_update(nothing, state, params, specs, {"matrix": 0.25}, here, 1e-2, CONFIG)
+    np.testing.assert_allclose(new["matrix"], 1 - 1e-2 * CONFIG.weight_decay, rtol=1e-6)
 
 
 def test_schedules_warm_up_hold_and_fall():
