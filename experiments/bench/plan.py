@@ -7,6 +7,7 @@ device would hold and send. The same report comes from the devices at hand.
 from __future__ import annotations
 
 import importlib.util
+import math
 import re
 import time
 from collections.abc import Mapping
@@ -46,6 +47,7 @@ class Plan:
     mesh: Mapping[str, int]
     compile_seconds: float
     flops_per_step: float  # of the model, by formula, all devices together
+    moments: int = 0  # both, of what is trained
     arguments: int = 0  # parameters, moments and this device's rows
     temporary: int = 0
     peak: int = 0
@@ -58,7 +60,7 @@ class Plan:
 
     @property
     def stored(self) -> int:
-        """Of the parameters, in float32; the two moments are twice that."""
+        """Of the parameters, in float32."""
         return 4 * sum(d.device_size for d in self.decisions)
 
 
@@ -134,6 +136,10 @@ def make_plan(
         devices=len(devices),
         mesh=dict(mesh.shape),
         flops_per_step=train_flops_per_step(model, table, train),
+        moments=sum(
+            x.dtype.itemsize * math.prod(x.sharding.shard_shape(x.shape))
+            for x in jax.tree.leaves((state.opt_state.first, state.opt_state.second))
+        ),
     )
     began = time.perf_counter()
     with jax.set_mesh(mesh):
@@ -173,7 +179,7 @@ def abstract_inputs(
     mesh: Mesh,
 ) -> tuple[TrainState, dict[str, jax.ShapeDtypeStruct]]:
     """State and batch of the training step: shapes, types and shardings, no arrays."""
-    state = state_shapes(declared, table, mesh, mesh_config, average=train.ema_decay > 0)
+    state = state_shapes(declared, table, mesh, mesh_config, average=train.ema_decay > 0, only=train.only)
     shape = (train.batch, model.frames, model.tokens)
     tokens = (shape, jnp.int32)
     if model.diffusion:

@@ -101,7 +101,7 @@ def plan(
     )  # fmt: skip
     for name, made in rows:
         # The peak holds parameters, moments, the average and whatever lives at once of what is computed.
-        sizes = (made.stored, 2 * made.stored, *[made.stored] * averaged, made.temporary, made.peak)
+        sizes = (made.stored, made.moments, *[made.stored] * averaged, made.temporary, made.peak)
         shown = [size_of(x) if made.peak else "" for x in sizes]
         shape = " x ".join(map(str, made.mesh.values()))
         verdict = "" if name == "local" and limit is None else "fits"

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
 
 import jax
 import numpy as np
 
 from hma_jax.convert.atomic import atomic_directory
-from hma_jax.model.params import Use
+from hma_jax.model.hma import declare_model
 from hma_jax.runtime.files import write_file
 from hma_jax.training.checkpoints import Checkpoints
-from hma_jax.training.optimizer import AdamState
 from hma_jax.training.run_lock import CHECKPOINTS
 from hma_jax.training.runs import Run, describe_run
-from hma_jax.training.state import TrainState
+from hma_jax.training.state import TrainState, state_shapes
 
 
 def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None) -> None:
@@ -35,9 +33,7 @@ def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None)
 def fresh_state(run: Run) -> TrainState:
     """What training starts with, in memory of the host."""
     params = jax.tree.map(np.asarray, run.params)
+    shapes = state_shapes(declare_model(run.model, run.table), run.table, only=run.train.only)
     # Untouched zeros cost no memory.
-    moments = [jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), params) for _ in range(2)]
-    shared = {use: np.zeros((), np.int32) for use in get_args(Use)}
-    robots = {use: np.zeros(run.table.size, np.int32) for use in get_args(Use)}
-    ema = params if run.train.ema_decay else None
-    return TrainState(np.zeros((), np.int32), params, AdamState(*moments, shared, robots), ema)
+    step, opt_state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), (shapes.step, shapes.opt_state))
+    return TrainState(step, params, opt_state, params if run.train.ema_decay else None)

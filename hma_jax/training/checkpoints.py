@@ -15,7 +15,7 @@ import logging
 import math
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,10 @@ from hma_jax.training.reading import (
 from hma_jax.training.run_lock import require_plain
 
 Description = dict[str, Any]
+
+Load = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
+"""Reads the items of a checkpoint, as `load_items`."""
+
 log = logging.getLogger(__name__)
 
 
@@ -195,8 +199,9 @@ class Checkpoints:
         shapes: Any,
         may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: (),
         skip_damaged: bool = False,
+        load: Load = load_items,
     ) -> tuple[int, Any]:
-        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say.
+        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say, read by `load`.
 
         `may_change` says which fields of its description ('train.steps') may differ, at its step. With `skip_damaged`,
         checkpoints after the newest whole one are moved to `damaged` beside this directory. Raises
@@ -226,7 +231,7 @@ class Checkpoints:
                 "output directory or restore these fields:\n  " + "\n  ".join(changes)
             )
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
-        return step, type(shapes)(**load_items(checkpoint, wanted))
+        return step, type(shapes)(**load(checkpoint, wanted))
 
     def _move_damaged_away(self) -> None:
         damaged = []

@@ -36,7 +36,7 @@ class Presence(NamedTuple):
 
 
 class AdamState(NamedTuple):
-    """Moments like the parameters, and how often each was updated, for bias correction."""
+    """Moments like the parameters that are trained, and how often each was updated, for bias correction."""
 
     first: Params
     second: Params
@@ -243,16 +243,16 @@ def apply_update(
     return params, AdamState(first, second, count, count_E)
 
 
-def take_adam(state: AdamState, specs: Params, active: Active) -> AdamState:
-    """The moments and counts of a step's robots, and of what all share."""
-    first, second = (robots.take(moment, specs, active) for moment in (state.first, state.second))
+def take_adam(state: AdamState, specs: Params, active: Active, places_G: jax.Array | None) -> AdamState:
+    """The moments and counts of a step's robots, and of what all share; their moments are at `places_G`."""
+    first, second = (robots.take(moment, specs, places_G) for moment in (state.first, state.second))
     return AdamState(first, second, state.count, {use: n[active.robots_G] for use, n in state.count_E.items()})
 
 
-def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active) -> AdamState:
+def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active, places_G: jax.Array | None) -> AdamState:
     """`state` with those of `new` in their places."""
-    first = robots.put(state.first, new.first, specs, active)
-    second = robots.put(state.second, new.second, specs, active)
+    first = robots.put(state.first, new.first, specs, places_G)
+    second = robots.put(state.second, new.second, specs, places_G)
     count_E = {use: n.at[active.robots_G].set(new.count_E[use]) for use, n in state.count_E.items()}
     return AdamState(first, second, new.count, count_E)
 

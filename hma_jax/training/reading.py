@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
@@ -86,9 +87,9 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
         return ocp.checkpointables_metadata(checkpoint).custom_metadata or {}
 
 
-def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
+def load_items(checkpoint: Path, shapes: Mapping[str, Any], partial: bool = False) -> dict[str, Any]:
     """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says, or in memory of the host
-    if it is one of NumPy arrays.
+    if it is one of NumPy arrays (`on_host`). With `partial` trees may lack arrays that are there.
 
     With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing, ReadError if
     one cannot be read now.
@@ -100,12 +101,27 @@ def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
         with _reading(checkpoint):
             verify(checkpoint, lambda name: name.split("/")[0] in folders, share)
     with _reading(checkpoint):
-        if not old:
-            return ocp.load_checkpointables(checkpoint, dict(shapes))
         context = ocp.Context()
-        context.pytree.loading.partial_load = True
+        context.pytree.loading.partial_load = old or partial
         with context:
-            return ocp.load(checkpoint, dict(shapes))
+            return (ocp.load if old else ocp.load_checkpointables)(checkpoint, dict(shapes))
+
+
+def on_host(shapes: Any) -> Any:
+    """A tree of shapes (jax.ShapeDtypeStruct) as one of NumPy arrays, which take no memory themselves: what Orbax then
+    reads is not on devices."""
+    return jax.tree.map(lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape), shapes)
+
+
+def saved_shapes(checkpoint: Path, item: str, field: str) -> Any:
+    """A tree of the shapes of the arrays in a field of an item. With several processes all call this. Raises as
+    `load_items`."""
+    old = (checkpoint / WHOLE_STATE).is_dir()
+    folder = WHOLE_STATE if old else item
+    with raised_in_all("shapes"), _reading(checkpoint):
+        verify(checkpoint, lambda name: name.split("/")[0] == folder, (jax.process_index(), jax.process_count()))
+        found = ocp.checkpointables_metadata(checkpoint).metadata[folder]
+        return jax.tree.map(lambda x: tuple(x.shape), (found[item] if old else found)[field])
 
 
 def has_item(checkpoint: Path, name: str) -> bool:

@@ -20,6 +20,12 @@ class Active(NamedTuple):
 
     robots_G: jax.Array  # int32: their places on the embodiment axis
     slice_B: jax.Array  # int32: each example's robot, as a place in `robots_G`
+    everyone: bool = False  # all robots, in their order
+
+    @property
+    def places_G(self) -> jax.Array | None:
+        """`robots_G`, None where that is everyone."""
+        return None if self.everyone else self.robots_G
 
 
 def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
@@ -28,36 +34,40 @@ def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
     # copies all robots' arrays in each step. The second robot, without an example, is not changed.
     count = min(max(len(embodiment_B), 2), embodiments)
     if count == embodiments:
-        return Active(jnp.arange(embodiments), embodiment_B)
+        return Active(jnp.arange(embodiments), embodiment_B, everyone=True)
     here_E = jnp.zeros(embodiments, bool).at[embodiment_B].set(True)
     order = jnp.argsort(~here_E, stable=True)
     place_E = jnp.zeros(embodiments, jnp.int32).at[order].set(jnp.arange(embodiments, dtype=jnp.int32))
     return Active(order[:count], place_E[embodiment_B])
 
 
-def take(tree: Params, specs: Params, active: Active) -> Params:
-    """Parameters, or anything with an array per parameter, with the active robots' slices only."""
+def take(tree: Params, specs: Params, places_G: jax.Array | None) -> Params:
+    """Parameters, or anything with an array per parameter, with robots' slices at these places of the embodiment axis
+    only; None: with all of them. What stands beyond the end of the axis is no number that counts."""
+    if places_G is None:
+        return tree
 
     def slices(spec: ParamSpec, x: jax.Array) -> jax.Array:
-        if _whole(spec, active):
+        if spec.embodiment_axis is None:
             return x
-        return jnp.take(x, active.robots_G, axis=spec.embodiment_axis)
+        # Clipped where these are all robots: a choice between slices and what is beyond them would change how updates
+        # are rounded.
+        mode = "clip" if len(places_G) == spec.shape[spec.embodiment_axis] else None
+        return jnp.take(x, places_G, axis=spec.embodiment_axis, mode=mode)
 
     return jax.tree.map(slices, specs, tree, is_leaf=is_spec)
 
 
-def put(tree: Params, new: Params, specs: Params, active: Active) -> Params:
-    """`tree` with the active robots' slices, and whatever all robots share, from `new`."""
+def put(tree: Params, new: Params, specs: Params, places_G: jax.Array | None) -> Params:
+    """`tree` with robots' slices at these places, and whatever all robots share, from `new`; slices beyond the end of
+    the axis are left out."""
+    if places_G is None:
+        return new
 
     def written(spec: ParamSpec, x: jax.Array, slices: jax.Array) -> jax.Array:
-        if _whole(spec, active):
+        if spec.embodiment_axis is None:
             return slices
-        index: tuple[Any, ...] = (slice(None),) * spec.embodiment_axis + (active.robots_G,)
+        index: tuple[Any, ...] = (slice(None),) * spec.embodiment_axis + (places_G,)
         return x.at[index].set(slices, unique_indices=True)
 
     return jax.tree.map(written, specs, tree, new, is_leaf=is_spec)
-
-
-def _whole(spec: ParamSpec, active: Active) -> bool:
-    axis = spec.embodiment_axis
-    return axis is None or spec.shape[axis] == len(active.robots_G)

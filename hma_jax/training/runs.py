@@ -27,6 +27,7 @@ from hma_jax.training.reading import (
     agree_on_latest,
     has_item,
     load_items,
+    on_host,
     raised_in_all,
     read_description,
 )
@@ -174,10 +175,8 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
     )
     item = "ema" if averaged and weights != "last" else "params"
     declared = declare_model(model, table)
-    # Orbax reads into memory of the host what is described by arrays of NumPy; these take none themselves.
-    like = jax.tree.map(lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape), declared.shapes())
     with raised_in_all("parameters"):
-        params = load_items(checkpoint, {item: like})[item]
+        params = load_items(checkpoint, {item: on_host(declared.shapes())})[item]
     require_params(declared, params, f"{checkpoint} is not of the model that it describes")
     return Run(
         model,

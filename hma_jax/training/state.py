@@ -6,6 +6,7 @@ A checkpoint keeps each field of a state as an item of its own (`training.checkp
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from hma_jax.model.params import Declared, Params, require_params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.sharding import place
 from hma_jax.training.optimizer import init_adam
+from hma_jax.training.own import own_specs
 
 FINITE = "finite/"
 """Prefix of the names of a step's checks: metrics that are not logged, but stop a run if false."""
@@ -60,7 +62,7 @@ def init_state(
         require_params(declared, params, "the initial parameters do not fit the model")
         params = jax.tree.map(lambda x, like: place(np.array(x, like.dtype), like.sharding), params, shapes.params)
     leaves, treedef = jax.tree.flatten(shapes)
-    step, opt_state = _jitted_zeros(treedef, tuple(leaves), table.size)()
+    step, opt_state = _jitted_zeros(treedef, tuple(leaves))()
     ema = None if shapes.ema is None else jax.tree.map(copy, params)
     return TrainState(step, params, opt_state, ema)
 
@@ -71,14 +73,12 @@ def _layout(shapes: TrainState) -> TrainState | None:
 
 
 @lru_cache(maxsize=4)
-def _jitted_zeros(
-    treedef: Any, leaves: tuple[jax.ShapeDtypeStruct, ...], robots: int
-) -> Callable[[], tuple[jax.Array, Any]]:
+def _jitted_zeros(treedef: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> Callable[[], tuple[jax.Array, Any]]:
     """Counter and moments of a state of these shapes before step 1; kept for the next run of the same process."""
     shapes = jax.tree.unflatten(treedef, leaves)
     layout = _layout(shapes)
     return jax.jit(
-        lambda: (jnp.zeros((), jnp.int32), init_adam(shapes.params, robots)),
+        lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (shapes.step, shapes.opt_state)),
         out_shardings=layout and (layout.step, layout.opt_state),
     )
 
@@ -99,21 +99,28 @@ def state_shapes(
     device_mesh: jax.sharding.Mesh | None = None,
     mesh: MeshConfig = MeshConfig(),
     average: bool = False,
+    only: tuple[str, ...] = (),
 ) -> TrainState:
     """A state's shapes (jax.ShapeDtypeStruct) and, given a mesh, their shardings.
 
-    Moments and `average` (whether there is a moving average) lie as their parameters, counters on
-    every device.
+    Moments and `average` (whether there is a moving average) lie as parameters of their shapes, counters on every
+    device. There are moments of what is trained: of everything, or of the robots' own parameters of `only`.
     """
-    params = declared.shapes(None if device_mesh is None else param_shardings(declared, device_mesh, mesh))
+
+    def laid_out(declared: Declared) -> Params:
+        return declared.shapes(None if device_mesh is None else param_shardings(declared, device_mesh, mesh))
+
+    params = moments = laid_out(declared)
+    if only:
+        moments = laid_out(replace(declared, specs=own_specs(declared.specs, len(set(only)))))
     whole = None if device_mesh is None else NamedSharding(device_mesh, PartitionSpec())
-    counters = jax.eval_shape(lambda: init_adam(params, table.size))
+    counters = jax.eval_shape(lambda: init_adam(moments, table.size))
     return TrainState(
         jax.ShapeDtypeStruct((), jnp.int32, sharding=whole),
         params,
         counters._replace(
-            first=params,
-            second=params,
+            first=moments,
+            second=moments,
             count=with_sharding(counters.count, whole),
             count_E=with_sharding(counters.count_E, whole),
         ),

@@ -15,7 +15,7 @@ from hma_jax.config.training import ActionLeak
 from hma_jax.kernels.random import GENERATOR, key_of
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import HMA
-from hma_jax.model.params import Declared, Use, is_spec
+from hma_jax.model.params import Declared, Params, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import Masked, mask_batch
 from hma_jax.training import robots
@@ -31,6 +31,7 @@ from hma_jax.training.optimizer import (
     put_adam,
     take_adam,
 )
+from hma_jax.training.own import pick_own, places_among, put_own
 from hma_jax.training.state import FINITE, TrainState, all_finite
 
 Batch = dict[str, jax.Array]
@@ -65,6 +66,11 @@ def make_train_step(
     check_targets(learning, masking)
     if config.only:
         check_own(learning, masking)
+    places_E = places_among(trained_E)
+
+    def trained(tree: Params) -> Params:
+        """The entries of what is trained, of which alone there are moments."""
+        return pick_own(tree, specs) if config.only else tree
 
     def sums(params: Any, batch: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
         model = declared.merge(params)
@@ -104,7 +110,7 @@ def make_train_step(
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         counts = count_targets(masked, batch["tokens"], masking)
         active = robots.choose(batch["embodiment"], table.size)
-        own = robots.take(state.params, specs, active)
+        own = robots.take(state.params, specs, active.places_G)
         rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.slice_B}
         grads, total = accumulated(own, rows, counts)
         if config.only:
@@ -114,12 +120,14 @@ def make_train_step(
         leak = masking.action_leak
         presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT, leak)
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
+        moments_G = jnp.asarray(places_E)[active.robots_G] if config.only else active.places_G
         new, adam = apply_update(
-            grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer,
-            declared.min_shard_size,
+            trained(grads), take_adam(state.opt_state, trained(specs), active, moments_G), trained(own),
+            trained(specs), trained(multipliers), here, rate, config.optimizer, declared.min_shard_size,
         )  # fmt: skip
-        params = robots.put(state.params, new, specs, active)
-        opt_state = put_adam(state.opt_state, adam, specs, active)
+        opt_state = put_adam(state.opt_state, adam, trained(specs), active, moments_G)
+        new = put_own(own, new) if config.only else new
+        params = robots.put(state.params, new, specs, active.places_G)
         ema = update_average(state.ema, params, config.ema_decay, state.step) if config.ema_decay else None
         metrics = loss_metrics(total, counts, masking, discrete=not model.diffusion)
         metrics |= {"grad_norm": norm, "learning_rate": rate}

@@ -27,8 +27,10 @@ from hma_jax.runtime.mesh import check_mesh, make_mesh
 from hma_jax.runtime.rows import own_rows
 from hma_jax.runtime.sharding import put_batch
 from hma_jax.training.divergence import Records
+from hma_jax.training.former import load_trained
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, RunInfo, fit
 from hma_jax.training.optimizer import steps_in_common
+from hma_jax.training.reading import load_items
 from hma_jax.training.runs import describe_run, modernise
 from hma_jax.training.state import init_state, state_shapes
 from hma_jax.training.step import make_train_step
@@ -65,7 +67,7 @@ def train_model(
     device_mesh = make_mesh(mesh)
     check_mesh(device_mesh, model, config.batch, execution.accumulate)
     audit_sharding(plan_sharding(declared, device_mesh, mesh), device_mesh)
-    shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0)
+    shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0, only=config.only)
 
     rows = len(own_rows(device_mesh, config.batch))
     # Neither the seed nor the robots' statistics are constants of the programs, so that runs of others share them. With
@@ -94,6 +96,11 @@ def train_model(
             same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
             return ("train.steps",) if step <= min(same, config.steps) else ()
 
+        def load(checkpoint: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
+            if not config.only:
+                return load_items(checkpoint, wanted)
+            return load_trained(checkpoint, wanted, declared, np.isin(table.names, config.only))
+
         return fit(
             step,
             shapes,
@@ -101,7 +108,7 @@ def train_model(
             make_batches,
             steps=config.steps,
             run_dir=run_dir,
-            info=RunInfo(describe_run(model, config, table, provenance), to_dict(execution), modernised, records),
+            info=RunInfo(describe_run(model, config, table, provenance), to_dict(execution), modernised, records, load),
             put_batch=put_checked,
             options=replace(
                 options,
@@ -156,7 +163,7 @@ def _jitted_step(
     and compiling a step takes seconds.
     """
     declared = declare_model(model, table, execution)
-    shapes = state_shapes(declared, table, device_mesh, execution.mesh, average=config.ema_decay > 0)
+    shapes = state_shapes(declared, table, device_mesh, execution.mesh, average=config.ema_decay > 0, only=config.only)
     everywhere = NamedSharding(device_mesh, PartitionSpec())
     return jax.jit(
         make(declared, table, model, config, execution.accumulate),

@@ -21,7 +21,7 @@ from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.mesh import make_mesh
 from hma_jax.training.state import init_state
-from tests.tiny import TABLE, model_config, train_config
+from tests.tiny import SMALLER, TABLE, model_config, train_config
 
 
 def test_the_command_line_offers_the_models_of_the_table():
@@ -48,6 +48,16 @@ def test_a_step_that_fits_is_reported_with_its_memory_and_parameters():
     assert plan.arguments > 3 * plan.stored  # weights and two moments
     assert plan.peak == plan.arguments + plan.temporary > plan.temporary > 0
     assert not plan.refusal and not plan.collectives
+
+
+def test_what_is_frozen_is_planned_without_moments():
+    config = model_config(**SMALLER)
+    plans = [
+        make_plan(config, TABLE, train_config(only=o), ExecutionConfig(), jax.devices()[:1]) for o in ((), ("arm",))
+    ]
+    everything, one = plans
+    assert everything.moments == 2 * everything.stored == 2 * one.stored
+    assert everything.arguments - one.arguments == everything.moments - one.moments > one.stored
 
 
 def test_a_mesh_that_does_not_suit_the_devices_is_refused():

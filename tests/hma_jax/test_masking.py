@@ -13,7 +13,7 @@ from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import LossSums, count_targets, masked_loss
 from hma_jax.objective.masking import hidden_at_inference, mask_tokens
-from hma_jax.training.state import init_state
+from hma_jax.training.state import init_state, state_shapes
 from hma_jax.training.step import find_presence, make_train_step
 from tests.tiny import (
     DIFFUSION,
@@ -432,7 +432,7 @@ def test_only_the_named_robots_own_parameters_are_trained():
     config = shallow_config()
     declared, params = lively_params(config)
     train = train_config(steps=1, only=("arm",))
-    state = init_state(declared, TABLE, 0)._replace(params=params)
+    state = init_state(declared, TABLE, 0, state_shapes(declared, TABLE, only=train.only))._replace(params=params)
     new, _ = jax.jit(make_train_step(declared, TABLE, config, train))(state, random_batch(0, config))
     for (path, spec), old, moved in zip(
         declared.leaves().items(), jax.tree.leaves(params), jax.tree.leaves(new.params), strict=True

@@ -32,7 +32,7 @@ def digest(state: TrainState) -> str:
 def main(directory: str) -> None:
     model, table = make_model("ids"), make_table(40)
     batch = random_batch(0, model, BATCH, table)
-    state, found = None, []
+    state, few, found = None, None, []
     for number, sizes in enumerate(MESHES):
         config = MeshConfig(*sizes, min_shard_size=1)
         declared = declare_model(model, table, ExecutionConfig(mesh=config))
@@ -48,6 +48,17 @@ def main(directory: str) -> None:
                 _, state = checkpoints.restore(shapes)
         with Checkpoints(Path(directory) / str(number), {}) as checkpoints:
             checkpoints.save(1, state)
+        # Of a run that trains two robots alone, with moments of these.
+        some = state_shapes(declared, table, mesh, config, only=("robot_3", "robot_9"))
+        if few is None:
+            few = init_state(declared, table, 0, some)
+            moved = jax.tree.map(lambda x: x + np.cos(np.arange(x.size)).reshape(x.shape), few.opt_state.first)
+            few = few._replace(opt_state=few.opt_state._replace(first=moved))
+        else:
+            with Checkpoints(Path(directory) / f"few{number - 1}", {}) as checkpoints:
+                _, few = checkpoints.restore(some)
+        with Checkpoints(Path(directory) / f"few{number}", {}) as checkpoints:
+            checkpoints.save(1, few)
         with jax.set_mesh(mesh):
             rows = put_batch(batch, mesh)
             apply = jax.jit(
@@ -55,7 +66,9 @@ def main(directory: str) -> None:
             )
             logits = np.asarray(apply(state.params, rows))
         split = [x for x in jax.tree.leaves(state.params) if not x.sharding.is_fully_replicated]
-        found.append({"state": digest(state), "logits": logits.ravel().tolist(), "split": len(split)})
+        found.append(
+            {"state": digest(state), "few": digest(few), "logits": logits.ravel().tolist(), "split": len(split)}
+        )
     print(json.dumps(found))
 
 

@@ -1,0 +1,37 @@
+"""Checkpoints of earlier versions, with moments of everything, for runs that have them of some robots alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hma_jax.model.params import Declared, Params, is_spec
+from hma_jax.runtime.sharding import place
+from hma_jax.training.own import own_specs
+from hma_jax.training.reading import load_items, on_host, saved_shapes
+
+
+def load_trained(checkpoint: Path, shapes: Mapping[str, Any], declared: Declared, trained_E: np.ndarray) -> Any:
+    """`load_items` of a state with moments of the `trained_E` robots' own parameters alone, also from a checkpoint with
+    moments of everything, of which all robots' own are read into memory of the host."""
+    wanted = shapes["opt_state"]
+    if saved_shapes(checkpoint, "opt_state", "first") == jax.tree.map(lambda x: tuple(x.shape), wanted.first):
+        return load_items(checkpoint, shapes)
+    specs = own_specs(declared.specs, len(trained_E))
+    like = on_host(jax.tree.map(lambda spec: jax.ShapeDtypeStruct(spec.shape, np.float32), specs, is_leaf=is_spec))
+    given = {**shapes, "opt_state": wanted._replace(first=like, second=like)}
+    found = load_items(checkpoint, given, partial=True)
+
+    def taken(moment: Params, like: Params) -> Params:
+        return jax.tree.map(
+            lambda spec, x, shape: place(np.compress(trained_E, x, spec.embodiment_axis), shape.sharding),
+            specs, moment, like, is_leaf=is_spec,
+        )  # fmt: skip
+
+    state = found["opt_state"]
+    moments = taken(state.first, wanted.first), taken(state.second, wanted.second)
+    return found | {"opt_state": state._replace(first=moments[0], second=moments[1])}
