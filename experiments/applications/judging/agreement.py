@@ -16,12 +16,16 @@ import numpy as np
 from scipy.stats import rankdata
 
 from experiments.analysis.intervals import LEVEL, Interval
+from experiments.applications.judging.true_rates import draw_rates, has_one_apart, noise_of_counts, noise_of_starts
 
 DRAWS = 2000
 
 LEAST_POLICIES = 5
 """Of which intervals of correlations and rank violation over policies are known: of fewer, many resamples have one or
 two different policies, which have no order or are always in perfect order or disorder."""
+
+LEAST_STARTS = 20
+"""Of which intervals of correlations and rank violation over starts are known (`tests/stress/judged_starts.py`)."""
 
 Measure = Callable[[np.ndarray, np.ndarray], float]
 
@@ -61,26 +65,24 @@ MEASURES: dict[str, Measure] = {
     "bias": bias,
 }
 
-LOWEST = {"pearson": -1.0, "spearman": -1.0, "rank violation": 0.0, "bias": -1.0}
-"""Value that each measure cannot be below; none can be above 1."""
-
 
 @dataclass(frozen=True)
 class Agreement:
     """Measures of two worlds' success rates, with intervals over other policies of the kind and other starts."""
 
     measures: dict[str, Interval]  # of fewer than LEAST_POLICIES without the interval, but for the bias
-    over_starts: dict[str, Interval]  # of these policies, were there no end of starts: see `_to_both_sides`
+    over_starts: dict[str, Interval]  # of these policies, were there no end of starts: see `_of_true_rates`
 
 
 def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS) -> Agreement:
     """From successes bool [P, M] of P policies at the same M starts.
 
-    Intervals are of `draws` bootstrap resamples: over policies and starts their quantiles, over starts alone reaching
-    as far to both sides of the measured value. A start drawn is drawn in both worlds and for all policies. Draws in
-    which a measure is not defined are left out.
+    Intervals over policies and starts, and all of the bias, are quantiles of `draws` bootstrap resamples. A start drawn
+    is drawn in both worlds and for all policies. Draws in which a measure is not defined are left out. Over starts
+    alone correlations and rank violation are those of as many draws of true rates (`true_rates`).
     """
-    return _agree(true_PM.mean(1), lambda columns: true_PM[:, columns].mean(1), learned_PM, draws)
+    draw = lambda columns: true_PM[:, columns].mean(1)  # noqa: E731
+    return _agree(true_PM.mean(1), draw, learned_PM, draws, lambda: noise_of_starts(true_PM, learned_PM))
 
 
 def agree_with_counts(
@@ -91,31 +93,42 @@ def agree_with_counts(
     successes in n episodes (Jeffreys' prior), which leaves doubt at 0 and at n too."""
     rng, failures_P = np.random.default_rng([0, 18]), episodes_P - successes_P
     draw = lambda columns: rng.beta(successes_P + 0.5, failures_P + 0.5)  # noqa: E731
-    return _agree(successes_P / episodes_P, draw, learned_PM, draws)
+    noise = lambda: noise_of_counts(successes_P, episodes_P, learned_PM)  # noqa: E731
+    return _agree(successes_P / episodes_P, draw, learned_PM, draws, noise)
 
 
 def _agree(
-    true_P: np.ndarray, draw: Callable[[np.ndarray], np.ndarray], learned_PM: np.ndarray, draws: int
+    true_P: np.ndarray,
+    draw: Callable[[np.ndarray], np.ndarray],
+    learned_PM: np.ndarray,
+    draws: int,
+    noise: Callable[[], np.ndarray],
 ) -> Agreement:
-    """`draw` gives true rates [P] anew, where the starts drawn are `columns`."""
+    """`draw` gives true rates [P] anew, where the starts drawn are `columns`; `noise` the covariance [P, 2, 2] of the
+    errors of measured ones."""
     policies, starts = learned_PM.shape
-    drawn_measures: tuple[dict[str, list[float]], ...] = (
-        {name: [] for name in MEASURES},
-        {name: [] for name in MEASURES},
-    )
+    learned_P = learned_PM.mean(1)
+    drawn: dict[str, list[float]] = {name: [] for name in MEASURES}
+    biases = []
     for rows, columns in _resamples(policies, starts, draws):
         rates = draw(columns), learned_PM[:, columns].mean(1)
-        for kept, which in zip(drawn_measures, (rows, slice(None)), strict=True):
-            for name, measure in MEASURES.items():
-                kept[name].append(measure(rates[0][which], rates[1][which]))
-    value = {name: measure(true_P, learned_PM.mean(1)) for name, measure in MEASURES.items()}
+        biases.append(bias(*rates))
+        for name, measure in MEASURES.items():
+            drawn[name].append(measure(rates[0][rows], rates[1][rows]))
+    value = {name: measure(true_P, learned_P) for name, measure in MEASURES.items()}
     size = {"n": policies * starts, "episodes": starts}
     if policies < LEAST_POLICIES:
-        drawn_measures[0].update({name: [] for name in MEASURES if name != "bias"})
-    both, alone = (
-        {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in drawn_measures
-    )
-    return Agreement(both, {name: _to_both_sides(interval, LOWEST[name]) for name, interval in alone.items()})
+        drawn.update({name: [] for name in MEASURES if name != "bias"})
+    both = {name: _interval(value[name], np.array(found), size) for name, found in drawn.items()}
+    alone = {name: _interval(x, np.array([]), size) for name, x in value.items()}
+    if policies > 1 and starts >= LEAST_STARTS:
+        measured_P2 = np.stack([true_P, learned_P], 1)
+        rates_nP2, known = draw_rates(measured_P2, noise(), draws), set(MEASURES)
+        if has_one_apart(measured_P2):  # its correlation would be taken for the order of the others
+            known -= {"spearman"}
+        alone |= {name: _of_true_rates(alone[name], MEASURES[name], rates_nP2) for name in known}
+    # What all rates of a world have in common, and so the bias, is no part of those draws.
+    return Agreement(both, {**alone, "bias": _interval(value["bias"], np.array(biases), size)})
 
 
 def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS) -> Interval:
@@ -164,18 +177,14 @@ def _interval(value: float, drawn: np.ndarray, size: dict[str, int]) -> Interval
     return Interval(value, float(known.std(ddof=1)), float(low), float(high), **size)
 
 
-def _to_both_sides(drawn: Interval, lowest: float) -> Interval:
-    """As far to either side of the value as quantiles of resampled starts are on the side where they are further.
-
-    Measured rates have the noise of so many starts, and a resample has it twice: correlations of resamples are too low,
-    rank violations too high, while the truth lies on the other side of the value. In simulated judgements with other
-    true rates, spreads of policies and shared difficulties of starts, such intervals held the truth of 50 starts in
-    96 % (Pearson), 95 % (Spearman) and 94 % (rank violation), of 20 starts in 92, 90 and 92 %; the quantiles themselves
-    in 59, 68 and 61 % of both. Quantiles over policies too, which spread more, held it in 95 % (Pearson) where the true
-    rates of the two worlds differ.
-    """
-    furthest = max(drawn.mean - drawn.low, drawn.high - drawn.mean)
-    return dataclasses.replace(drawn, low=max(drawn.mean - furthest, lowest), high=min(drawn.mean + furthest, 1.0))
+def _of_true_rates(measured: Interval, measure: Measure, rates_nP2: np.ndarray) -> Interval:
+    """Of what is `measured` at some starts the interval over draws of the true rates; it reaches to what was measured,
+    which noise may have put beyond all of them."""
+    if not math.isfinite(measured.mean):
+        return measured
+    size = {"n": measured.n, "episodes": measured.episodes}
+    drawn = _interval(measured.mean, np.array([measure(*rates.T) for rates in rates_nP2]), size)
+    return dataclasses.replace(drawn, low=min(drawn.low, drawn.mean), high=min(max(drawn.high, drawn.mean), 1.0))
 
 
 def rate_interval(successes: np.ndarray) -> Interval:

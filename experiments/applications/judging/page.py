@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
-from experiments.applications.judging.agreement import LEAST_POLICIES, count_interval
+from experiments.applications.judging.agreement import LEAST_POLICIES, LEAST_STARTS, count_interval
 from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
 from experiments.applications.judging.recordings import LAST
@@ -159,7 +159,13 @@ def write_page(judged: Judgement, summary: dict[str, Any], out: Path, command: s
 def _doubts(summary: dict[str, Any]) -> list[str]:
     return [
         f"<p><b>{html.escape(warning)}</b></p>"
-        for warning in (describe_control(summary), describe_clipping(summary), describe_few_policies(summary))
+        for warning in (
+            describe_control(summary),
+            describe_clipping(summary),
+            describe_few_policies(summary),
+            describe_few_starts(summary),
+            describe_one_apart(summary),
+        )
         if warning
     ]
 
@@ -186,8 +192,8 @@ def _agreement(summary: dict[str, Any]) -> str:
         return section(
             "Agreement with the real robot",
             heading,
-            f"<p>Over the {len(_compared(summary))} policies with counts of the robot. Intervals over starts resample those "
-            "of the model and draw the robot's rates from what its counts tell of them.</p>",
+            f"<p>Over the {len(_compared(summary))} policies with counts of the robot, whose rates are known as well as these "
+            "counts tell.</p>",
         )
     return section(
         "Agreement with the true simulator",
@@ -240,6 +246,30 @@ def describe_few_policies(summary: dict[str, Any]) -> str:
     return (
         f"Only {len(compared)} policies are compared: how well they are told apart says little about others. Correlations and "
         f"rank violation have an interval over other policies from {LEAST_POLICIES} on, correlations a value from 3."
+    )
+
+
+def describe_few_starts(summary: dict[str, Any]) -> str:
+    """Why there are no intervals over starts; "" where there are, or nothing is compared."""
+    if not summary["compared with"] or summary["starts"] >= LEAST_STARTS:
+        return ""
+    return (
+        f"Correlations and rank violation have an interval over other starts from {LEAST_STARTS} starts on; these are "
+        f"{summary['starts']}."
+    )
+
+
+def describe_one_apart(summary: dict[str, Any]) -> str:
+    """Why Spearman's correlation has no interval over starts where only it has none; "" elsewhere."""
+    if summary["starts"] < LEAST_STARTS:
+        return ""
+    spearmans = {name: agreed["starts"]["spearman"] for name, agreed in summary["agreement"].items()}
+    without = [name for name, x in spearmans.items() if x["mean"] is not None and x["low"] is None]
+    if not without:
+        return ""
+    return (
+        f"Over other starts Spearman's correlation has no interval in: {', '.join(without)}. There the rate of one policy is "
+        "far from all others, and would be taken for their order."
     )
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from experiments.applications.judging.agreement import (
     LEAST_POLICIES,
+    LEAST_STARTS,
     MEASURES,
     agree,
     agree_with_counts,
@@ -17,6 +18,7 @@ from experiments.applications.judging.agreement import (
     spearman,
 )
 from experiments.applications.judging.head import auroc
+from experiments.applications.judging.page import describe_few_starts, describe_one_apart
 
 
 def test_measures_of_known_cases():
@@ -43,16 +45,55 @@ def test_a_faithful_world_has_a_high_interval_and_one_without_relation_has_none(
     assert (starts.mean, starts.low, starts.high) == (0, 0, 0)
 
 
-def test_intervals_over_starts_hold_what_more_starts_would_show():
-    """Resamples have the noise of the starts twice: their quantiles held the truth in less than half of these."""
+@pytest.mark.parametrize(("least", "most"), [(0.05, 0.95), (0.4, 0.6)])
+def test_intervals_over_starts_hold_what_more_starts_would_show(least, most):
+    """Resamples have the noise of the starts twice. Where true rates differ by little more than it, intervals around
+    the measured value missed half of the correlations of such faithful worlds, all of them above."""
     rng, held = np.random.default_rng(0), {"pearson": 0, "spearman": 0, "rank violation": 0}
     for _ in range(24):
-        true, noise = rng.uniform(0.05, 0.95, (2, 8))
+        true, noise = rng.uniform(least, most, (2, 8))
         rates = true, 0.9 * true + 0.1 * noise
-        found = agree(*(rng.random((8, 30)) < rate[:, None] for rate in rates), draws=60).over_starts
+        found = agree(*(rng.random((8, 30)) < rate[:, None] for rate in rates), draws=100).over_starts
         for name in held:
             held[name] += found[name].low <= MEASURES[name](*rates) <= found[name].high
     assert min(held.values()) >= 20, held
+
+
+def test_starts_that_worlds_share_make_no_correlation_of_policies_that_are_alike():
+    """A start that is hard in both worlds, and one that a policy fails in both, are not a matter of its true rate."""
+    rng, intervals = np.random.default_rng(0), []
+    for _ in range(8):
+        true = rng.random((8, 30)) < 0.5
+        learned = np.where(rng.random((8, 30)) < 0.8, true, rng.random((8, 30)) < 0.5)
+        found = agree(true, learned, draws=100).over_starts["pearson"]
+        intervals.append((found.mean, found.low))
+    means, lows = np.array(intervals).T
+    assert means.min() > 0.4 and sum(lows < 0) >= 7
+
+
+def test_too_few_starts_have_no_interval_over_starts_but_of_the_bias():
+    rng = np.random.default_rng(0)
+    for starts, known in ((LEAST_STARTS - 1, False), (LEAST_STARTS, True)):
+        found = agree(*(rng.random((2, 8, starts)) < np.linspace(0.1, 0.9, 8)[:, None]), draws=50).over_starts
+        assert {np.isfinite(found[name].low) for name in MEASURES if name != "bias"} == {known}
+        assert np.isfinite(found["bias"].low)
+
+
+def test_one_policy_that_is_far_from_others_does_not_stand_for_their_order():
+    """Of ten that are alike and one that is worse in both worlds, which have no more in common, Pearson's is high."""
+    rng, rates = np.random.default_rng(0), np.array([0.2] + 10 * [0.9])
+    found = agree(*(rng.random((2, 11, 50)) < rates[:, None]), draws=100).over_starts
+    assert found["pearson"].low > 0.5 and np.isfinite(found["rank violation"].low)
+    assert np.isfinite(found["spearman"].mean) and np.isnan(found["spearman"].low)
+
+
+def test_the_page_says_why_there_is_no_interval_over_starts():
+    without, known = {"mean": 0.5, "low": None, "high": None}, {"mean": 0.5, "low": 0.1, "high": 0.9}
+    for starts, spearmans, few, apart in ((LEAST_STARTS - 1, without, True, False), (LEAST_STARTS, without, False, True),
+                                          (LEAST_STARTS, known, False, False)):  # fmt: skip
+        agreed = {"learned model": {"starts": {"spearman": spearmans}}}
+        summary = {"starts": starts, "compared with": "true, by state", "agreement": agreed}
+        assert (describe_few_starts(summary) != "", describe_one_apart(summary) != "") == (few, apart)
 
 
 def test_few_policies_have_no_interval_over_policies_and_two_no_correlation():
