@@ -121,13 +121,13 @@ class _Stream:
     episodes: np.ndarray  # int64, those of the split
     seed: int
 
-    def read(self, i: int, draws: np.ndarray, size: int) -> list[np.ndarray]:
+    def read(self, i: int, draws: np.ndarray) -> list[np.ndarray]:
         """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `EpisodeSource.frames`."""
         at = self._drawn(i)
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
             try:
-                return self.source.frames(episode, self.spec.image_key, lambda n: (draws % n).tolist(), size)
+                return self.source.frames(episode, self.spec.image_key, lambda n: (draws % n).tolist())
             except EpisodeError as error:
                 self.source.skip(episode, error)
         raise DataError(f"{self.source.name}: none of its {len(self.episodes)} episodes can be read")
@@ -165,7 +165,7 @@ class _Batches:
         frames = np.empty((self.batch, self.size, self.size, 3), np.uint8)
         row = 0
         for d, i, drawn in zip(streams.tolist(), positions.tolist(), draws, strict=True):
-            for image in self.streams[d].read(i, drawn, self.size):
+            for image in self.streams[d].read(i, drawn):
                 frames[row] = self.streams[d].spec.correct(fit_image(image, self.size))
                 row += 1
         return frames

@@ -82,11 +82,9 @@ class JoinedSource(EpisodeSource):
         with part.open_episode(own, image_key, action_keys) as episode:
             yield replace(episode, index=i)
 
-    def frames(
-        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
-    ) -> list[np.ndarray]:
+    def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
         part, own = self._part(i)
-        return part.frames(own, image_key, choose, at_least)
+        return part.frames(own, image_key, choose)
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         part, own = self._part(i)

@@ -112,9 +112,7 @@ class LeRobotDataset(EpisodeSource):
         with self._open(i, image_key, action_keys, with_success=self._read.layout.knows_success) as episode:
             yield episode
 
-    def frames(
-        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
-    ) -> list[np.ndarray]:
+    def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
         """As `EpisodeSource.frames`; those of a video are read without the episode's table."""
         with self._open(i, image_key, (), with_success=False) as episode:
             return episode.images(choose)

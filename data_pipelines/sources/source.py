@@ -187,13 +187,9 @@ class EpisodeSource(ABC):
             images = [episode.image(t) for t in range(0, episode.steps, frame_step)]
             return RawEpisode(i, images, episode.actions, episode.success)
 
-    def frames(
-        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
-    ) -> list[np.ndarray]:
-        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers.
-
-        Images may be decoded at a reduced size, with no side shorter than `at_least` pixels, where that saves time.
-        """
+    def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
+        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers. They are those that
+        `open_episode` decodes."""
         with self.open_episode(i, image_key, ()) as episode:
             return episode.images(choose)
 
@@ -239,15 +235,15 @@ def find_instruction(record: Mapping[str, Any]) -> str:
     return text.decode(errors="replace")
 
 
-def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception], at_least: int = 0) -> np.ndarray:
-    """uint8 [H, W, 3] of a frame as its source holds it; `at_least` as in `decode_image`.
+def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception]) -> np.ndarray:
+    """uint8 [H, W, 3] of a frame as its source holds it.
 
     Raises what `unusable` makes of a reason, for bytes that are no image.
     """
     if isinstance(frame, np.ndarray):
         return frame
     try:
-        return decode_image(frame, at_least)
+        return decode_image(frame)
     except ValueError as error:
         raise unusable(f"cannot be decoded: {error}") from error
 

@@ -57,6 +57,10 @@ are imported when a dataset needs them."""
 
 TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
 
+FRAMES, ENCODED, SHRUNK = "frames", "those that are encoded", "JPEG images of RLDS shrunk while they were decoded"
+"""Recorded: on which frames a tokenizer was trained and judged. Earlier versions, which record none, took smaller ones
+where a decoder could make them, by another filter than that of the frames that are encoded."""
+
 
 def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     """What the tokenizer of a study is trained from, under the names that --set has for it.
@@ -85,7 +89,8 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
         "datasets": list(data),
         "data": data,
     }
-    return MadeFrom(inputs, {"code": closure_hash(trace(SOURCES))}, describe_machine())
+    recorded = {"code": closure_hash(trace(SOURCES)), FRAMES: ENCODED}
+    return MadeFrom(inputs, recorded, describe_machine())
 
 
 def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None) -> None:
@@ -158,7 +163,7 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     require_same("tokenizer", place, lines, replace, f"use it unchanged with --tokenizer {place}")
     if lines:
         return False
-    say_recorded("the tokenizer", place, existing.recorded, made_from.recorded)
+    say_recorded("the tokenizer", place, {FRAMES: SHRUNK} | existing.recorded, made_from.recorded)
     console.print("[green]done[/] train the tokenizer [dim](before)[/]")
     return True
 

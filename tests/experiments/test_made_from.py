@@ -264,6 +264,7 @@ def test_a_stamp_of_an_earlier_version_is_read_in_place(hma, out):
     before = contents(out)
     code, said = hma("tokenize")
     assert code == 0 and "other code" not in said and contents(out) == before
+    assert "made with other frames: 'JPEG images of RLDS shrunk while they were decoded' -> 'those that are" in said
     code, said = hma("tokenize", "--set", "tau=2")
     assert code == 2 and "\n  tau: 3.0 -> 2.0" in said and contents(out) == before
 
@@ -434,6 +435,8 @@ def test_the_stamp_holds_the_inputs(made):
     stamp = json.loads((made[0] / "tokenizer" / STAMP).read_text())
     assert stamp["inputs"]["tokenizer_train"]["steps"] == 5
     assert stamp["inputs"]["datasets"] == [ARM.name, "dlr_edan_shared_control_converted_externally_to_rlds"]
-    assert stamp["inputs"]["tau"] == 3.0 and set(stamp["recorded"]) == {"code"} and "commit" in stamp["machine"]
+    assert (
+        stamp["inputs"]["tau"] == 3.0 and set(stamp["recorded"]) == {"code", "frames"} and "commit" in stamp["machine"]
+    )
     assert stamp["inputs"]["data"][ARM.name]["image_key"] == ARM.image_key
     assert BASE.name not in stamp["inputs"]["data"]

@@ -148,13 +148,9 @@ class RldsDataset(EpisodeSource):
                 lambda step, data: self._image(i, image_key, step, data),
             )
 
-    def frames(
-        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
-    ) -> list[np.ndarray]:
-        """As `EpisodeSource.frames`; JPEG images may come smaller, see `decode_image`.
-
-        A record is read and verified as a whole once, and the spans of its frames are cached. While they are, only
-        the chosen frames are read, from a file that stays open (see `OpenFiles`).
+    def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
+        """As `EpisodeSource.frames`. A record is read and verified as a whole once, and the spans of its frames are
+        cached. While they are, only the chosen frames are read, from a file that stays open (see `OpenFiles`).
         """
         key = step_key(image_key)
         known = self._span_cache.get((i, key))
@@ -170,7 +166,7 @@ class RldsDataset(EpisodeSource):
                 parts = [encoded[t] for t in chosen]
                 if not self._in_array_records and not is_remote(self.directory):
                     self._span_cache.put((i, key), encoded.spans)
-        return [self._image(i, key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
+        return [self._image(i, key, t, data) for t, data in zip(chosen, parts, strict=True)]
 
     def record(self, i: int, keys: Sequence[str] | None = None) -> dict[str, Feature]:
         """The flat features of episode `i`, as `example.parse_example` gives them."""
@@ -237,6 +233,6 @@ class RldsDataset(EpisodeSource):
         self._steps[i] = len(encoded)
         return encoded
 
-    def _image(self, i: int, key: str, step: int, data: bytes, at_least: int = 0) -> np.ndarray:
+    def _image(self, i: int, key: str, step: int, data: bytes) -> np.ndarray:
         advice = "Repair the episode, or read with corrupt='skip'."
-        return decode_frame(data, lambda what: self._unusable(i, f"step {step} of {key!r} {what}. {advice}"), at_least)
+        return decode_frame(data, lambda what: self._unusable(i, f"step {step} of {key!r} {what}. {advice}"))

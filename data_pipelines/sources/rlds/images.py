@@ -15,17 +15,17 @@ MAX_PIXELS = 2**25
 """Pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can claim billions."""
 
 
-def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
+def decode_image(data: bytes) -> np.ndarray:
     """uint8 [H, W, 3] from JPEG or PNG bytes (grey images become RGB, alpha is dropped).
 
     The fast DCT is the default of TensorFlow's decoder, so pixels equal those of RLDS pipelines built on
-    TensorFlow. With `at_least`, a JPEG image may be decoded at a reduced size, as its coefficients allow, with no
-    side shorter than that: decoding an image that is resized anyway then takes half the time.
+    TensorFlow. Every image is decoded at its own size: libjpeg could shrink one at half the cost, but by another filter
+    than `fit_image`, and a tokenizer would be trained on other frames than it encodes.
     Raises ValueError if the bytes are no image, one of more than MAX_PIXELS, or one of depths.
     """
     if data.startswith(JPEG_MAGIC):
         _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
-        return simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=True, min_height=at_least, min_width=at_least)
+        return simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=True)
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             _check_pixels(data, *image.size)

@@ -14,9 +14,11 @@ from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles
+from data_pipelines.sources.rlds.writer import encode_jpeg
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
-from tests.data_pipelines.fakes import REAL_DATA, count_open, make_spec, write_rlds
+from tests.data_pipelines.fakes import REAL_DATA, FakeTokenizer, count_open, make_spec, write_rlds
 
 SPEC = make_spec()
 
@@ -43,6 +45,34 @@ def test_frames_are_corrected_as_the_entry_says(rlds):
         take([(spec, rlds)], 1) for spec in (SPEC, replace(SPEC, image_corrections=("swap_red_blue",)))
     )
     assert plain.any() and np.array_equal(swapped, plain[..., ::-1])
+
+
+class Wide(FakeTokenizer):
+    """Of images four times as wide as the others', and it keeps what it encodes."""
+
+    image_size = 32
+
+    def __init__(self):
+        super().__init__()
+        self.seen: list[bytes] = []
+
+    def encode(self, images):
+        self.seen += [image.tobytes() for image in images]
+        return super().encode(images[:, ::4, ::4])
+
+
+def test_a_tokenizer_is_trained_on_the_frames_that_it_will_encode(tmp_path):
+    """JPEG images of twice its size, which a decoder can shrink by itself: then another filter has made them."""
+    rng, spec, tokenizer = np.random.default_rng(0), replace(SPEC, image_corrections=("swap_red_blue",)), Wide()
+
+    def draw(_, features):
+        pictures = rng.integers(0, 256, (5, 64, 64, 3), np.uint8)
+        features["steps/observation/image"] = [encode_jpeg(picture) for picture in pictures]
+
+    rlds = write_rlds(tmp_path, spec, [5] * 4, change=draw)
+    tokenize_dataset(spec, rlds, tokenizer, tmp_path / "store", rate=None)
+    frames = next(make_frame_loader([(spec, rlds)], tokenizer.image_size, 16, seed=1))
+    assert all(frame.tobytes() in tokenizer.seen for frame in frames)
 
 
 def test_splits_share_no_episode_and_cover_all_frames(rlds):
