@@ -18,7 +18,8 @@ from hma_jax.config import AnyTokenizerConfig, TokenizerConfig
 SIMULATED = 3000.0
 """Native frames of the suite that two cores simulate, draw and write in a second."""
 DECODED = 1500.0
-"""Frames that a core reads, decodes in full and resizes in a second, to train a tokenizer on or to encode."""
+"""Frames that a core reads, decodes in full and resizes in a second, to train a tokenizer on or to encode. Several
+share this work (`decoding_threads`), but the machine that plans it may be another than the one that does it."""
 LARGE_PRODUCTS = 3.0
 """How many times the FLOPs of a small world model a tokenizer computes in a second: its products are larger, and it
 has all cores."""

@@ -24,7 +24,7 @@ from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, V
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.open import open_source
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import decoding_threads, fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
 from hma_jax.config import require
@@ -50,12 +50,13 @@ def make_frame_loader(
     split: Literal["train", "val"] = "train",
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: float = MAX_SKIPPED,
-    threads: int = 2,
+    threads: int | None = None,
 ) -> FrameLoader:
     """Endless batches of frames, uint8 [B, image_size, image_size, 3].
 
     Datasets are drawn with p ∝ episodes^(1/tau), episodes and frames within them uniformly.
-    Held-out episodes are those that the token store holds out under the same fractions.
+    Held-out episodes are those that the token store holds out under the same fractions. `threads` (default: as many as
+    cores, up to 8) read and decode; they change no frame.
     Raises ConfigError and DataError as `open_source` does.
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
@@ -85,6 +86,7 @@ def make_frame_loader(
     group = math.gcd(batch, FRAMES_PER_READ)
     draws = Draws(mixture.weights, f"frames/{split}/{seed}")
     batches = _Batches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)
+    threads = decoding_threads() if threads is None else threads
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, PREFETCH_BATCHES))
     iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})

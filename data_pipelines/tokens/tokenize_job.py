@@ -23,7 +23,7 @@ from data_pipelines.errors import EpisodeError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, held_out_episodes
 from data_pipelines.sources.open import open_source
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import decoding_threads, fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
 from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.encoder import Encoder
@@ -41,7 +41,6 @@ from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
 from data_pipelines.tokens.turns import TurnWatch
 from hma_jax.config import require
-from hma_jax.runtime.cores import usable_cores
 
 if TYPE_CHECKING:
     from data_pipelines.sources.joined import Parts
@@ -95,7 +94,7 @@ def tokenize_dataset(
         max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
     )  # fmt: skip
     watch = TurnWatch(spec, warn or (lambda _: None))
-    work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8), watch)
+    work = _Work(source, plan, tokenizer, batch, threads or decoding_threads(), watch)
     skipped = [
         SkippedEpisodes(source.without_location(reason), episodes=count)
         for reason, count in sorted(source.skipped.items())

@@ -40,7 +40,7 @@ def prepare(
 
     `data` are directories of the user's datasets; () simulates the suite. Instead of training one, a trained
     `tokenizer` is taken from its directory. What follows from `replace` on may be made again in its place. `batch` and
-    `threads` as in `make_store`. Raises ConfigError or DataError.
+    `threads` as in `make_store`; a tokenizer is trained with as many threads. Raises ConfigError or DataError.
     """
     require_plain(workspace.root)
     if study.eval.lpips:
@@ -51,7 +51,7 @@ def prepare(
     if not workspace.manifest.exists():  # else all is known
         say_short_episodes(study, sources)
     if tokenizer is None:
-        make_tokenizer(study, workspace, sources, replace)
+        make_tokenizer(study, workspace, sources, replace, threads=threads)
     else:
         adopt_tokenizer(tokenizer, study, workspace, sources, replace)
     make_store(study, workspace, sources, replace=replace, batch=batch, threads=threads)

@@ -93,11 +93,18 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     return MadeFrom(inputs, recorded, describe_machine())
 
 
-def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None) -> None:
+def make_tokenizer(
+    study: Study,
+    workspace: Workspace,
+    sources: Sequence[Source],
+    replace: Step | None = None,
+    *,
+    threads: int | None = None,
+) -> None:
     """A tokenizer trained on frames of all sources; nothing is done if it is there.
 
-    Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there
-    that was made from other inputs, unless `replace` allows it.
+    Beside it lies quality.json: its reconstruction PSNR on held-out frames. `threads` as in `make_frame_loader`. Raises
+    ConfigError if one is there that was made from other inputs, unless `replace` allows it.
     """
     from data_pipelines.loading.frames import make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
@@ -117,7 +124,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
             **{name: getattr(settings, name) for name in HELD_OUT},
-            corrupt=settings.corrupt, max_skipped=settings.max_skipped,
+            corrupt=settings.corrupt, max_skipped=settings.max_skipped, threads=threads,
         )  # fmt: skip
 
     held_out = frames(0, "val")  # raises before hours of training if there are none

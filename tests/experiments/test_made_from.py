@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from data_pipelines.loading import frames
 from data_pipelines.registry import get_spec, register
 from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
@@ -213,6 +214,19 @@ def test_no_dataset_is_opened_for_a_given_tokenizer_that_knows_none_of_them(made
     monkeypatch.setattr(tokenizer_step, "open_source", lambda *_: pytest.fail("opened"))
     tokenizer_step.adopt_tokenizer(tokenizer, setting.study, setting.workspace, found)
     assert setting.workspace.tokenizer.is_dir()
+
+
+def test_threads_of_tokenising_train_the_tokenizer_too(made, tmp_path, monkeypatch):
+    def look(*_, threads, **__):
+        raise Stopped(threads)
+
+    monkeypatch.setattr(frames, "make_frame_loader", look)
+    with pytest.raises(Stopped, match="5"):
+        main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), *made[1], "--threads", "5"])
+
+
+class Stopped(Exception):
+    pass
 
 
 def test_the_tokenizer_that_is_there_can_be_given(hma, out):

@@ -9,10 +9,21 @@ import numpy as np
 import simplejpeg
 from PIL import Image, UnidentifiedImageError
 
+from hma_jax.runtime.cores import usable_cores
+
 JPEG_MAGIC, PNG_MAGIC = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
 MAX_PIXELS = 2**25
 """Pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can claim billions."""
+
+
+MAX_THREADS = 8
+"""Threads that decode frames, unless a user asks for more."""
+
+
+def decoding_threads() -> int:
+    """As many as there are cores, up to MAX_THREADS: decoding is outside the interpreter's lock."""
+    return min(usable_cores(), MAX_THREADS)
 
 
 def decode_image(data: bytes) -> np.ndarray:

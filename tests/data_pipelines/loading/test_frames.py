@@ -4,6 +4,7 @@ import hashlib
 import itertools
 from dataclasses import replace
 
+import grain
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import get_spec
 from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import describe
+from data_pipelines.sources.rlds import images
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles
 from data_pipelines.sources.rlds.writer import encode_jpeg
@@ -123,6 +125,16 @@ def test_number_of_threads_changes_no_frame(tmp_path, rlds):
     alone = take(datasets, 12, threads=0)
     for threads in (1, 3, 9):
         assert np.array_equal(take(datasets, 12, threads=threads), alone)
+
+
+@pytest.mark.parametrize(("cores", "threads"), [(1, 1), (5, 5), (64, 8)])
+def test_as_many_threads_decode_as_there_are_cores_up_to_eight(cores, threads, rlds, monkeypatch):
+    """There were two on every machine, which a GPU waited for."""
+    asked, make = [], grain.ReadOptions
+    monkeypatch.setattr(grain, "ReadOptions", lambda **options: asked.append(options) or make(**options))
+    monkeypatch.setattr(images, "usable_cores", lambda: cores)
+    take([(SPEC, rlds)], 1)
+    assert [options["num_threads"] for options in asked] == [threads]
 
 
 def test_order_does_not_change_between_releases(tmp_path, rlds):
