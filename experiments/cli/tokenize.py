@@ -76,9 +76,9 @@ def prepare_together(
 def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
     """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
     from experiments.preparing.asked import require_same_asked
+    from experiments.preparing.given_tokenizer import require_same_tokenizer
     from experiments.preparing.sources import find_sources, find_suite
     from experiments.preparing.store import make_store
-    from experiments.preparing.tokenizer import require_same_tokenizer
     from experiments.preparing.windows import require_same_windows
 
     study, workspace = setting.study, setting.workspace
@@ -104,7 +104,7 @@ def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | N
 def _freeze(setting: Setting, sources: Sequence[Source]) -> None:
     """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
     from data_pipelines.publishing.output_lock import backoff
-    from experiments.preparing.tokenizer import adopt_tokenizer
+    from experiments.preparing.given_tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
     study, workspace, announced = setting.study, setting.workspace, False

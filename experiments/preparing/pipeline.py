@@ -13,11 +13,12 @@ from pathlib import Path
 
 from experiments.preparing.asked import write_asked
 from experiments.preparing.counterfactual import make_counterfactual
+from experiments.preparing.given_tokenizer import adopt_tokenizer
 from experiments.preparing.made_from import Step
 from experiments.preparing.sources import find_sources, say_short_episodes
 from experiments.preparing.store import make_store
 from experiments.preparing.suite import make_suite
-from experiments.preparing.tokenizer import adopt_tokenizer, make_tokenizer
+from experiments.preparing.tokenizer import make_tokenizer
 from experiments.preparing.windows import freeze_windows, require_same_windows
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace

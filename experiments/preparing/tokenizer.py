@@ -1,12 +1,10 @@
-"""The tokenizer of a study: trained on its datasets, or one that is given."""
+"""The tokenizer of a study, trained on its datasets; `given_tokenizer` has those that are not."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import json
-import math
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,14 +23,14 @@ from experiments.preparing.made_from import (
     say_recorded,
 )
 from experiments.preparing.sources import Source, open_source
-from experiments.progress import console, say, step
+from experiments.progress import console, step
 from experiments.running.closure import closure_hash, trace
 from experiments.running.machine import describe_machine
 from experiments.running.run_options import CHECKPOINTS
 from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.words import few, plus_minus
-from hma_jax.config import ConfigError, TokenizerConfig, require
+from experiments.words import plus_minus
+from hma_jax.config import TokenizerConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.runtime.files import write_file
 
@@ -55,7 +53,8 @@ SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames", "data_pi
 """The modules that train it; what they import follows (`running.closure`), of these three in functions as well: readers
 are imported when a dataset needs them."""
 
-TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
+TRAINED = "trained here"
+"""The origin of a tokenizer that was not given."""
 
 FRAMES, ENCODED, SHRUNK = "frames", "those that are encoded", "JPEG images of RLDS shrunk while they were decoded"
 """Recorded: on which frames a tokenizer was trained and judged. Earlier versions, which record none, took smaller ones
@@ -143,15 +142,9 @@ def make_tokenizer(
     publish(aside, workspace.tokenizer)
 
 
-def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """Raises ConfigError if the workspace has another tokenizer than the one that is given by its directory `source`
-    or, without, than the study would train."""
-    from hma_jax.tokenizers.io import load_tokenizer
-
-    if source is None:
-        _in_place(workspace.tokenizer, tokenizer_made_from(study, _seen(study, sources)), None)
-    else:
-        _adopted(load_tokenizer(source, expect=study.tokenizer), source, workspace, None)
+def require_same_trained(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
+    """Raises ConfigError if the workspace has another tokenizer than the study would train."""
+    _in_place(workspace.tokenizer, tokenizer_made_from(study, _seen(study, sources)), None)
 
 
 def _seen(study: Study, sources: Sequence[Source]) -> list[Source]:
@@ -173,85 +166,6 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     say_recorded("the tokenizer", place, {FRAMES: SHRUNK} | existing.recorded, made_from.recorded)
     console.print("[green]done[/] train the tokenizer [dim](before)[/]")
     return True
-
-
-def adopt_tokenizer(
-    source: Path, study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
-) -> None:
-    """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already. A note says
-    of which `sources` it may know held-out frames.
-
-    Raises ConfigError if it is not the kind that the study is made for, or if another one is there, unless
-    `replace` allows it.
-    """
-    from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
-
-    tokenizer = load_tokenizer(source, expect=study.tokenizer)
-    if _adopted(tokenizer, source, workspace, replace):
-        return
-    _say_held_out_elsewhere(read_stamp(source), study, sources)
-    aside = workspace.root / "tokenizer.adopted"
-    shutil.rmtree(aside, ignore_errors=True)
-    save_tokenizer(tokenizer, aside)
-    _given(tokenizer).save(aside)
-    publish(aside, workspace.tokenizer)
-
-
-def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: Step | None) -> bool:
-    """Whether the tokenizer that is given, by its directory `source`, is there. ConfigError if another one is, unless
-    allowed."""
-    from hma_jax.tokenizers.io import load_tokenizer
-
-    place = workspace.tokenizer
-    if not place.exists():
-        return False
-    existing = read_stamp(place)
-    if existing == _given(tokenizer):
-        return True
-    try:
-        identity = load_tokenizer(place).identity
-    except ConfigError as error:
-        lines = [str(error)]
-    else:
-        if identity == tokenizer.identity:  # trained here, or the very directory that is given
-            return True
-        origin = existing.inputs[ORIGIN] if existing else "not written down"
-        lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
-    require_same("tokenizer", place, lines, replace)
-    return False
-
-
-def _given(tokenizer: Tokenizer) -> MadeFrom:
-    return MadeFrom({ORIGIN: f"{GIVEN} {tokenizer.identity}"})
-
-
-def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study, sources: Sequence[Source]) -> None:
-    """Of a tokenizer that was trained on datasets of the study with fewer episodes held out (those are among these), or
-    as they were before they grew: the hold-out is drawn among all episodes of a dataset."""
-    inputs = trained_from.inputs if trained_from is not None else {}
-    trained_with, study_settings = inputs.get("store", {}), to_dict(study.store)
-    more = [
-        f"store.{name}: {trained_with[name]} -> {study_settings[name]}"
-        for name in HELD_OUT
-        if study_settings[name] > trained_with.get(name, math.inf)
-    ]
-    names = [name for name in study.all_names() if name in inputs.get("data", {})]
-    if names and more:
-        say(
-            f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it "
-            "may have been trained on frames that are held out here"
-        )
-    shards = {name: facts["shards"] for name, facts in inputs.get("data", {}).items() if facts.get("shards")}
-    changed = [
-        spec.name
-        for spec, path in sources
-        if spec.name in shards and shards[spec.name] != open_source((spec, path), study.store).fingerprint()
-    ]
-    if changed:
-        say(
-            f"note: the tokenizer was trained on other recordings of {few(changed)}: unless they only `joins` more "
-            "directories now, it may have been trained on frames that are held out here"
-        )
 
 
 def reconstruction_psnr(tokenizer: Tokenizer, frames: FrameLoader) -> Stat:

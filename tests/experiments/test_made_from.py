@@ -1,7 +1,6 @@
 """What was made with other settings or data is refused and stays, byte for byte, until it is asked for."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
 from data_pipelines.windows.evalset import ChoiceSettings, DatasetWindows, EvalManifest
 from experiments.cli.main import main
+from experiments.preparing import given_tokenizer
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import (
     OLD_STAMP,
@@ -184,24 +184,64 @@ def test_a_tokenizer_that_is_given_does_not_replace_one_that_was_trained(hma, ou
 
 
 @pytest.mark.parametrize(
-    ("min_val", "grown", "told"),
+    ("min_val", "fact", "before", "told"),
     [
-        (1, False, None),
-        (2, False, None),
-        (3, False, " with fewer episodes held out (store.min_val: 2 -> 3): it may have been trained on frames"),
-        (2, True, "the tokenizer was trained on other recordings of "),
+        (1, None, None, None),
+        (2, None, None, None),
+        (3, None, None, " with fewer episodes held out (store.min_val: 2 -> 3): it may have been trained on frames"),
+        (2, "shards", "fewer", "the tokenizer was trained on other recordings of "),
+        (2, "split", "all", " with other episodes held out (split: 'all' -> 'train'): it may have been trained on"),
+        (2, "val_split", "val", " with other episodes held out (val_split: 'val' -> ''): it may have been trained on"),
     ],
 )
-def test_a_given_tokenizer_that_may_have_seen_what_is_held_out_is_told(min_val, grown, told, made, tmp_path, capsys):
+def test_a_given_tokenizer_that_may_have_seen_what_is_held_out_is_told(
+    min_val, fact, before, told, made, tmp_path, capsys
+):
     there, data = made
     tokenizer = shutil.copytree(there / "tokenizer", tmp_path / "tokenizer")
-    if grown:  # since it was trained
-        stamp = tokenizer / "made_from.json"
-        stamp.write_text(re.sub(r'"shards": "\w+"', '"shards": "fewer"', stamp.read_text()))
+    if fact:  # was another when it was trained
+        stamp = json.loads((tokenizer / STAMP).read_text())
+        for facts in stamp["inputs"]["data"].values():
+            facts[fact] = before
+        (tokenizer / STAMP).write_text(json.dumps(stamp))
     given = ["--tokenizer", str(tokenizer), "--set", f"store.min_val={min_val}"]
     assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "new"), *data, *given]) == 0
     said = capsys.readouterr().out
-    assert ("frames that are held out here" in said) == bool(told) and (told or "") in said
+    assert said.count("frames that are held out here") == bool(told) and (told or "") in said
+
+
+def test_a_given_tokenizer_that_was_trained_on_unseen_robots_is_told(made, tmp_path, capsys):
+    there, data = made
+    study = ["--set", f"unseen={ARM.name}", "--set", "datasets=dlr_edan_shared_control_converted_externally_to_rlds"]
+    given = ["--tokenizer", str(there / "tokenizer"), *study]
+    assert main(["tokenize", *SMOKE, "--out", str(tmp_path), *data, *given]) == 0
+    assert f"was trained on frames of {ARM.name}, which `unseen` names" in capsys.readouterr().out
+
+
+def test_the_copy_of_a_copy_of_a_tokenizer_still_says_what_it_was_trained_from(made, tmp_path, capsys):
+    there, data = made
+    trained, tokenizer = read_stamp(there / "tokenizer"), there / "tokenizer"
+    for name in ("first", "second"):
+        given = ["--tokenizer", str(tokenizer), "--set", "store.min_val=3"]
+        assert main(["tokenize", *SMOKE, "--out", str(tmp_path / name), *data, *given]) == 0
+        assert "frames that are held out here" in capsys.readouterr().out
+        tokenizer = tmp_path / name / "tokenizer"
+        copied = read_stamp(tokenizer)
+        assert copied.inputs["origin"].startswith("given") and copied.inputs["trained_from"] == trained.inputs
+        assert (copied.recorded, copied.machine) == (trained.recorded, trained.machine)
+
+
+def test_a_copy_that_an_earlier_version_made_stays_in_use(made, tmp_path):
+    """Its stamp has the origin alone."""
+    there, data = made
+    given = ["--tokenizer", str(there / "tokenizer")]
+    assert main(["tokenize", *SMOKE, "--out", str(tmp_path), *data, *given]) == 0
+    stamp = tmp_path / "tokenizer" / STAMP
+    origin = json.loads(stamp.read_text())["inputs"]["origin"]
+    stamp.write_text(json.dumps({"inputs": {"origin": origin}, "recorded": {}, "machine": {}}))
+    before = contents(tmp_path)
+    assert main(["tokenize", *SMOKE, "--out", str(tmp_path), *data, *given]) == 0
+    assert contents(tmp_path) == before
 
 
 def test_no_dataset_is_opened_for_a_given_tokenizer_that_knows_none_of_them(made, tmp_path, monkeypatch):
@@ -211,8 +251,8 @@ def test_no_dataset_is_opened_for_a_given_tokenizer_that_knows_none_of_them(made
     (tokenizer / STAMP).unlink()
     setting = make_setting(StudyArguments("smoke", tmp_path / "new", tuple(data[1:])))
     found = find_sources(setting.study, setting.data)
-    monkeypatch.setattr(tokenizer_step, "open_source", lambda *_: pytest.fail("opened"))
-    tokenizer_step.adopt_tokenizer(tokenizer, setting.study, setting.workspace, found)
+    monkeypatch.setattr(given_tokenizer, "open_source", lambda *_: pytest.fail("opened"))
+    given_tokenizer.adopt_tokenizer(tokenizer, setting.study, setting.workspace, found)
     assert setting.workspace.tokenizer.is_dir()
 
 

@@ -1,0 +1,157 @@
+"""A tokenizer that is given to a study: copied from where it was trained, or refused, and what it may know is told."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from data_pipelines.publishing.files import publish
+from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, read_stamp, require_same
+from experiments.preparing.sources import Source, open_source
+from experiments.preparing.tokenizer import HELD_OUT, OF_FRAMES, TRAINED, require_same_trained
+from experiments.progress import say
+from experiments.running.workspace import Workspace
+from experiments.study import Study
+from experiments.words import few
+from hma_jax.config import ConfigError
+from hma_jax.config.json import diff, to_dict
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
+    from hma_jax.tokenizers.base import Tokenizer
+
+GIVEN = "given with --tokenizer, identity"
+"""The origin of a copy, followed by what the tokenizer is."""
+
+TRAINED_FROM = "trained_from"
+"""In the stamp of a copy: the inputs of the training, where they are known. Its identity alone tells it from other
+tokenizers."""
+
+
+def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
+    """Raises ConfigError if the workspace has another tokenizer than the one that is given by its directory `source`
+    or, without, than the study would train."""
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    if source is None:
+        require_same_trained(study, workspace, sources)
+    else:
+        _adopted(load_tokenizer(source, expect=study.tokenizer), source, workspace, None)
+
+
+def adopt_tokenizer(
+    source: Path, study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
+) -> None:
+    """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already. Notes say of
+    which `sources` it may know held-out frames, and which unseen robots it was trained on. The stamp of the copy says
+    what was known of the training.
+
+    Raises ConfigError if it is not the kind that the study is made for, or if another one is there, unless
+    `replace` allows it.
+    """
+    from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
+
+    tokenizer = load_tokenizer(source, expect=study.tokenizer)
+    if _adopted(tokenizer, source, workspace, replace):
+        return
+    training = _training(read_stamp(source))
+    _say_what_it_may_know(training, study, sources)
+    aside = workspace.root / "tokenizer.adopted"
+    shutil.rmtree(aside, ignore_errors=True)
+    save_tokenizer(tokenizer, aside)
+    known = {TRAINED_FROM: training.inputs} if training.inputs else {}
+    dataclasses.replace(training, inputs={ORIGIN: _given(tokenizer)} | known).save(aside)
+    publish(aside, workspace.tokenizer)
+
+
+def _training(stamp: MadeFrom | None) -> MadeFrom:
+    """The stamp of a tokenizer's training, by that of a copy too; without inputs if it is not known."""
+    if stamp is None:
+        return MadeFrom({})
+    if stamp.inputs.get(ORIGIN) == TRAINED:
+        return stamp
+    return dataclasses.replace(stamp, inputs=stamp.inputs.get(TRAINED_FROM, {}))
+
+
+def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: Step | None) -> bool:
+    """Whether the tokenizer that is given, by its directory `source`, is there. ConfigError if another one is, unless
+    allowed."""
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    place = workspace.tokenizer
+    if not place.exists():
+        return False
+    existing = read_stamp(place)
+    if existing is not None and existing.inputs.get(ORIGIN) == _given(tokenizer):
+        return True
+    try:
+        identity = load_tokenizer(place).identity
+    except ConfigError as error:
+        lines = [str(error)]
+    else:
+        if identity == tokenizer.identity:  # trained here, or the very directory that is given
+            return True
+        origin = existing.inputs[ORIGIN] if existing else "not written down"
+        lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
+    require_same("tokenizer", place, lines, replace)
+    return False
+
+
+def _given(tokenizer: Tokenizer) -> str:
+    return f"{GIVEN} {tokenizer.identity}"
+
+
+def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[Source]) -> None:
+    """Of a tokenizer that was trained on datasets of the study: with fewer episodes held out (those are among these) or
+    others, or on datasets as they were before they grew (the hold-out is drawn among all episodes of a dataset), or on
+    robots that no model of the study is trained on."""
+    trained_with, study_settings = training.inputs.get("store", {}), to_dict(study.store)
+    data = {name: facts for name, facts in training.inputs.get("data", {}).items() if name in study.all_names()}
+    more = [
+        f"store.{name}: {trained_with[name]} -> {study_settings[name]}"
+        for name in HELD_OUT
+        if study_settings[name] > trained_with.get(name, math.inf)
+    ]
+    if data and more:
+        say(
+            f"note: the tokenizer was trained on {few(list(data))} with fewer episodes held out ({'; '.join(more)}): it "
+            "may have been trained on frames that are held out here"
+        )
+    known = [(spec, path) for spec, path in sources if spec.name in data]
+    otherwise = {spec.name: lines for spec, _ in known if (lines := _other_splits(data[spec.name], spec))}
+    for lines in dict.fromkeys(otherwise.values()):
+        names = [name for name, own in otherwise.items() if own == lines]
+        say(
+            f"note: the tokenizer was trained on {few(names)} with other episodes held out ({'; '.join(lines)}): it may "
+            "have been trained on frames that are held out here"
+        )
+    changed = [
+        spec.name
+        for spec, path in known
+        if spec.name not in otherwise
+        and data[spec.name].get("shards")
+        and data[spec.name]["shards"] != open_source((spec, path), study.store).fingerprint()
+    ]
+    if changed:
+        say(
+            f"note: the tokenizer was trained on other recordings of {few(changed)}: unless they only `joins` more "
+            "directories now, it may have been trained on frames that are held out here"
+        )
+    if unseen := [name for name in study.unseen if name in data]:
+        say(
+            f"note: the tokenizer was trained on frames of {few(unseen)}, which `unseen` names: no model is trained on "
+            "them before it is adapted, but the tokenizer knows them already"
+        )
+
+
+def _other_splits(facts: Mapping[str, Any], spec: DatasetSpec) -> tuple[str, ...]:
+    """Lines on how other episodes of a dataset were held out of a training by the `facts` of its stamp than its entry
+    says now. What an earlier version did not write down is not compared."""
+    now = {name: getattr(spec, name) for name in OF_FRAMES}
+    before = {name: facts.get(name, value) for name, value in now.items()}
+    same = before["val_split"] == now["val_split"] != ""  # whatever else is read
+    return () if same else tuple(diff(before, now))
