@@ -19,6 +19,7 @@ from hma_jax.generation.rollout import Sequences
 from tests.tiny import DIFFUSION, SMALLER, TABLE, lively_params, model_config, random_batch, shallow_config
 
 SAMPLER = SamplerConfig(steps=5)
+LATER = (pytest.mark.exact, pytest.mark.slow)
 
 
 def some(cases: list) -> list:
@@ -212,26 +213,28 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
         np.testing.assert_allclose(fast[:, t - 1], slow, atol=1e-4 * np.abs(slow).max())
 
 
-@pytest.mark.exact
 @pytest.mark.parametrize(
     "options, decode",
     [
-        pytest.param({"conditioning": "concat+modulate"}, DecodeConfig(3, 1.0), marks=pytest.mark.slow),
-        pytest.param({"action_alignment": "causal"}, DecodeConfig(2, order="confidence"), marks=pytest.mark.slow),
-        pytest.param({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SAMPLER), marks=pytest.mark.slow),
-        pytest.param({"conditioning": "cross_attention"}, DecodeConfig(2), marks=pytest.mark.slow),
+        pytest.param(SMALLER | {"recall": True}, DecodeConfig(2, 1.0), id="smallest"),
+        pytest.param({"conditioning": "concat+modulate"}, DecodeConfig(3, 1.0), id="sampled", marks=LATER),
+        pytest.param({"action_alignment": "causal"}, DecodeConfig(2, order="confidence"), id="causal", marks=LATER),
+        pytest.param({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SAMPLER), id="continuous", marks=LATER),
+        pytest.param({"conditioning": "cross_attention"}, DecodeConfig(2), id="cross-attention", marks=LATER),
     ],
-    ids=["sampled", "causal", "continuous", "cross-attention"],
 )
 def test_next_frames_equal_one_rollout_of_a_frame_per_recorded_past(options: dict, decode: DecodeConfig):
+    """Of one example whose actions are hidden, and of others."""
     config = model_config(**options)
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
     batch, keys = random_batch(0, config, 3), jax.random.split(jax.random.key(0), 3)
-    rest = (batch["embodiment"], keys, decode)
-    fast = jax.jit(lambda p: next_frames(declared.merge(p), batch["tokens"], batch["actions"], *rest)[1])(params)
+    tokens, actions, rest = batch["tokens"], batch["actions"], (batch["embodiment"], keys, decode)
+    hidden = np.repeat([[True], [False], [False]], config.frames, axis=1)
+    fast = jax.jit(lambda p: next_frames(declared.merge(p), tokens, actions, *rest, hidden)[1])(params)
     for t in range(1, config.frames):
-        past, chunks = batch["tokens"][:, :t], batch["actions"][:, : t + 1]
-        slow = jax.jit(lambda p, x=past, a=chunks: rollout_naive(declared.merge(p), x, a, *rest)[:, 0])(params)
+        given = tokens[:, :t], actions[:, : t + 1], *rest
+        shown = hidden[:, : t + 1]
+        slow = jax.jit(lambda p, g=given, h=shown: rollout_naive(declared.merge(p), *g, hidden_BT=h)[:, 0])(params)
         if config.diffusion:
             np.testing.assert_allclose(fast[:, t - 1], slow, atol=2e-3)
         else:
@@ -353,9 +356,6 @@ def test_streaming_is_exact_but_for_what_a_finished_frame_had_seen_and_where_it_
     anywhere = {name: jnp.zeros_like(params[name]) for name in ("positions", "action_mask")}
     streamed, exact = both(params | anywhere)
     np.testing.assert_array_equal(streamed, exact)
-
-
-LATER = (pytest.mark.exact, pytest.mark.slow)
 
 
 @pytest.mark.parametrize(

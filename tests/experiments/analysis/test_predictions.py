@@ -8,8 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from experiments.analysis import predictions
 from experiments.analysis.fits import MIN_POSITIONS, Coefficient
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.measured import Position
@@ -132,6 +134,22 @@ def test_a_part_of_what_was_predicted_is_on_the_level_of_all_seeds_and_has_no_ve
     alone = {id: tables[id] for id in ("a8", "b1", "b2")}
     outcome = compare(made, [curve], alone, inputs)
     assert outcome.observed is None and "every seed was evaluated on other robots" in outcome.marks[-1]
+
+
+def test_a_mean_over_more_seeds_is_predicted_the_more_narrowly():
+    rng, axes = np.random.default_rng(0), ("steps",)
+    places = [Position(f"{x:g}-{seed}", "run", seed, (x,), ("a",)) for x in np.geomspace(1, 64, 7) for seed in range(3)]
+    tables = {
+        p.trial: windows_of([(1.5 + p.x[0] ** -0.5) * np.exp(0.01 * rng.standard_normal())], "a", [0]) for p in places
+    }
+    new = [Position(f"new-{seed}", "run", seed, (20.0,), ("a",)) for seed in range(16)]
+
+    def width(seeds: int) -> float:
+        held = tuple(new[:seeds])
+        made = predictions.predict(Curve("own", axes, (*places, *held)), held, tables, dict.fromkeys(tables, ""))
+        return np.log(made.high / made.low)
+
+    assert width(16) < 0.6 * width(1)
 
 
 def test_nothing_is_predicted_of_a_trial_that_exists(root, capsys):

@@ -289,6 +289,25 @@ def test_no_part_of_what_is_predicted_may_be_no_number(wrong, params, monkeypatc
     np.testing.assert_array_equal(metrics["finite"], finite)
 
 
+def test_a_model_that_was_trained_without_actions_is_shown_none(params, monkeypatch):
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    hidden = []
+
+    def outputs(model, tokens, actions, robots, hidden_BT):
+        hidden.append(hidden_BT)
+        return jnp.zeros((4, 5, 9, CONFIG.factors, CONFIG.factor_vocab))
+
+    def rolled_out(_, prompt, sequences, *__, hidden_BT):
+        hidden.append(hidden_BT)
+        return jnp.zeros((*sequences.shape[:2], 4, 9), jnp.int32)
+
+    monkeypatch.setattr(protocol, "rollout", rolled_out)
+    monkeypatch.setattr(protocol, "next_frame_outputs", outputs)
+    inputs = {name: batch[name] for name in ("tokens", "actions", "embodiment", "episode", "start")}
+    protocol.make_predictor(CONFIG, TABLE, EVAL, "passive")(params, inputs)
+    assert len(hidden) == 2 and all(marks is not None and marks.all() for marks in hidden)
+
+
 def test_another_episode_s_actions_begin_with_the_chunk_that_leads_to_the_first_predicted_frame(params, monkeypatch):
     """Those before it led to the frames of the prompt."""
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
