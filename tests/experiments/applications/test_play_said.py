@@ -23,7 +23,30 @@ def test_a_page_without_input_says_why_time_stands_still(browsing):  # noqa: F81
         await page.evaluate("state.input -= 61e3")
         await page.wait_for_function("!state.running")
         assert "paused: no input for 60 s" in await page.inner_text("#said")
+        for key in ("KeyR", "Backspace"):
+            await page.wait_for_timeout(5)
+            await page.keyboard.press(key)
+            await page.wait_for_function("!state.pending.length")
+            assert "paused: no input for 60 s" in await page.inner_text("#said"), "one frame came, it is still paused"
         await page.keyboard.press("ArrowUp")
+        await frames(page, 2)
+        assert await page.inner_text("#said") == "" and not page.faults
+
+    browsing(test)
+
+
+def test_a_page_that_was_hidden_says_why_time_stands_still(browsing):  # noqa: F811
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        hide = "Object.defineProperty(document, 'hidden', {value: true}); document.dispatchEvent(new Event('visibilitychange'))"
+        await page.click("#run")
+        await page.evaluate(hide)
+        assert await page.inner_text("#said") == "", "who paused it knows why"
+        await page.click("#run")
+        await page.evaluate(hide)
+        await page.wait_for_function("!state.pending.length")
+        assert "paused: the page was hidden" in await page.inner_text("#said")
+        await page.click("#run")
         await frames(page, 2)
         assert await page.inner_text("#said") == "" and not page.faults
 
