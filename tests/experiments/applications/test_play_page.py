@@ -282,6 +282,21 @@ def test_a_robot_that_is_chosen_while_the_connection_is_lost_begins_once_there_i
     browsing(test)
 
 
+def test_a_robot_that_is_chosen_before_the_page_knows_that_the_connection_is_lost_begins_once_there_is_one(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate("state.socket.send = () => {}; document.querySelector('[data-name=arm]').click()")
+        assert await page.evaluate("state.begun && state.socket.readyState == 1")
+        await page.evaluate("state.socket.close()")
+        await page.wait_for_function("state.socket.readyState == 1 && state.tries == 0")
+        await frames(page, 2)
+        assert await page.inner_text("#name") == "arm" and not page.faults
+        [visitor] = client.server.app[SESSIONS].visitors.values()
+        assert visitor.session.robot.name == "arm"
+
+    browsing(test)
+
+
 def test_who_finds_no_place_waits_for_one_and_cannot_press_anything_meanwhile(browsing, monkeypatch):
     edit_page(monkeypatch, "RETRY = 10e3", "RETRY = 0.2e3")
 
