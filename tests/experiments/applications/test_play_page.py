@@ -533,12 +533,12 @@ def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_re
 
 def test_it_fits_a_phone(browsing):
     async def test(browser, address, client):
-        phone = {"viewport": {"width": 360, "height": 740}, "has_touch": True, "is_mobile": True}
+        phone = {"viewport": {"width": 360, "height": 640}, "has_touch": True, "is_mobile": True}
         page = await opened(browser, address, bypass_csp=False, **phone)  # as a visitor has it
         assert await page.evaluate("document.documentElement.scrollWidth") <= 360
         assert not await page.is_visible("#saved"), "nothing was recorded yet"
         pad = await page.locator(".pads").bounding_box()
-        assert pad["y"] + pad["height"] <= 740, "the picture and the pad are on one screen"
+        assert pad["y"] + pad["height"] <= 640, "the picture and the pad are on one screen"
         await page.tap(".pad button[data-key=ArrowUp]")
         for width, height in ((500, 320), (740, 360)):  # on its side
             await page.set_viewport_size({"width": width, "height": height})
