@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -13,10 +14,12 @@ if TYPE_CHECKING:
 
 
 class Encoder:
-    """Takes frames and gives their tokens in the same order. The device encodes while the next batch is collected."""
+    """Takes frames and gives their tokens in the same order. Devices encode while the next batch is collected: at least
+    `batch` frames, in calls of the tokenizer that are full."""
 
     def __init__(self, tokenizer: Tokenizer, batch: int):
-        self._tokenizer, self._batch = tokenizer, batch
+        self._tokenizer = tokenizer
+        self._batch = math.ceil(batch / tokenizer.at_once) * tokenizer.at_once
         self._frames: list[np.ndarray] = []
         self._tokens: deque[np.ndarray] = deque()
         self._under_way: Future | None = None

@@ -74,13 +74,13 @@ def tokenize_dataset(
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
     `frame_step`: native frames per stored frame; by default the stride at `rate` Hz (None: native), which it must
-    divide. 1 stores all frames and serves every rate. `batch` images are encoded at a time, `threads` (default: as
-    many as cores, up to 8) decode. If the store already has this dataset, made from the same shards in the same way,
-    nothing is done. Any number of processes may run the same call, start and be killed at any time: each makes parts
-    that no other one makes. `progress(done, total)` counts the episodes of all processes; `warn` is told of values of
-    the action that look like wrapping angles, in the parts that this process makes. With `wait` it waits for
-    the parts of other processes; without, it returns None while parts are missing. The bytes of the dataset depend
-    on `spec`, source, tokenizer, `part_size` and the settings of JobSettings only.
+    divide. 1 stores all frames and serves every rate. At least `batch` images are encoded at a time (as many as fill
+    the devices), `threads` (default: as many as cores, up to 8) decode. If the store already has this dataset, made
+    from the same shards in the same way, nothing is done. Any number of processes may run the same call, start and be
+    killed at any time: each makes parts that no other one makes. `progress(done, total)` counts the episodes of all
+    processes; `warn` is told of values of the action that look like wrapping angles, in the parts that this process
+    makes. With `wait` it waits for the parts of other processes; without, it returns None while parts are missing. The
+    bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of JobSettings only.
 
     Raises ConfigError for keys, settings or a store directory that cannot work, and for a
     dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data

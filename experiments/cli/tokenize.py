@@ -41,7 +41,7 @@ def tokenize(
     Args:
         arguments: Study, data, output directory and settings. Several processes share the directory.
         replacement: Results made with other settings or data are replaced only on request.
-        batch: Frames encoded at a time. Does not change any token.
+        batch: Frames encoded at a time, at least: rounded up to what fills all devices. Does not change any token.
         threads: Threads that decode frames, to train a tokenizer as well.
     """
     prepare_together(make_setting(arguments), batch, threads, replacement.replace)

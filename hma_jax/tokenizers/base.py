@@ -82,6 +82,11 @@ class Tokenizer(Protocol):
         """Images that a device takes at a time."""
         ...
 
+    @property
+    def at_once(self) -> int:
+        """Images of one call: `piece` on every device. A smaller batch is padded to it."""
+        ...
+
     def encode(self, images: np.ndarray) -> np.ndarray:
         """uint8 [B, height, width, 3] -> int32 [B, S] or float32 [B, S, C]."""
         ...

@@ -199,7 +199,7 @@ class BaseTokenizer(abc.ABC):
 
     @property
     def at_once(self) -> int:
-        """Images of one call."""
+        """Images of one call, over all devices."""
         return self.piece * self._mesh.size
 
     def _jit_over_devices(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:

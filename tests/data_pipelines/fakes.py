@@ -29,6 +29,7 @@ class FakeTokenizer:
 
     image_size, grid, tokens = 8, 2, 4
     vocab_size, factors, factor_vocab, channels = 65536, 2, 256, 0
+    at_once = 1
 
     def __init__(self, identity: str = "fake"):
         self.identity = identity

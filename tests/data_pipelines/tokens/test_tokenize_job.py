@@ -170,6 +170,21 @@ def test_interrupted_job_leaves_no_dataset_and_can_be_repeated(tmp_path, rlds):
     assert files(tmp_path / "store") == ["toy"]
 
 
+def test_no_device_encodes_padding_while_frames_are_left(tmp_path, rlds):
+    """Eight devices took half of their rows from a batch of 256, the other half were zeros."""
+
+    class Wide(FakeTokenizer):
+        at_once, rows = 3, []
+
+        def encode(self, images):
+            self.rows.append(len(images))
+            return super().encode(images)
+
+    tokenize_dataset(SPEC, rlds, Wide(), tmp_path / "store", batch=4)
+    *full, rest = Wide.rows
+    assert full and set(full) == {6} and rest <= 6
+
+
 def test_unwritable_directory_is_one_clear_message(tmp_path, rlds):
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"file/store/toy: .* cannot be written there \(Not a dir"):
