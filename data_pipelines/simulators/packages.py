@@ -10,7 +10,7 @@ import importlib.metadata
 import importlib.util
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection
 
 from data_pipelines.simulators.spec import SimSpec
 from hma_jax.config import ConfigError, require
@@ -48,6 +48,9 @@ DEPENDENCIES = {
 }
 """Backend -> dependencies of its packages whose versions affect simulation, control or rendering, if installed."""
 
+USED_VERSIONS = {"robosuite": "1.5.1"}
+"""Package -> its only version that is used. Episodes of robosuite 1.5.2 would ignore their seeds."""
+
 EXTRA = "pip install -e '.[sim]'"
 
 APT = (
@@ -59,12 +62,14 @@ GL = {"egl": "EGL", "osmesa": "OSMesa"}
 """Values of MUJOCO_GL for off-screen rendering -> the library of each."""
 
 
-def missing_packages(specs: Iterable[SimSpec]) -> tuple[str, ...]:
+def missing_packages(specs: Collection[SimSpec]) -> tuple[str, ...]:
     """Packages that these embodiments need and that are not installed."""
-    needed = {"mujoco"}
-    for spec in specs:
-        needed.update({spec.package, *IMPORTED_TOGETHER.get(spec.backend, ())})
-    return tuple(p for p in sorted(needed) if importlib.util.find_spec(MODULES.get(p, p)) is None)
+    needed = sorted({"mujoco"} | _imported_packages(specs))
+    return tuple(p for p in needed if importlib.util.find_spec(MODULES.get(p, p)) is None)
+
+
+def _imported_packages(specs: Collection[SimSpec]) -> set[str]:
+    return {package for spec in specs for package in (spec.package, *IMPORTED_TOGETHER.get(spec.backend, ()))}
 
 
 def package_versions(spec: SimSpec) -> dict[str, str]:
@@ -85,13 +90,16 @@ def _version(package: str) -> str:
         return ""
 
 
-def why_unavailable(specs: Iterable[SimSpec]) -> str:
+def why_unavailable(specs: Collection[SimSpec]) -> str:
     """Why these embodiments cannot be simulated on this machine, with what to install; "" where they can."""
     missing = missing_packages(specs)
     if missing:
         return (
             f"simulators are not installed ({', '.join(missing)}). Run: {EXTRA} and, to render without a screen, {APT}"
         )
+    for package, used in USED_VERSIONS.items():
+        if package in _imported_packages(specs) and (found := _version(package)) != used:
+            return f"{package} {found} is installed, but only version {used} can be used. Run: {EXTRA}"
     try:
         backend = gl_backend()
     except ConfigError as error:
@@ -102,7 +110,7 @@ def why_unavailable(specs: Iterable[SimSpec]) -> str:
     return ""
 
 
-def require_packages(specs: Iterable[SimSpec]) -> None:
+def require_packages(specs: Collection[SimSpec]) -> None:
     """Raises ConfigError, with what to install, unless these embodiments can be simulated here."""
     obstacle = why_unavailable(specs)
     require(not obstacle, obstacle)

@@ -6,14 +6,12 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 
 import numpy as np
 import robosuite
 import robosuite_models  # noqa: F401 (registers its robots)
 from robosuite.controllers import load_composite_controller_config, load_part_controller_config
-from robosuite.environments.base import REGISTERED_ENVS
 from robosuite.models.base import MujocoXML
 
 from data_pipelines.simulators.backends.physics import PhysicsBackend
@@ -45,9 +43,6 @@ class Backend(PhysicsBackend):
     hidden_geoms = (0,)  # collision shapes
 
     def make(self, env: str) -> None:
-        # Version 1.5.1 draws from numpy's global generator (see `start`), 1.5.2 from the environment's own. It is not
-        # in the extra, but who installs it would not see that episodes ignore their seeds.
-        seeded = {"seed": 0} if "seed" in inspect.signature(REGISTERED_ENVS[env]).parameters else {}
         self.env = robosuite.make(
             env,
             robots=self.spec.kwargs["robots"],
@@ -60,15 +55,12 @@ class Backend(PhysicsBackend):
             horizon=NEVER,
             ignore_done=True,
             hard_reset=False,  # the model stays, which saves seconds an episode
-            **seeded,
         )
         for name in self.env._observables:  # computed in every step of the physics; nobody looks
             self.env.modify_observable(name, "enabled", False)
 
     def reset(self, seed: int) -> None:
-        # In place: what draws starts in 1.5.2 holds the same generator.
-        self.env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-        self.env.reset()
+        self.env.reset()  # draws from numpy's global generator (see `start`)
         self.model, self.data = self.env.sim.model._model, self.env.sim.data._data
         self.low, self.high = (np.array(bound, np.float64) for bound in self.env.action_spec)
 

@@ -21,6 +21,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
 from tests.data_pipelines.simulators.fakes import EPISODES, SIZE, SPEC, fake_workers, make_episode, write_episode
+from tests.test_packaging import PYPROJECT
 
 
 @pytest.fixture
@@ -113,6 +114,27 @@ def test_missing_packages_are_named_with_the_extra_and_what_draws(monkeypatch):
     message = r"not installed \(gym-pusht, mujoco\)\. Run: pip install -e '.\[sim\]'.*libegl1"
     with pytest.raises(ConfigError, match=message):
         packages.require_packages([SPEC])
+
+
+@pytest.mark.parametrize("robot", ["robosuite_panda_lift", "robosuite_g1"])  # of robosuite-models, which needs it too
+def test_another_version_of_robosuite_is_refused(monkeypatch, robot):
+    """Of 1.5.2 episodes would ignore their seeds."""
+    specs, installed = select([robot]), {"robosuite": "1.5.1"}
+    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(packages.ctypes.util, "find_library", lambda name: "lib")
+    monkeypatch.setattr(packages.importlib.metadata, "version", lambda name: installed.get(name, "1"))
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    packages.require_packages(specs)
+    installed["robosuite"] = "1.5.2"
+    message = r"robosuite 1\.5\.2 is installed, but only version 1\.5\.1 can be used\. Run: pip install -e '.\[sim\]'"
+    with pytest.raises(ConfigError, match=message):
+        packages.require_packages(specs)
+    packages.require_packages([SPEC])  # of another package
+
+
+def test_the_extra_installs_the_only_versions_that_are_used():
+    extra = PYPROJECT["project"]["optional-dependencies"]["sim"]
+    assert {f"{package}=={version}" for package, version in packages.USED_VERSIONS.items()} <= set(extra)
 
 
 def test_a_machine_that_cannot_draw_is_told_what_to_install(monkeypatch):
