@@ -37,11 +37,16 @@ class CheckpointError(ConfigError):
 
 def agree_on_latest(directory: Path) -> int | None:
     """The latest step with a checkpoint as process 0 sees it: a shared disk may show the others an older state of the
-    directory. Raises CheckpointError or ReadError, in all processes, if it cannot be listed now."""
+    directory. Raises ReadError, in all processes, if it cannot be listed now."""
     steps: list[int] = []
-    with raised_in_all("checkpoints"), _reading(directory):
-        if is_writer():
-            steps = list_steps(directory)
+    with raised_in_all("checkpoints"):
+        try:
+            if is_writer():
+                steps = list_steps(directory)
+        except OSError as error:  # no advice of `ReadError.of`: to remove this directory removes every checkpoint
+            raise ReadError(
+                f"{directory} cannot be read now ({error.strerror}). Run the same command again when its disk answers"
+            ) from error
     latest = broadcast_from_writer("latest checkpoint", str(steps[-1]) if steps else "")
     return int(latest) if latest else None
 

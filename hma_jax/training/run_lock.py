@@ -22,7 +22,8 @@ def list_steps(directory: Path) -> list[int]:
     """Steps with a finished checkpoint, in order; what Orbax has not finished has another name."""
     if not directory.is_dir():
         return []
-    return sorted(int(path.name) for path in directory.iterdir() if path.name.isdigit() and path.is_dir())
+    numbered = [path for path in directory.iterdir() if path.name.isascii() and path.name.isdecimal()]
+    return sorted(int(path.name) for path in numbered if path.is_dir())
 
 
 class RunBusy(Held):

@@ -114,15 +114,25 @@ def test_so_does_one_that_is_removed_before_its_items_are_looked_for(code, avera
     assert load_run(tmp_path / "run", "ema").step == 3
 
 
-def test_checkpoints_that_process_0_cannot_list_now_are_refused_by_all(averaged, monkeypatch):
+@pytest.mark.parametrize("code", [errno.ENOENT, errno.ENOTDIR, errno.ESTALE])
+def test_checkpoints_that_cannot_be_listed_now_are_not_called_one_that_can_be_removed(code, averaged, monkeypatch):
     def fail(directory: Path) -> list[int]:
-        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(directory))
+        raise OSError(code, os.strerror(code), str(directory))
 
     monkeypatch.setattr(reading, "list_steps", fail)
-    with pytest.raises(
-        ReadError, match=f"{averaged[0] / 'checkpoints'} cannot be read now .{os.strerror(errno.ESTALE)}"
-    ):
+    place = averaged[0] / "checkpoints"
+    with pytest.raises(ReadError, match=f"{place} cannot be read now .{os.strerror(code)}.*same command") as refused:
         load_run(averaged[0])
+    assert "remove" not in str(refused.value)
+
+
+def test_a_folder_whose_name_is_no_plain_number_is_no_checkpoint(tmp_path):
+    for name in ("4", "²", "٣", "5.orbax-checkpoint-tmp"):
+        (tmp_path / name).mkdir()
+    assert reading.list_steps(tmp_path) == [4]
+
+
+def test_checkpoints_that_process_0_cannot_list_now_are_refused_by_all(averaged, monkeypatch):
     monkeypatch.setattr(reading, "is_writer", lambda: False)
     monkeypatch.setattr(reading, "all_gather", lambda name, own: ["ReadError: why", own])
     with pytest.raises(ReadError, match="why"):
