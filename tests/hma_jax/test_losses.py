@@ -54,7 +54,12 @@ def action_losses(config, action_head):
     batch = random_batch(0, config)
     robots, actions = jnp.asarray(batch["embodiment"]), batch["actions"]
     target = TABLE.normalise(actions, robots)
-    model = SimpleNamespace(config=config, table=TABLE, action_head=lambda *given: action_head(target, *given))
+    model = SimpleNamespace(
+        config=config,
+        table=TABLE,
+        normalise=TABLE.normalise,
+        action_head=lambda *given: action_head(target, *given),
+    )
     return action_loss_per_step(model, jnp.zeros((*actions.shape[:2], 1)), actions, robots, robots, KEYS), robots
 
 
