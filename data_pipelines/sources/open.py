@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from data_pipelines.errors import MAX_LISTED, DataError, UnreachableError
 from data_pipelines.sources.joined import JoinedSource, Parts
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
+from data_pipelines.sources.rlds.schema import read_rate as rlds_rate
 from data_pipelines.sources.rlds.schema import resolve_version
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
@@ -108,6 +109,19 @@ def open_source(
     from data_pipelines.sources.rlds.dataset import RldsDataset
 
     return RldsDataset(location, split, files=files, **options)
+
+
+def read_rate(location: Location | Parts, split: str = "train", corrupt: Corrupt = "raise") -> float | None:
+    """Native frames per second, as the files of a dataset say, or those of the first of `Parts` that do; None where
+    none does. The records of RLDS are not looked for, which may take hours. Raises what `open_source` raises."""
+
+    def rate_of(place: Location) -> float | None:
+        if find_format(place) == "rlds":
+            return rlds_rate(resolve_version(place))
+        return open_source(place, split, corrupt=corrupt, max_skipped=sys.maxsize).hz
+
+    places = location.places if isinstance(location, Parts) else (location,)
+    return next((hz for hz in map(rate_of, places) if hz is not None), None)
 
 
 def source_name(location: str | Location) -> str:

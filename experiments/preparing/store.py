@@ -82,10 +82,11 @@ def data_differences(study: Study, workspace: Workspace, data: Sequence[str], to
 
 def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
     """Of datasets whose files say another native rate than their entry, which counts."""
+    from data_pipelines.sources.open import read_rate
     from data_pipelines.sources.source import same_rate
 
     for spec, path in sources:
-        own = open_source((spec, path), study.store).hz
+        own = read_rate(path, spec.split, study.store.corrupt)
         if own is not None and not same_rate(own, spec.hz):
             say(
                 f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "
