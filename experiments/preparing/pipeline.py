@@ -49,7 +49,7 @@ def prepare(
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     write_asked(study, workspace, sources, tokenizer)
-    if not workspace.manifest.exists():  # else all is known
+    if replace or not workspace.manifest.exists():  # else all is known
         say_short_episodes(study, sources)
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace, threads=threads)

@@ -28,6 +28,7 @@ from data_pipelines.tokens import tokenize_job
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
 from experiments.preparing import tokenizer, windows
+from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.convert import read_official, write_run
 from hma_jax.tokenizers import train as tokenizer_training
@@ -276,6 +277,15 @@ def test_episodes_that_an_entry_says_are_too_short_are_told_before_a_tokenizer_i
         assert "it would be trained" in said.err and (note in said.out) == told
         assert main(["train", *SMOKE, "--out", str(tmp_path / "new"), "--data", str(arm), "--dry-run"]) == 0
         assert (note in capsys.readouterr().out) == told
+
+
+def test_so_are_those_of_data_that_replace_others_of_which_windows_are_there(arm, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tokenizer_training, "train_tokenizer", lambda *_, **__: require(False, "it would be trained"))
+    monkeypatch.setattr(registry_table, "_registered", {ARM.name: replace(ARM, mean_steps=8.0)})
+    Workspace(tmp_path).manifest.write_text("{}")  # of an earlier version, say
+    assert main(["tokenize", *SMOKE, "--out", str(tmp_path), "--data", str(arm), "--replace", "tokenizer"]) == 2
+    said = capsys.readouterr()
+    assert "it would be trained" in said.err and f"{ARM.name} (about 8 steps an episode; 9 are needed)" in said.out
 
 
 def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
