@@ -10,12 +10,14 @@ import numpy as np
 
 from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, Facts
-from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
+from data_pipelines.registry.spec import MAX_STRIDE
 from data_pipelines.sources.convertible import unsupported_images_text
-from data_pipelines.sources.rlds.schema import field_slice
+from data_pipelines.sources.rlds.schema import METADATA, RATE_KEY, field_slice
 from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES
+from hma_jax.config import require
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 DEPTHS = re.compile(r"depth|dispar", re.IGNORECASE)
@@ -101,6 +103,15 @@ class WindowFacts:
     long_enough: int  # with any
     per_episode: float  # windows, over the sampled episodes
     total: float  # windows of the split, estimated
+
+
+def require_own_rate(facts: Facts) -> None:
+    """Raises ConfigError if no frames could be taken at the rate that the dataset's own files say."""
+    require(
+        facts.hz is None or facts.hz <= MAX_STRIDE * FRAME_RATE,
+        f"{facts.directory}: its own files say {facts.hz:g} native frames per second (those of RLDS as {RATE_KEY} in "
+        f"{METADATA}), which is too many for a recording: correct that, or give --hz",
+    )
 
 
 def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:

@@ -254,6 +254,18 @@ def test_a_rate_that_no_recording_has_is_refused_before_anything_is_read(robot, 
     assert not told.out
 
 
+@pytest.mark.parametrize("command", ["inspect", "view"])
+def test_a_rate_that_no_recording_has_is_said_to_be_that_of_the_files_where_it_is(command, robot, tmp_path, capsys):
+    """Nobody gave one: `correct hz` was said, and not where."""
+    (robot / "metadata.json").write_text(json.dumps({"hz": 1e9}))
+    where = tmp_path / "sheets" if command == "inspect" else tmp_path / "page.html"
+    asked = ["data", command, str(robot), "--out", str(where)]
+    assert main(asked) == 2
+    said = capsys.readouterr().err
+    assert f"error: {robot}" in said and "say 1e+09 native frames" in said and "hz in metadata.json" in said
+    assert main([*asked, "--hz", "4"]) == 0
+
+
 def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path, capsys):
     file = tmp_path / "my.toml"
     file.write_text("# what the lab has\n")

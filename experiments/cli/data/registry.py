@@ -143,7 +143,7 @@ def data_inspect(
         registry: TOML file with your own registry entries.
     """
     from data_pipelines.inspection.inspect import inspect_dataset
-    from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry
+    from data_pipelines.inspection.suggest import NO_CAMERA, require_own_rate, suggest_entry
     from data_pipelines.registry import all_specs
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_reader
@@ -171,6 +171,8 @@ def data_inspect(
         require(suggestion is not None, f"{facts.name}: no entry to write: {NO_CAMERA}")
         require(bool(suggestion.hz), "--entry needs the native rate, which the files do not contain: add --hz")
     taken = None if entry else known  # as the dataset is read afterwards
+    if not hz and not taken:
+        require_own_rate(facts)
     rate = hz or (taken.hz if taken else suggested)
     windows = _report_windows(facts, rate, hz, taken, frames) if rate else None
     _print_entry(known, suggestion)

@@ -86,7 +86,7 @@ def _view_one(
     from data_pipelines.inspection.duplicates import find_duplicates
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.issues import find_issues
-    from data_pipelines.inspection.suggest import suggest_entry, window_facts
+    from data_pipelines.inspection.suggest import require_own_rate, suggest_entry, window_facts
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_reader
     from data_pipelines.sources.open import source_name
@@ -99,6 +99,8 @@ def _view_one(
         directory, split, episodes=episodes, max_examples=shown, frames=CLIP_FRAMES, action_keys=keys
     )
     facts = sample.facts
+    if not hz and not known:
+        require_own_rate(facts)
     rate = hz or (known.hz if known else facts.hz)
     entry = replace(known, hz=rate) if known else None
     if known is None and rate is not None:
