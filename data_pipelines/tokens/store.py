@@ -121,7 +121,7 @@ class TokenStore:
         beside them. Raises as `episode`."""
         part, at = self._locate(name, split, i)
         facts = self.manifest(name).split(split)
-        steps = np.asarray(facts.steps[i - at :][: facts.parts[part]], np.int64)
+        steps = np.asarray(facts.steps[i - at : i - at + facts.parts[part]], np.int64)
         kept = read_actions(self._path(name, split, part), int(steps.sum()))
         if kept is None:
             return self.episode(name, split, i).actions.copy()  # a view would keep the whole record

@@ -93,10 +93,8 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
     from data_pipelines.windows.evalset import EvalManifest
     from data_pipelines.windows.windows import least_judged
 
-    empty, least = (
-        EvalManifest.load(workspace.manifest).empty,
-        least_judged(study.eval.prompt_frames, study.model.frames),
-    )
+    empty = EvalManifest.load(workspace.manifest).empty
+    least = least_judged(study.eval.prompt_frames, study.model.frames)
     summary = json.loads(workspace.data_summary.read_text())
     names = study.all_names()
     unjudged = [name for name in names if name in empty and name in judged]
