@@ -57,7 +57,7 @@ def test_remote_dataset_makes_the_same_store(local, remote, tmp_path):
     for name, directory in (("a", local), ("b", str(remote))):
         tokenize_dataset(SPEC, directory, FakeTokenizer(), tmp_path / name)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
-    assert len(files) == 6
+    assert len(files) == 7
     assert all((tmp_path / "a" / f).read_bytes() == (tmp_path / "b" / f).read_bytes() for f in files)
 
 
