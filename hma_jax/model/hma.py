@@ -150,7 +150,7 @@ class HMA(nnx.Module):
 
     def given_in(self, units: ActionUnits) -> HMA:
         """This model, made within a traced function, whose actions are normalised on another scale than its table's:
-        with inputs of the program for constants."""
+        with inputs of the program for constants. For evaluation; `train_model` says why training does otherwise."""
         self._units = nnx.data(units)
         return self
 

@@ -71,7 +71,9 @@ def train_model(
 
     rows = len(own_rows(device_mesh, config.batch))
     # Neither the seed nor the robots' statistics are constants of the programs, so that runs of others share them. With
-    # action heads the statistics are: the loss would have other last bits if its targets came normalised.
+    # action heads the statistics are: the loss would have other last bits if its targets came normalised. Evaluation
+    # has them as inputs of its program instead (`HMA.given_in`), with action heads too. Training does not: every result
+    # depends on the last bits of its steps, and nobody has shown on every platform that they would stay the same.
     scale, known = (None, table) if model.action_heads else (table.scale(), table.standardised())
 
     def put(batch: Any) -> Any:
