@@ -122,9 +122,9 @@ def _agree(
     both = {name: _interval(value[name], np.array(found), size) for name, found in drawn.items()}
     alone = {name: _interval(x, np.array([]), size) for name, x in value.items()}
     if policies > 1 and starts >= LEAST_STARTS:
-        measured_P2 = np.stack([true_P, learned_P], 1)
-        rates_nP2, known = draw_rates(measured_P2, noise(), draws), set(MEASURES)
-        if has_one_apart(measured_P2):  # its correlation would be taken for the order of the others
+        measured = np.stack([true_P, learned_P], 1), noise()
+        rates_nP2, known = draw_rates(*measured, draws), set(MEASURES)
+        if has_one_apart(*measured):  # its correlation would be taken for the order of the others
             known -= {"spearman"}
         alone |= {name: _of_true_rates(alone[name], MEASURES[name], rates_nP2) for name in known}
     # What all rates of a world have in common, and so the bias, is no part of those draws.

@@ -8,7 +8,6 @@ start adds to all policies of a world alike says nothing of how they differ, and
 
 from __future__ import annotations
 
-import math
 from functools import cache
 
 import numpy as np
@@ -52,18 +51,22 @@ def noise_of_counts(successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM:
     return noise
 
 
-def has_one_apart(measured_P2: np.ndarray) -> bool:
-    """Whether a policy is so far from the others, in either world, that rates are not normally distributed: Grubbs'
-    test (1969, "Procedures for Detecting Outlying Observations in Samples", Technometrics 11) at 5 %."""
-    policies = len(measured_P2)
+def has_one_apart(measured_P2: np.ndarray, noise_P22: np.ndarray) -> bool:
+    """Whether a policy is so far from the others, in either world, that true rates are not normally distributed.
+
+    Grubbs' test (1969, "Procedures for Detecting Outlying Observations in Samples", Technometrics 11) at 5 % for both
+    worlds, but of rates with noise, of which one policy may have more than the others.
+    """
+    policies, noise_P2 = len(measured_P2), np.diagonal(noise_P22, axis1=1, axis2=2)
     if policies < 3:
         return False
     t_2 = np.zeros(2)
     for p in range(policies):
-        others = np.delete(measured_P2, p, 0)
-        error = np.maximum(others.std(0, ddof=1) * math.sqrt(1 + 1 / len(others)), 1e-9)
-        t_2 = np.maximum(t_2, np.abs(measured_P2[p] - others.mean(0)) / error)
-    return bool((stdtr(policies - 2, -t_2) < 0.05 / (2 * policies)).any())
+        others, noise_2 = np.delete(measured_P2, p, 0), np.delete(noise_P2, p, 0).mean(0)
+        variance_2 = np.maximum(others.var(0, ddof=1), noise_2)  # near 0 and 1 measured rates may all be equal
+        error_2 = np.sqrt(variance_2 * (1 + 1 / len(others)) + np.maximum(noise_P2[p] - noise_2, 0))
+        t_2 = np.maximum(t_2, np.abs(measured_P2[p] - others.mean(0)) / error_2)
+    return bool((stdtr(policies - 2, -t_2) < 0.05 / (2 * 2 * policies)).any())
 
 
 def draw_rates(measured_P2: np.ndarray, noise_P22: np.ndarray, draws: int) -> np.ndarray:

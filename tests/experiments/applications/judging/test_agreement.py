@@ -87,6 +87,15 @@ def test_one_policy_that_is_far_from_others_does_not_stand_for_their_order():
     assert np.isfinite(found["spearman"].mean) and np.isnan(found["spearman"].low)
 
 
+@pytest.mark.parametrize("always", [False, True])
+def test_one_episode_does_not_take_a_policy_from_the_others(always):
+    """Of policies that all but always succeed, or fail, one of fifty episodes that ends otherwise is noise."""
+    true = np.full((11, 50), always)
+    learned = true.copy()
+    true[0, 3] = learned[1, 4] = not always
+    assert np.isfinite(agree(true, learned, draws=100).over_starts["spearman"].low)
+
+
 def test_the_page_says_why_there_is_no_interval_over_starts():
     without, known = {"mean": 0.5, "low": None, "high": None}, {"mean": 0.5, "low": 0.1, "high": 0.9}
     for starts, spearmans, few, apart in ((LEAST_STARTS - 1, without, True, False), (LEAST_STARTS, without, False, True),
