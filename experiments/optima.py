@@ -34,7 +34,10 @@ class Optimum:
     role: str
     series: str
     x: float
-    edge: str  # "edge": what is as good reaches an end of what was tried, so that the best may lie beyond; or ""
+    # "edge": what is as good reaches an end of what was tried, so that the best may lie beyond. "open": on one side of
+    # the best no x is told to be worse, as one there has one seed in common with it or no result. Or "", also of a best
+    # x with one seed (seed_sem is nan), which is told from nothing.
+    edge: str
     loss: float
     seed_sem: float  # over seeds, nan for one
     near_low: float  # the lowest and highest x that are `as_good` as the best; x itself with one seed
@@ -104,18 +107,23 @@ def _optimum(
 ) -> Optimum:
     """`points` and `of_base` are the candidates of the curve and of the base series."""
     transferred, moved, penalties = math.nan, math.nan, [math.nan]
+    lost = diverged(rows, sweep, role, series)
     low, high = as_good(points, best, {r.x for r in _of(rows, sweep, role, series)})
+    worse = told_worse(points, best) | lost
+    between = any(x < best.x for x in worse) and any(x > best.x for x in worse)
+    edge = "" if between or math.isnan(best.seed_sem) else "open"
+    if ends(rows, sweep, role, series) & {low, high}:
+        edge = "edge"
     if base := lowest(of_base):
         transferred, grid = base.x, sorted({r.x for r in rows if r.sweep == sweep})
         moved = grid.index(best.x) - grid.index(base.x)
         transferred_point = next((p for p in points if p.x == base.x), None)
-        if base.x in diverged(rows, sweep, role, series):
+        if base.x in lost:
             penalties = [math.inf]
         elif transferred_point:
             penalties = cross_validated_penalties(points, of_base) or _by_seed(transferred_point, best) or [math.nan]
     return Optimum(
-        sweep, metric, role, series, best.x,
-        edge="edge" if ends(rows, sweep, role, series) & {low, high} else "",
+        sweep, metric, role, series, best.x, edge,
         loss=best.mean, seed_sem=best.seed_sem, near_low=low, near_high=high, moved=moved, transferred_x=transferred,
         penalty=add_up(penalties) / len(penalties), penalty_low=min(penalties), penalty_high=max(penalties),
     )  # fmt: skip
@@ -125,23 +133,26 @@ def as_good(points: Sequence[CurvePoint], best: CurvePoint, grid: set[float]) ->
     """(lowest, highest x) of the candidates around `best` that seeds do not tell from it: paired, 95 % and one side.
 
     The range ends before the first point that they do tell or that has no error, and before an x of the `grid` without
-    a candidate. Of a point that scatters more than the curve's median one, the median error counts: where training is
-    about to diverge, seeds scatter so much that no loss could be told from the best.
+    a candidate.
     """
-    others = [p for p in points if p.x != best.x]
-    beside = {p.x: difference(p, best) for p in others}
-    usual = statistics.median([error for _, error in beside.values() if math.isfinite(error)] or [math.nan])
-
-    def told(point: CurvePoint) -> bool:
-        mean, error = beside[point.x]
-        seeds = len(_by_seed(point, best))
-        return not math.isfinite(error) or mean > -stdtrit(seeds - 1, 0.05) * min(error, usual)
-
-    apart = grid - {p.x for p in points} | {p.x for p in others if told(p)}
+    known = {p.x for p in points if p.x == best.x or math.isfinite(difference(p, best)[1])}
+    apart = grid - known | told_worse(points, best)
     below = max((x for x in apart if x < best.x), default=-math.inf)
     above = min((x for x in apart if x > best.x), default=math.inf)
     near = [p.x for p in points if below < p.x < above]
     return min(near), max(near)
+
+
+def told_worse(points: Iterable[CurvePoint], best: CurvePoint) -> set[float]:
+    """The x of the candidates that the seeds tell to be worse than `best`: paired, 95 % and one side.
+
+    Of a point that scatters more than the curve's median one, the median error counts: where training is about to
+    diverge, seeds scatter so much that no loss could be told from the best. It takes two seeds in common.
+    """
+    beside = {p.x: (*difference(p, best), len(_by_seed(p, best))) for p in points if p.x != best.x}
+    known = {x: of_seeds for x, of_seeds in beside.items() if math.isfinite(of_seeds[1])}
+    usual = statistics.median([error for _, error, _ in known.values()] or [math.nan])
+    return {x for x, (mean, error, seeds) in known.items() if mean > -stdtrit(seeds - 1, 0.05) * min(error, usual)}
 
 
 def cross_validated_penalties(points: Sequence[CurvePoint], of_base: Sequence[CurvePoint]) -> list[float]:

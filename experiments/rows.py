@@ -223,6 +223,7 @@ class CurvePoint:
     seeds: dict[int, float]  # the mean of each
     parameters: tuple[int, ...]  # the numbers that its seeds have, in order: several where robots are drawn
     label: str = ""
+    clustered: bool = True  # by episode, as errors of each seed are; in tables of earlier versions windows stand alone
 
 
 def curve(
@@ -259,6 +260,7 @@ def curve(
                 seed_sem=math.sqrt(spread) if len(group) > 1 else math.nan,
                 seeds={r.seed: r.mean for r in group}, label=group[0].label,
                 parameters=tuple(sorted({r.parameters for r in group})),
+                clustered=scope == TRAINING or all(r.episodes for r in group),
             )
         )  # fmt: skip
     return points

@@ -80,8 +80,8 @@ def test_errors_of_settings_and_conditioning_are_over_what_the_page_says():
         points = {m: of[label] for m, of in found.items()}
         shown = [f"{p.mean:.{metrics[m]}f} ± {p.seed_sem:.{metrics[m]}f}" for m, p in points.items()]
         assert cells == [text.replace("-0.000", "0.000") for text in shown], label
-    of_windows = [(p.sem**2 - p.seed_sem**2) ** 0.5 for p in found["perplexity"].values()]
-    said = f"are over seeds alone; windows add {min(of_windows):.2f} to {max(of_windows):.2f} to that of a perplexity"
+    whole = [p.sem for p in found["perplexity"].values()]
+    said = f"as if these were independent, those of a perplexity would be {min(whole):.2f} to {max(whole):.2f}"
     assert said in " ".join(RESULTS.read_text().split()), said
 
 

@@ -8,8 +8,9 @@ through losses that only flatten has a minimum, too. Where sizes lie off the par
 is reported: the error of its minimum is then larger than the bootstrap's.
 
 The parabola is a choice, and no bootstrap knows of it. So the exponent is given a second time, of the parabola through
-the best size and its two neighbours alone, and is doubted where that lies outside its interval, or where one size has
-the lowest loss at every budget: then the form alone says that the best size grows.
+the best size and its two neighbours alone. It is doubted where bootstraps, whose draws both share, tell the two apart
+(that of three sizes is so much noisier that it often lies outside the other's interval by chance), and where one size
+has the lowest loss at every budget: then the form alone says that the best size grows or shrinks.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ MIN_SIZES, MIN_BUDGETS = 4, 3
 """Sizes at one budget, one more than a parabola has parameters; budgets with a minimum, for the power law."""
 
 BUDGETS = 4
+"""At most: no more than were measured."""
 
 NEIGHBOURS = 2
 """Sizes on either side of the best one that the parabola is fitted to: further out the curve is no parabola."""
@@ -80,21 +82,26 @@ class IsoFlop:
     scale: float = float("nan")  # k
     near: Coefficient | None = None  # a, wherever there is an exponent
     near_scale: float = float("nan")  # k
+    apart: Coefficient | None = None  # a less that of three sizes, draw by draw, wherever there is an exponent
     refused: str = ""
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """What is doubtful of the exponent, beside what is of the best size of a single budget."""
-        a, near, found = self.exponent, self.near, []
+        a, apart, found = self.exponent, self.apart, []
         if a is None:
             return ()
-        if not a.low <= near.value <= a.high:
-            found.append(f"the three sizes around each best one alone give {near.value:.2g}, outside its interval")
-        lowest = {b.lowest for b in self.budgets if b.best}
+        if not apart.low <= 0 <= apart.high:
+            found.append(
+                f"the three sizes around each best one alone give {self.near.value:.2g}, another exponent by more than the "
+                "bootstraps scatter"
+            )
+        lowest = {b.lowest for b in self.budgets if len(b.sizes) >= MIN_SIZES}
         if len(lowest) == 1 and not a.low <= 0 <= a.high:
             size = f"{lowest.pop():,.0f} trunk parameters"
+            changes = "grows" if a.value > 0 else "shrinks"
             found.append(
-                f"{size} have the lowest loss at every budget: the form of the fit alone says that more are best"
+                f"{size} have the lowest loss at every budget: the form of the fit alone says that the best size {changes}"
             )
         return tuple(found)
 
@@ -116,16 +123,18 @@ def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws
         why = f"{len(minima)} of {len(found)} budgets have a minimum; the exponent needs at least {MIN_BUDGETS}"
         return IsoFlop(tuple(found), refused=why)
     flops, optima = np.log([f for f, _ in minima]), np.stack([m for _, m in minima], 1)  # [b], [2, b, 1 + R]
-    laws = (_law(name, flops, of_form) for name, of_form in zip(("a", "a of three sizes"), optima, strict=True))
-    (exponent, scale), (near, near_scale) = laws
-    return IsoFlop(tuple(found), exponent, scale, near, near_scale)
+    (slopes, scale), (near_slopes, near_scale) = (_law(flops, of_form) for of_form in optima)
+    exponent, near, apart = (
+        Coefficient(name, float(a[0]), *map(float, interval(a[1:])))
+        for name, a in (("a", slopes), ("a of three sizes", near_slopes), ("difference", slopes - near_slopes))
+    )
+    return IsoFlop(tuple(found), exponent, scale, near, near_scale, apart)
 
 
-def _law(name: str, flops: np.ndarray, optima: np.ndarray) -> tuple[Coefficient, float]:
-    """(a called `name`, k) of N_opt = k C^a, of log C [b] and log N_opt [b, 1 + R]."""
+def _law(flops: np.ndarray, optima: np.ndarray) -> tuple[np.ndarray, float]:
+    """(a [1 + R], k of the values) of N_opt = k C^a, of log C [b] and log N_opt [b, 1 + R]."""
     slope, level = np.polyfit(flops - flops.mean(), optima, 1)
-    exponent = Coefficient(name, float(slope[0]), *map(float, interval(slope[1:])))
-    return exponent, float(np.exp(level[0] - slope[0] * flops.mean()))
+    return slope, float(np.exp(level[0] - slope[0] * flops.mean()))
 
 
 class _Line:
@@ -157,14 +166,17 @@ class _Line:
 
 
 def _common_budgets(lines: list[_Line]) -> np.ndarray:
-    """Evenly spread in log C between the lowest and the highest that enough sizes cover."""
+    """Evenly spread in log C between the lowest and the highest that enough sizes cover: as many as were measured, up
+    to BUDGETS. Those within TOLERANCE of each other are one: steps are whole, so sizes miss a budget by a little."""
     ends = np.unique(np.concatenate([line.flops for line in lines]))
     covered = [f for f in ends if sum(line.covers(f) for line in lines) >= MIN_SIZES]
     if not covered:
         return np.array([])
-    if covered[0] == covered[-1]:
-        return np.array(covered[:1])
-    budgets = np.geomspace(covered[0], covered[-1], BUDGETS)
+    distinct = covered[:1]
+    for flops in covered:
+        if flops > distinct[-1] * (1 + TOLERANCE):
+            distinct.append(flops)
+    budgets = np.geomspace(covered[0], covered[-1], min(BUDGETS, len(distinct)))
     return np.array([b for b in budgets if sum(line.covers(b) for line in lines) >= MIN_SIZES])
 
 

@@ -21,6 +21,7 @@ from experiments.report.plot_style import (
     name_axis,
     plain_log,
     say_bars,
+    show_caption,
     show_control,
     show_legend,
     show_means,
@@ -38,9 +39,10 @@ DRAWN = {
 }
 """Metrics with their scope and label, where curves are compared by where they are lowest."""
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
-OF_TRAINING = "; of the training loss over seeds, of one over steps"
 PAIRED = "; points are paired, on the same windows"
-OF_BASE = "\nstar: lowest, hollow at an end of the grid; cross: diverged; dotted: lowest of the base curve"
+OF_BASE = (
+    "\nstar: lowest, hollow at an end of the grid or of one seed; cross: diverged; dotted: lowest of the base curve"
+)
 
 
 def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
@@ -68,8 +70,8 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     show_legend(figure, panels.flat)
     lost = any(diverged(rows, sweep.name, role, name) for role, names in series.items() for name in names)
     marks = OF_BASE if sweep.base else "\ncross: a seed diverged, the point is left out" * lost
-    bars = say_bars(points, sweep.robots_vary) + OF_TRAINING * (TRAINING_LOSS in metrics)
-    figure.supxlabel(bars + PAIRED + marks, fontsize=8.5, color=MUTED)
+    bars = say_bars(points, sweep.robots_vary, training=TRAINING_LOSS in metrics)
+    show_caption(figure, bars + PAIRED + marks)
     return figure
 
 
@@ -99,10 +101,10 @@ def _draw(
         drawn += points
         if not sweep.base:
             continue
-        open_ended = best.x in ends(rows, sweep.name, role, name)
+        unsure = len(best.seeds) == 1 or best.x in ends(rows, sweep.name, role, name)
         panel.plot(
             aside[best.x], best.mean, "*", markersize=13, color=colour, zorder=4,
-            markerfacecolor="white" if open_ended else colour,
+            markerfacecolor="white" if unsure else colour,
         )  # fmt: skip
         if name == sweep.base:
             panel.axvline(best.x, color=MUTED, linewidth=1, linestyle=":", zorder=1)

@@ -26,6 +26,7 @@ from experiments.report.plot_style import (
     name_axis,
     plain_log,
     save,
+    show_caption,
     show_legend,
     style_of,
 )
@@ -157,8 +158,12 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
         left.set_ylabel("loss, nats per token")
         right.set_ylabel(f"best {TRUNK}")
         show_legend(figure, [left])
+        words = []
         if isoflop.doubts or any(b.doubts for b in isoflop.budgets):
-            words = "hollow or dashed: doubtful (the table says why)"
-            figure.supxlabel(words, fontsize=8.5, color=MUTED)
+            words.append("hollow or dashed: doubtful (the table says why)")
+        if not isoflop.exponent and any(b.best for b in isoflop.budgets):  # else the law's legend says it
+            words.append("crosses: by three sizes")
+        if words:
+            show_caption(figure, "; ".join(words))
         left.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
         save(figure, path)

@@ -19,6 +19,7 @@ from experiments.report.plot_style import (
     drawn_metrics,
     plain_log,
     say_bars,
+    show_caption,
     show_nothing,
     show_tally,
 )
@@ -53,13 +54,8 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     panels[0, 0].set_yticks(range(len(sweep.labels)), sweep.labels)
     panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
     panels[0, 0].get_yticklabels()[int(sweep.reference_x)].set(color=DEFAULT, fontweight="bold")
-    figure.supxlabel(
-        CAPTION.format(
-            bars=say_bars(points, sweep.robots_vary, "hollow dot"), judged=JUDGED[sweep.robots_vary],
-            whose=WHOSE[sweep.robots_vary],
-        ),
-        fontsize=8.5, color=MUTED,
-    )  # fmt: skip
+    bars = say_bars(points, sweep.robots_vary, "hollow dot")
+    show_caption(figure, CAPTION.format(bars=bars, judged=JUDGED[sweep.robots_vary], whose=WHOSE[sweep.robots_vary]))
     return figure
 
 

@@ -45,6 +45,8 @@ exponentials: of a few hard robots, so that it may rank models otherwise than na
 OVER = {False: "seeds and episodes", True: "seeds, each with its own robots"}
 """What errors of several seeds are over, by whether judged robots are drawn anew for every seed."""
 ONE_SEED = "one seed: s.e. over episodes"
+CAPTION_LETTERS = 15.5
+"""Of a caption, on an inch."""
 MARKERS = "o^DvPXs"
 SHADES = 0.55
 """Where the colours of curves end on viridis: beyond it they are too light for white paper."""
@@ -113,12 +115,26 @@ def show_means(
             )  # fmt: skip
 
 
-def say_bars(points: Collection[CurvePoint], robots_vary: bool, what: str = "hollow") -> str:
-    """What the bars of `points` are; `what` shows those of one seed."""
+def say_bars(points: Collection[CurvePoint], robots_vary: bool, what: str = "hollow", training: bool = False) -> str:
+    """What the bars of `points` are; `what` shows those of one seed, and `training`: a training loss is among them."""
     alone = [len(p.seeds) == 1 for p in points]
     if alone and all(alone):
-        return f"bars, {ONE_SEED}"
-    return f"bars: s.e. over {OVER[robots_vary]}" + f"; {what}: one seed, over episodes" * any(alone)
+        return in_unit(f"bars, {ONE_SEED}" + ", of the training loss over steps" * training, points)
+    several = f"bars: s.e. over {OVER[robots_vary]}" + ", of the training loss over seeds" * training
+    one = f"; {what}: one seed, over episodes" + " or steps" * training
+    return in_unit(several + one * any(alone), points)
+
+
+def in_unit(words: str, points: Iterable[CurvePoint]) -> str:
+    """`words` on errors over episodes, as the errors of `points` are."""
+    return words if all(p.clustered for p in points) else words.replace("episodes", "windows")
+
+
+def show_caption(figure: plt.Figure, words: str) -> None:
+    """Below all panels, each of its lines in as many as it needs: a longer one would be cut off at both edges."""
+    room = int(CAPTION_LETTERS * figure.get_figwidth())
+    lines = [part for line in words.split("\n") for part in textwrap.wrap(line, room)]
+    figure.supxlabel("\n".join(lines), fontsize=8.5, color=MUTED)
 
 
 def bars_of(points: Iterable[CurvePoint]) -> list[float]:

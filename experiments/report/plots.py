@@ -27,6 +27,7 @@ from experiments.report.plot_style import (
     count,
     drawn_curve,
     drawn_metrics,
+    in_unit,
     name_axis,
     plain_log,
     save,
@@ -88,13 +89,14 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     points = drawn_curve(rows, sweep, metric)
     colour = COLOURS[metric]
     if points:
+        several, one = (in_unit(s, points) for s in (f"mean ± s.e. over {OVER[sweep.robots_vary]}", ONE_SEED))
         show_means(
-            panel, points, [p.x for p in points], f"mean ± s.e. over {OVER[sweep.robots_vary]}", ONE_SEED, color=colour,
-            marker="o", markersize=5.5, linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3,
+            panel, points, [p.x for p in points], several, one, color=colour, marker="o",
+            markersize=5.5, linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3,
         )  # fmt: skip
-        if several := [p for p in points if len(p.seeds) > 1]:
+        if scattered := [p for p in points if len(p.seeds) > 1]:
             panel.plot(
-                [p.x for p in several for _ in p.seeds], [v for p in several for v in p.seeds.values()],
+                [p.x for p in scattered for _ in p.seeds], [v for p in scattered for v in p.seeds.values()],
                 "o", color=colour, alpha=0.45, markersize=3.5, markeredgewidth=0, zorder=4, label="seeds",
             )  # fmt: skip
         _x_axis(panel, points, sweep)

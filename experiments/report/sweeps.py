@@ -246,6 +246,8 @@ def _difference(point: CurvePoint | None, default: CurvePoint | None, paired: Ch
     if point is None or default is None or point is default:
         return ""
     mean, error = (paired.mean, paired.sem) if paired else (difference(point, default)[0], math.nan)
+    if not math.isfinite(mean):  # no seed in common
+        return "–"
     return ("+" if mean > 0 else "") + pm(mean, error)
 
 
@@ -279,7 +281,8 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
             "rates are chosen on all seeds but one and judged on the one left out, so that they may be others than those of "
             "the table; elsewhere they are judged on the seeds that chose them, which makes the penalty too large. The error "
             "of the lowest loss is over seeds; the grid is not interpolated. <em>Edge</em>: the best rate, or one as good, "
-            "is the lowest or the highest tried, so the true optimum may lie beyond.</p>"
+            "is the lowest or the highest tried, so the true optimum may lie beyond. <em>Open</em>: so it may on a side where no "
+            "rate is told to be worse, since one there has one seed or no result.</p>"
         )
     )
 
@@ -294,8 +297,9 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
             # Whichever reaches an end: what is best beyond it may have moved further than `far`.
             reaches = ", some at an end of the grid or not told from it, so perhaps further"
             open_ended = reaches if any(o.edge for o in own) else ""
-            if any(math.isnan(o.seed_sem) for o in own):
-                open_ended += ", some told by one seed only, so perhaps less or more"
+            alone = [math.isnan(o.seed_sem) for o in own]
+            if any(alone):
+                open_ended += f", {'all' if all(alone) else 'some'} told by one seed only, so perhaps less or more"
             steps = counted(round(abs(far.moved)), "step")
             span = counted(round(max(o.moved for o in own) - min(o.moved for o in own)), "step")
             parts.append(

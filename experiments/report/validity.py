@@ -27,6 +27,7 @@ from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.words import counted
 from hma_jax.config.json import stable_hash
+from hma_jax.evaluation.controllability import OPTIONAL_METRICS
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable
 
@@ -115,9 +116,10 @@ def check_numbers(
     if broken := _without_numbers(windows):
         (id, metric), count = next(iter(broken.items()))
         others = f", nor have {counted(len(broken) - 1, 'more')}" if len(broken) > 1 else ""
-        return Check(
-            name, "bad", f"{id} has no {metric} of {counted(count, 'window')}{others}; no difference is taken of these."
-        )
+        text = f"{id} has no {metric} of {counted(count, 'window')}{others}; no difference is taken of these"
+        if of_others := list(dict.fromkeys(m for _, m in broken if m in OPTIONAL_METRICS)):
+            text += f", and the means of {', '.join(of_others)} are of the other windows"
+        return Check(name, "bad", f"{text}.")
     missing = [id for id in results if id not in windows]
     if missing or not results:
         what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows."
@@ -263,17 +265,22 @@ def _held_out(optima: Sequence[Optimum]) -> bool:
 
 def _optima(optima: Sequence[Optimum], rows: Sequence[Row]) -> list[Check]:
     """Of muP's curves, on held-out data where there is a likelihood. Where the standard parametrisation is best is a
-    finding, not a condition. What the seeds do not tell from an end of the grid is open: more of them may."""
+    finding, not a condition. What the seeds do not tell from an end of the grid is open: more of them may. It is inside
+    where on either side a rate is told to be worse."""
     mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT_LOSS if _held_out(optima) else TRAINING_LOSS)]
     if not mup:
         return []
     at_end = [o.series for o in mup if o.x in ends(rows, o.sweep, o.role, o.series)]
     alone = [o.series for o in mup if math.isnan(o.seed_sem) and o.series not in at_end]
-    near_end = [o.series for o in mup if o.edge and o.series not in at_end]
-    said = {"at an end of the grid": at_end, "not told from one at an end": near_end, "told by one seed only": alone}
+    near_end = [o.series for o in mup if o.edge == "edge" and o.series not in at_end]
+    unknown = [o.series for o in mup if o.edge == "open" and o.series not in at_end]
+    said = {
+        "at an end of the grid": at_end, "not told from one at an end": near_end, "told by one seed only": alone,
+        "on one side no rate is told to be worse, as one there has one seed or no result,": unknown,
+    }  # fmt: skip
     text = "; ".join(f"{what} for {', '.join(series)}" for what, series in said.items() if series)
     text = f"{text[0].upper()}{text[1:]}." if text else f"On all {len(mup)} curves with muP."
-    verdict: Verdict = "bad" if at_end else "open" if near_end or alone else "good"
+    verdict: Verdict = "bad" if at_end else "open" if near_end or alone or unknown else "good"
     return [Check("The best learning rate lies inside the grid.", verdict, text)]
 
 

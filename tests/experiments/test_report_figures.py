@@ -20,6 +20,7 @@ from experiments.report.pieces import pm
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, dodge, style_of
+from experiments.report.plots import _draw
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.rows import TRAINING, TRAINING_LOSS, Row, curve
 from experiments.running.trial import trial_id
@@ -108,28 +109,69 @@ def test_the_error_of_a_training_loss_is_over_seeds_alone():
     point = next(p for p in curve(rows, sweep.name, TRAINING_LOSS, scope=TRAINING, series=series) if p.x == x)
     assert len(point.seeds) == 3 and point.sem == point.seed_sem < 0.01
     assert "of the training loss over seeds" in plot_family(rows, sweep).get_supxlabel()
-    alone = next(
-        p for p in curve([r for r in rows if r.seed == 0], sweep.name, TRAINING_LOSS, scope=TRAINING, series=series)
-    )
+    of_one = [r for r in rows if r.seed == 0]
+    alone = next(p for p in curve(of_one, sweep.name, TRAINING_LOSS, scope=TRAINING, series=series))
     assert alone.sem == pytest.approx(0.07)
+    assert "s.e. over episodes, of the training loss over steps;" in caption_of(plot_family(of_one, sweep))
 
 
 def test_points_of_one_seed_are_hollow_and_said_to_be():
     """Their bars lack the spread of seeds, and looked the surest of all."""
     sweep = plan_lr_horizon(CPU_FULL)
-    last = max(p.x for p in sweep.points)
-    rows = [r for r in rows_of(sweep, lambda _: {"cross_entropy": 4.0}) if r.x < last or r.seed == 0]
+    _, middle, last = sorted({p.x for p in sweep.points})
+    rows = [r for r in rows_of(sweep, lambda p: {"cross_entropy": 4 + (p.x != middle)}) if r.x < last or r.seed == 0]
     figure = plot_family(rows, sweep)
     faces = [c.lines[0].get_markerfacecolor() == "white" for c in figure.axes[0].containers]
-    assert faces == [False, True] * 2 and "hollow: one seed, over episodes" in figure.get_supxlabel()
-    only = plot_family([r for r in rows if r.seed == 0], sweep).get_supxlabel()
-    assert only.startswith("bars, one seed: s.e. over episodes")
+    assert faces == [False, True] * 2 and "hollow: one seed, over episodes" in caption_of(figure)
+    figure = plot_family([r for r in rows if r.seed == 0], sweep)
+    assert caption_of(figure).startswith("bars, one seed: s.e. over episodes;")
+    stars = [line for line in figure.axes[-1].lines if line.get_marker() == "*"]
+    assert stars and all(star.get_markerfacecolor() == "white" for star in stars)
     names = plan_conditioning(CPU_FULL)
     of_names = [r for r in rows_of(names, lambda _: {"cross_entropy": 4.0}) if r.x > 0 or r.seed == 0]
     figure = plot_names(of_names, names)
     dots = [line.get_markerfacecolor() == "white" for line in figure.axes[0].lines if line.get_marker() == "o"]
     assert dots == [True] + [False] * (len(names.labels) - 1)
-    assert "hollow dot: one seed, over episodes" in figure.get_supxlabel()
+    assert "hollow dot: one seed, over episodes" in caption_of(figure)
+
+
+def caption_of(figure):
+    return " ".join(figure.get_supxlabel().split())
+
+
+@pytest.mark.parametrize("plan", [plan_lr_horizon, plan_conditioning])
+@pytest.mark.parametrize("metrics", [("cross_entropy",), ("cross_entropy", "delta_psnr", TRAINING_LOSS)])
+def test_a_caption_lies_within_its_figure(plan, metrics):
+    """Of one panel and of two."""
+    sweep = plan(CPU_FULL)
+    last = max(p.x for p in sweep.points)
+    rows = [r for r in rows_of(sweep, lambda _: dict.fromkeys(metrics, 4.0)) if r.x < last or r.seed == 0]
+    figure = (plot_names if sweep.labels else plot_family)(rows, sweep)
+    figure.canvas.draw()
+    box = figure._supxlabel.get_window_extent()
+    assert 0 < box.x0 and box.x1 < figure.bbox.width and "one seed, over episodes" in caption_of(figure)
+
+
+def test_errors_of_tables_without_episodes_are_said_to_be_over_windows():
+    """Earlier versions counted none."""
+    sweep = plan_conditioning(CPU_FULL)
+    rows = [replace(r, episodes=0) for r in rows_of(sweep, lambda _: {"cross_entropy": 4.0})]
+    assert "bars: s.e. over seeds and windows;" in plot_names(rows, sweep).get_supxlabel()
+    figure, panel = plt.subplots()
+    _draw(panel, [replace(r, label="", seed=0) for r in rows], replace(sweep, labels=()), "perplexity")
+    assert "one seed: s.e. over windows" in panel.get_legend_handles_labels()[1]
+    plt.close(figure)
+
+
+def test_variants_without_a_seed_in_common_have_no_difference():
+    sweep = plan_conditioning(CPU_FULL)
+    of_default = {p.trial.train.seed for p in sweep.points if p.x == sweep.reference_x}
+    alone = min(of_default)
+    rows = [
+        r for r in rows_of(sweep, lambda _: {"cross_entropy": 4.0}) if (r.seed == alone) == (r.x == sweep.reference_x)
+    ]
+    said = describe(sweep, rows, [], AxisStatistics())
+    assert "<td>–</td>" in said and "nan" not in said
 
 
 def test_several_curves_are_shown_with_their_controls():
@@ -227,7 +269,7 @@ def test_a_best_size_that_is_doubtful_is_drawn_and_said_to_be(tmp_path, monkeypa
     )
     more = replace(budget, flops=2e12, loss=np.array([4.1, 4.0, 3.9]))
     law = Coefficient("a", 0.28, 0.22, 0.35)
-    fit = IsoFlop((budget, replace(more, misfit="sizes lie off")), law, 1.0, law, 1.0)
+    fit = IsoFlop((budget, replace(more, misfit="sizes lie off")), law, 1.0, law, 1.0, replace(APART, low=-0.1))
     monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
     plot_fits.plot_isoflop(fit, tmp_path / "isoflop.png")
     left, right = kept[0].axes
@@ -242,18 +284,33 @@ def line_of_parabolas(panel) -> str:
     return line.get_linestyle()
 
 
+def test_crosses_are_named_where_no_law_is_drawn_whose_legend_does(tmp_path, monkeypatch):
+    best, kept = Coefficient("N_opt", 2e4, 1.9e4, 2.1e4), []
+    sizes, loss = np.array([1e4, 2e4, 4e4]), np.array([4.0, 3.9, 4.0])
+    budget = Budget(1e12, sizes, loss, np.array([0.1, 0.0, 1.36]), 9.9, best, best)
+    monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
+    plot_fits.plot_isoflop(IsoFlop((budget,), refused="1 of 1 budgets"), tmp_path / "isoflop.png")
+    assert kept[0].get_supxlabel() == "crosses: by three sizes"
+
+
+APART = Coefficient("difference", 0.19, 0.1, 0.3)
+
+
 def test_a_growth_of_the_best_size_that_three_sizes_do_not_have_is_drawn_and_said_to_be_doubtful(tmp_path, monkeypatch):
     """Of the exponent alone: of no budget anything is doubtful."""
     best, law, kept = Coefficient("N_opt", 2e4, 1.9e4, 2.1e4), Coefficient("a", 0.28, 0.22, 0.35), []
     sizes, loss, parabola = np.array([1e4, 2e4, 4e4]), np.array([4.0, 3.9, 4.0]), np.array([0.1, 0.0, 1.36])
     first, last = (Budget(flops, sizes, loss, parabola, 9.9, best, best) for flops in (1e12, 2e12))
-    fit = IsoFlop((first, replace(last, loss=loss[[2, 0, 1]])), law, 1.0, replace(law, value=0.09), 1.0)
+    fit = IsoFlop((first, replace(last, loss=loss[[2, 0, 1]])), law, 1.0, replace(law, value=0.09), 1.0, APART)
     monkeypatch.setattr(plot_fits, "save", lambda figure, _: kept.append(figure))
     plot_fits.plot_isoflop(fit, tmp_path / "isoflop.png")
     assert line_of_parabolas(kept[0].axes[1]) == "--" and "doubtful" in kept[0].get_supxlabel()
     said = describe_fits([], fit, [], "")
     assert "How the best size grows is doubtful: as C<sup>0.28</sup>" in said and "as C<sup>0.09</sup>" in said
-    assert "The three sizes around each best one alone give 0.09, outside its interval." in said
+    assert (
+        "The three sizes around each best one alone give 0.09, another exponent by more than the bootstraps scatter."
+        in said
+    )
 
 
 @pytest.mark.parametrize(("high", "interval"), [(3.1e-4, ""), (1.4, " <span class=sem>[0, 1.4]</span>")])

@@ -173,18 +173,33 @@ def test_a_model_without_a_number_of_some_windows_is_named_and_not_compared(copi
     workspace, record = copied
     broken, *_ = trials_of(record, width=16, seed=0)
 
-    def lose(metrics):
-        lost = metrics["cross_entropy"].copy()
-        lost[:3] = np.nan
-        return metrics | {"cross_entropy": lost}
-
-    rejudge(workspace, broken, lose)
+    rejudge(workspace, broken, lambda metrics: metrics | {"cross_entropy": without(metrics["cross_entropy"], 3)})
     workspace.results.unlink()
     draw(workspace, record)
     verdict, text = verdicts(workspace)["numbers"]
     assert verdict == "bad" and f"{broken} has no cross_entropy of 3 windows; no difference is taken of these." in text
     said = workspace.report.read_text()
     assert "From 8 to 16, paired by window: ΔPSNR (dB) " in said
+
+
+def test_means_of_windows_that_some_model_lacks_are_said_to_be_of_the_others(copied):
+    """They were said to be in no difference, which left open that means, and counts of robots, leave them out."""
+    workspace, record = copied
+    sound, broken = (trials_of(record, width=16, seed=seed)[0] for seed in (1, 0))
+    for id, lost in ((sound, 0), (broken, 3)):
+        rejudge(workspace, id, lambda m, lost=lost: m | {"action_nats": without(0.1 + 0 * m["psnr"], lost)})
+    workspace.results.unlink()
+    draw(workspace, record)
+    verdict, text = verdicts(workspace)["numbers"]
+    assert (
+        verdict == "bad" and f"{broken} has no action_nats of 3 windows; no difference is taken of these, and" in text
+    )
+    assert "the means of action_nats are of the other windows." in text
+
+
+def without(values, first):
+    """A copy of `values` whose `first` ones are no numbers."""
+    return np.where(np.arange(len(values)) < first, np.nan, values)
 
 
 def test_trials_that_kept_no_windows_leave_the_question_open(copied):

@@ -71,12 +71,16 @@ def command(root, *words):
 
 def test_the_law_of_best_sizes_stands_under_exponents(monkeypatch, tmp_path, capsys):
     """It stood under the loss."""
-    law = IsoFlop(exponent=Coefficient("a", 0.5, 0.45, 0.55), near=Coefficient("a", 0.6, 0.4, 0.8))
+    law = IsoFlop(
+        exponent=Coefficient("a", 0.5, 0.45, 0.55),
+        near=Coefficient("a", 0.6, 0.4, 0.8),
+        apart=Coefficient("d", -0.1, -0.2, -0.05),
+    )
     monkeypatch.setattr(numbers, "read_numbers", lambda _: SimpleNamespace(fits=[], isoflop=law))
     assert command(tmp_path) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert lines[0].index("N_opt ~ C^0.500") == head.index("exponents")
-    assert "by three sizes N_opt ~" in lines[1] and "C^0.600" in lines[2] and "interval" in lines[2]
+    assert "by three sizes N_opt ~" in lines[1] and "C^0.600" in lines[2] and "another exponent" in lines[2]
 
 
 def predict(root, *words):
