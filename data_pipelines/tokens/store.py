@@ -9,8 +9,8 @@ import os
 import resource
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -121,11 +121,11 @@ class TokenStore:
         beside them. Raises as `episode`."""
         part, at = self._locate(name, split, i)
         facts = self.manifest(name).split(split)
-        steps = np.asarray(facts.steps[i - at : i - at + facts.parts[part]], np.int64)
-        kept = read_actions(self._path(name, split, part), int(steps.sum()))
+        with self._checking_not_replaced(name):
+            steps = np.asarray(facts.steps[i - at : i - at + facts.parts[part]], np.int64)
+            kept = read_actions(self._path(name, split, part), int(steps.sum()))
         if kept is None:
             return self.episode(name, split, i).actions.copy()  # a view would keep the whole record
-        self._check_not_replaced(name)  # not before: it might be replaced in between
         first = int(steps[:at].sum())
         return np.array(kept[first : first + steps[at]])
 
@@ -156,14 +156,15 @@ class TokenStore:
         """Statistics of the actions of these training episodes alone (int [N], positions in the store).
 
         Reads what stands beside each part, and the episodes themselves in a store of earlier versions, which
-        gives the same bits. Raises DataError for what is damaged.
+        gives the same bits. Raises as `episode`.
         """
         rows, ends = [], self._ends[name, "train"]
         episodes = np.sort(episodes)
         of_episode = np.searchsorted(ends, episodes, side="right")
         for part in np.unique(of_episode).tolist():
             own = episodes[of_episode == part]
-            kept = read_moments(self._path(name, "train", part), self.manifest(name).train.parts[part])
+            with self._checking_not_replaced(name):
+                kept = read_moments(self._path(name, "train", part), self.manifest(name).train.parts[part])
             if kept is None:
                 rows += [moments_row(self.episode(name, "train", int(i)).actions) for i in own]
             else:
@@ -245,6 +246,14 @@ class TokenStore:
                 "Start a new run with the new one, or put the old one back and run the same command again."
             )
         self._stamps[name] = stamp
+
+    @contextmanager
+    def _checking_not_replaced(self, name: str) -> Iterator[None]:
+        """For what is read meanwhile: damaged or not, it may be that of a dataset which replaced this one."""
+        try:
+            yield
+        finally:
+            self._check_not_replaced(name)  # not before: it might be replaced in between
 
     def __getstate__(self) -> dict:
         return {"root": self.root, "_manifests": self._manifests, "_stamps": self._stamps}

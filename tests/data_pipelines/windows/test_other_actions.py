@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 
 import numpy as np
@@ -112,6 +113,20 @@ def test_actions_beside_a_part_that_are_damaged_are_named(tmp_path):
     np.save(path, np.load(path)[1:])
     with pytest.raises(DataError, match=r"val-.*.actions.npy: float32 \[\d+, 3\] cannot be the actions of \d+ steps"):
         store.actions("toy", "val", 0)
+
+
+def test_what_stands_beside_the_parts_of_another_dataset_is_neither_used_nor_called_damaged(tmp_path):
+    """It has as many training episodes, and other steps."""
+    (tmp_path / "other").mkdir()
+    store, other = (
+        small_store(at, lengths=(steps,) * 8, min_val=4, max_val_fraction=0.5)
+        for at, steps in ((tmp_path, 20), (tmp_path / "other", 26))
+    )
+    shutil.rmtree(store.root / "toy")
+    shutil.copytree(other.root / "toy", store.root / "toy")
+    for read in (lambda: store.actions("toy", "val", 0), lambda: store.action_moments("toy", np.arange(2))):
+        with pytest.raises(DataError, match="was replaced while it was in use"):
+            read()
 
 
 def test_of_each_episode_the_smallest_hash_comes_first_and_no_others_are_sorted(tmp_path, monkeypatch):
