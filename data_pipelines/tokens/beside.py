@@ -5,6 +5,7 @@ Owns their files. Stores of earlier versions lack some; whoever reads then reads
 
 from __future__ import annotations
 
+import io
 import os
 import tokenize
 from pathlib import Path
@@ -25,23 +26,21 @@ def write_beside(part: Path, kind: str, rows: np.ndarray, scratch: Path) -> None
 
 
 def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, otherwise: str) -> np.ndarray | None:
-    """[rows, ...] of `dtype`, memory-mapped; None if there is no such file beside `part`.
+    """[rows, ...] of `dtype`; None if there is no such file beside `part`.
 
     `of` says what of ("the actions of 12 steps") and `otherwise` what is done without the file, for messages. Raises
     DataError for a damaged file, UnreachableError where the disk fails.
     """
     path = beside(part, kind)
 
-    def read() -> np.ndarray:
-        try:
-            return np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
-            raise DataError(f"{path}: {of} cannot be read ({error}). Remove the file, and {otherwise}.") from error
-
     try:
-        found = retry(path, read)
+        data = retry(path, path.read_bytes)  # numpy takes a disk that fails in the middle for a file that ends there
     except FileNotFoundError:
         return None
+    try:
+        found = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
+        raise DataError(f"{path}: {of} cannot be read ({error}). Remove the file, and {otherwise}.") from error
     if found.ndim != 2 or len(found) != rows or found.dtype != dtype:
         raise DataError(f"{path}: {found.dtype} {list(found.shape)} cannot be {of}. Remove the file, and {otherwise}.")
     return found

@@ -245,6 +245,32 @@ def test_what_stands_beside_the_episodes_is_read_again_too(copy, failing, name):
         TokenStore(copy).action_moments("arm", np.arange(3))
 
 
+def test_a_disk_that_fails_in_the_middle_of_a_file_is_no_damage(copy, monkeypatch):
+    path, plain = copy / "arm/train-00000-of-00001.moments.npy", builtins.open
+
+    class Torn(io.FileIO):
+        """Gives what stands before the array."""
+
+        def readinto(self, buffer) -> int:
+            if self.tell() >= 128:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return super().readinto(memoryview(buffer)[:128])
+
+        def readall(self) -> bytes:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    store = TokenStore(copy)
+    for owner in (builtins, io):
+        monkeypatch.setattr(
+            owner,
+            "open",
+            lambda place, *a, **b: io.BufferedReader(Torn(place)) if place == path else plain(place, *a, **b),
+        )
+    monkeypatch.setattr(location.time, "sleep", lambda seconds: None)
+    with pytest.raises(UnreachableError, match="moments.npy: cannot be read .*Input/output error"):
+        store.action_moments("arm", np.arange(3))
+
+
 def test_a_dataset_whose_manifest_cannot_be_read_now_is_not_replaced(copy, rlds, failing):
     failing(10**6, copy / "arm" / "manifest.json")
     spec, directory = next((spec, directory) for spec, directory in rlds.items() if spec.name == "arm")
