@@ -129,19 +129,17 @@ def write_part(
 def read_part(directory: Path, part: Part) -> PartFacts | None:
     """The facts of a finished part; None if it is missing, or its files do not have the sizes they were written with.
 
-    Sizes suffice to detect what a crash or a full disk leaves behind.
+    Sizes suffice to detect what a crash or a full disk leaves behind, and numbers of rows of what stands beside.
     """
     try:
         facts = from_dict(PartFacts, json.loads(_facts_path(directory, part).read_text()))
     except (OSError, ValueError, AttributeError, TypeError, ConfigError):
         return None
     for split in SPLITS:
-        path = directory / part_name(split, part.number, part.count)
+        path, own = directory / part_name(split, part.number, part.count), getattr(facts, split)
         size = path.stat().st_size if path.is_file() else 0
-        if size != getattr(facts, split).size:
+        if size != own.size or (own.episodes and not _reads_beside(path, split, own)):
             return None
-    if facts.train.episodes and not _has_moments(directory, part, len(facts.train.episodes)):
-        return None
     return facts if facts.part == part else None
 
 
@@ -152,9 +150,12 @@ def read_actions(part: Path, steps: int) -> np.ndarray | None:
     return read_beside(part, ACTIONS, steps, np.float32, of, "they are read with the frames")
 
 
-def _has_moments(directory: Path, part: Part, episodes: int) -> bool:
+def _reads_beside(path: Path, split: str, own: PartSplit) -> bool:
+    """Whether what stands beside the records at `path` is that of these episodes. A part of an earlier version lacks
+    the actions, and is as good without."""
     try:
-        return read_moments(directory / part_name("train", part.number, part.count), episodes) is not None
+        read_actions(path, sum(own.steps))
+        return split != "train" or read_moments(path, len(own.episodes)) is not None
     except DataError:
         return False
 

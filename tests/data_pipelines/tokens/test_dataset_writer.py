@@ -99,7 +99,9 @@ def stop_after(episodes: int):
     return progress
 
 
-@pytest.mark.parametrize("damage", ["truncated", "missing", "statistics", "no statistics", "facts", "other facts"])
+@pytest.mark.parametrize(
+    "damage", ["truncated", "missing", "statistics", "no statistics", "actions", "facts", "other facts"]
+)
 def test_damaged_part_is_made_again(rlds, undisturbed, tmp_path, damage):
     work = begin(rlds, tmp_path)
     record, facts = sorted(work.glob("train-*.array_record"))[1], sorted(work.glob("parts/*.json"))
@@ -107,6 +109,9 @@ def test_damaged_part_is_made_again(rlds, undisturbed, tmp_path, damage):
         beside(record, MOMENTS).write_bytes(beside(record, MOMENTS).read_bytes()[:-1])
     elif damage == "no statistics":
         beside(record, MOMENTS).unlink()
+    elif damage == "actions":
+        actions = sorted(work.glob("val-*.actions.npy"))[0]
+        np.save(actions, np.load(actions)[1:])
     elif damage == "truncated":
         record.write_bytes(record.read_bytes()[:-1])
     elif damage == "missing":
