@@ -158,7 +158,17 @@ def plan_trials(
 
 
 def checkpoint_bytes(plan: TrialPlan) -> int:
-    """Size of the checkpoints that a finished trial leaves: weights and two moments in float32, and the weights'
-    average where there is one."""
-    copies = 3 + (plan.trial.train.ema_decay > 0)
-    return UNWATCHED.keep_checkpoints * copies * 4 * plan.cost.parameters
+    """Size of the checkpoints that a finished trial leaves."""
+    trial, train = plan.trial, plan.trial.train
+    return UNWATCHED.keep_checkpoints * _state_bytes(trial.model, _table_of(trial), train.ema_decay > 0, train.only)
+
+
+@functools.cache
+def _state_bytes(model: ModelConfig, table: EmbodimentTable, average: bool, only: tuple[str, ...]) -> int:
+    import jax
+
+    from hma_jax.model.hma import declare_model
+    from hma_jax.training.state import state_shapes
+
+    state = state_shapes(declare_model(model, table), table, average=average, only=only)
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
