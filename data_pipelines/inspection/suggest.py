@@ -17,7 +17,7 @@ from data_pipelines.sources.convertible import unsupported_images_text
 from data_pipelines.sources.rlds.schema import METADATA, RATE_KEY, field_slice
 from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES
-from hma_jax.config import require
+from hma_jax.config import ConfigError
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 DEPTHS = re.compile(r"depth|dispar", re.IGNORECASE)
@@ -107,11 +107,11 @@ class WindowFacts:
 
 def require_own_rate(facts: Facts) -> None:
     """Raises ConfigError if no frames could be taken at the rate that the dataset's own files say."""
-    require(
-        facts.hz is None or facts.hz <= MAX_STRIDE * FRAME_RATE,
-        f"{facts.directory}: its own files say {facts.hz:g} native frames per second (those of RLDS as {RATE_KEY} in "
-        f"{METADATA}), which is too many for a recording: correct that, or give --hz",
-    )
+    if facts.hz is not None and facts.hz > MAX_STRIDE * FRAME_RATE:
+        raise ConfigError(
+            f"{facts.directory}: its own files say {facts.hz:g} native frames per second (those of RLDS as {RATE_KEY} "
+            f"in {METADATA}), which is too many for a recording: correct that, or give --hz"
+        )
 
 
 def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
