@@ -15,7 +15,7 @@ from hma_jax.training import own
 from hma_jax.training.branch import begin_from
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.loop import LoopOptions
-from hma_jax.training.reading import load_items, read_description
+from hma_jax.training.reading import load_items, on_host, read_description
 from hma_jax.training.state import TrainState, init_state, state_shapes
 from hma_jax.training.step import make_train_step
 from tests.hma_jax.test_robots import DECLARED, MODEL, OWN, SIX
@@ -84,7 +84,7 @@ def run(tmp_path_factory) -> tuple[TrainState, Path]:
     begin_from(root / "whole", root / "former", 2)
     checkpoints = root / "former" / "checkpoints"
     shapes = state_shapes(declare_model(MODEL, TABLE), TABLE, only=ONLY.only)._asdict()
-    few = load_items(checkpoints / "2", {name: item for name, item in shapes.items() if item is not None})
+    few = load_items(checkpoints / "2", on_host({name: item for name, item in shapes.items() if item is not None}))
     description = read_description(checkpoints / "2")
     shutil.rmtree(checkpoints)
     with Checkpoints(checkpoints, description) as written:
