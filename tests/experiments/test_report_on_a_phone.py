@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("aiohttp", reason="needs the extra `play`")
-pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
-
-from experiments.presets import CPU_FULL  # noqa: E402
-from experiments.report.style import CSS  # noqa: E402
-from experiments.report.sweeps import AxisStatistics, describe  # noqa: E402
-from experiments.sweeps.conditioning import plan as plan_conditioning  # noqa: E402
-from experiments.sweeps.width import plan as plan_width  # noqa: E402
-from tests.experiments.applications.test_play_page import chromium  # noqa: E402, F401  a fixture
-from tests.experiments.test_report_figures import rows_of  # noqa: E402
+from experiments.presets import CPU_FULL
+from experiments.report.style import CSS
+from experiments.report.sweeps import AxisStatistics, describe
+from experiments.sweeps.conditioning import plan as plan_conditioning
+from experiments.sweeps.width import plan as plan_width
+from tests.experiments.applications.browser import chromium  # noqa: F401  a fixture
+from tests.experiments.test_report_figures import rows_of
 
 WHERE = """() => [...document.querySelectorAll(".scroll")].map(box => {
     const edge = cell => { const at = cell.getBoundingClientRect(), own = box.getBoundingClientRect();

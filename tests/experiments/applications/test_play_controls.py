@@ -9,14 +9,8 @@ pytest.importorskip("aiohttp", reason="needs the extra `play`")
 pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
 
 from experiments.applications.play.server import SESSIONS  # noqa: E402
+from tests.experiments.applications.browser import edit_page, frames, opened  # noqa: E402
 from tests.experiments.applications.serving import until  # noqa: E402
-from tests.experiments.applications.test_play_page import (  # noqa: E402
-    browsing,  # noqa: F401  a fixture
-    chromium,  # noqa: F401  a fixture
-    edit_page,
-    frames,
-    opened,
-)
 
 PUSH = 2.1  # what a key asks of the pusher, whose rest is 0
 
@@ -40,7 +34,7 @@ async def drives_arm(page) -> None:
     await frames(page, 1)
 
 
-def test_a_tap_between_two_frames_is_made_in_the_next_one(browsing):  # noqa: F811
+def test_a_tap_between_two_frames_is_made_in_the_next_one(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         made = executed(client)
@@ -62,7 +56,7 @@ def test_a_tap_between_two_frames_is_made_in_the_next_one(browsing):  # noqa: F8
     browsing(test)
 
 
-def test_a_tap_before_a_pause_is_forgotten(browsing):  # noqa: F811
+def test_a_tap_before_a_pause_is_forgotten(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         made = executed(client)
@@ -76,7 +70,7 @@ def test_a_tap_before_a_pause_is_forgotten(browsing):  # noqa: F811
     browsing(test)
 
 
-def test_every_dimension_is_set_by_the_keyboard_and_stays_until_its_slider_is_left(browsing):  # noqa: F811
+def test_every_dimension_is_set_by_the_keyboard_and_stays_until_its_slider_is_left(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await drives_arm(page)
@@ -101,7 +95,7 @@ def test_every_dimension_is_set_by_the_keyboard_and_stays_until_its_slider_is_le
     browsing(test)
 
 
-def test_what_a_pointer_has_moved_or_pressed_leaves_the_keys_to_the_robot(browsing):  # noqa: F811
+def test_what_a_pointer_has_moved_or_pressed_leaves_the_keys_to_the_robot(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await drives_arm(page)
@@ -124,7 +118,7 @@ def test_what_a_pointer_has_moved_or_pressed_leaves_the_keys_to_the_robot(browsi
     browsing(test)
 
 
-def test_a_button_that_has_the_focus_is_pressed_by_space_and_keeps_it(browsing):  # noqa: F811
+def test_a_button_that_has_the_focus_is_pressed_by_space_and_keeps_it(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.focus("#record")
@@ -144,7 +138,7 @@ def test_a_button_that_has_the_focus_is_pressed_by_space_and_keeps_it(browsing):
     browsing(test)
 
 
-def test_a_stick_that_drifts_does_not_keep_an_abandoned_page_going(browsing, monkeypatch):  # noqa: F811
+def test_a_stick_that_drifts_does_not_keep_an_abandoned_page_going(browsing, monkeypatch):
     edit_page(monkeypatch, "IDLE = 60e3", "IDLE = 1e3")
 
     async def test(browser, address, client):

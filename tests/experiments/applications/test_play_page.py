@@ -2,103 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import io
 import json
-import os
-import shutil
 import threading
 import time
 from dataclasses import replace
-from importlib.resources import files
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
-playwright = pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
+pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
 
 from PIL import Image  # noqa: E402
 
-from experiments.applications.play import server, sessions  # noqa: E402
+from experiments.applications.play import sessions  # noqa: E402
 from experiments.applications.play.server import SESSIONS  # noqa: E402
-from tests.experiments.applications.serving import SECONDS, serving, until  # noqa: E402
+from tests.experiments.applications.browser import PATIENCE, count, edit_page, frames, opened  # noqa: E402
+from tests.experiments.applications.serving import SECONDS, until  # noqa: E402
 from tests.experiments.applications.test_play_server import FakeTruth  # noqa: E402
-
-CHROMIUM = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-PATIENCE = 60_000
-"""Milliseconds that anything may take on a busy machine."""
-
-
-async def launched(play):
-    """A browser: the one that is installed, or playwright's own. Skips the test where there is neither."""
-    try:
-        return await play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-    except playwright.Error as error:
-        pytest.skip(f"no Chromium: install it, or name it in PLAYWRIGHT_CHROMIUM ({str(error).splitlines()[0]})")
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    """A loop and the browser in it, for all tests: beginning one takes longer than most of them."""
-    with asyncio.Runner() as runner:
-        play = runner.run(playwright.async_playwright().start())
-        try:
-            browser = runner.run(launched(play))
-            yield runner, browser
-            runner.run(browser.close())
-        finally:
-            runner.run(play.stop())
-
-
-@pytest.fixture
-def browsing(chromium):
-    """Runs `test(browser, address, client)` against a server of this process; who came in leaves with it."""
-    runner, browser = chromium
-
-    def run(test, **options) -> None:
-        async def with_browser(client) -> None:
-            try:
-                await test(browser, str(client.make_url("/")), client)
-            finally:
-                for context in browser.contexts:
-                    await context.close()
-
-        serving(with_browser, run=runner.run, **options)
-
-    return run
-
-
-def edit_page(monkeypatch, old: str, new: str) -> None:
-    """Servers that begin from now on serve the page with `new` in place of `old`."""
-    page = files("experiments.applications.play").joinpath("page.html").read_text()
-    assert old in page
-    edited = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda: page.replace(old, new)))
-    monkeypatch.setattr(server, "files", lambda _: edited)
-
-
-async def opened(browser, address: str, **how):
-    """The page in a new context (a person), an episode under way. Waiting for an expression needs `bypass_csp`."""
-    context = await browser.new_context(**{"bypass_csp": True, **how})
-    page = await context.new_page()
-    page.set_default_timeout(PATIENCE)
-    page.faults = []
-    page.on("pageerror", lambda error: page.faults.append(str(error)))
-    await page.goto(address)
-    await page.wait_for_selector("body[data-count]")
-    return page
-
-
-async def count(page) -> int:
-    return int(await page.evaluate("document.body.dataset.count"))
-
-
-async def frames(page, number: int) -> None:
-    """Waits for so many more frames of the episode: what the page counts now may be any number."""
-    here = await count(page)
-    await page.wait_for_function(f"document.body.dataset.count >= {here + number}")
 
 
 async def picture(page) -> np.ndarray:
@@ -269,25 +192,19 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
     browsing(test, visitors=1)
 
 
-def test_a_robot_that_is_chosen_while_the_connection_is_lost_begins_once_there_is_one(browsing):
+@pytest.mark.parametrize("known", [True, False])
+def test_a_robot_that_is_chosen_while_the_connection_is_lost_begins_once_there_is_one(browsing, known: bool):
+    """Also one that is chosen before the page knows that the connection is lost."""
+
     async def test(browser, address, client):
         page = await opened(browser, address)
-        await page.evaluate("state.socket.close(); document.querySelector('[data-name=arm]').click()")
-        await page.wait_for_function("state.socket.readyState == 1 && state.tries == 0")
-        await frames(page, 2)
-        assert await page.inner_text("#name") == "arm" and not page.faults
-        [visitor] = client.server.app[SESSIONS].visitors.values()
-        assert visitor.session.robot.name == "arm"
-
-    browsing(test)
-
-
-def test_a_robot_that_is_chosen_before_the_page_knows_that_the_connection_is_lost_begins_once_there_is_one(browsing):
-    async def test(browser, address, client):
-        page = await opened(browser, address)
-        await page.evaluate("state.socket.send = () => {}; document.querySelector('[data-name=arm]').click()")
-        assert await page.evaluate("state.begun && state.socket.readyState == 1")
-        await page.evaluate("state.socket.close()")
+        choose, lose = "document.querySelector('[data-name=arm]').click()", "state.socket.close()"
+        if known:
+            await page.evaluate(f"{lose}; {choose}")
+        else:
+            await page.evaluate(f"state.socket.send = () => {{}}; {choose}")
+            assert await page.evaluate("state.begun && state.socket.readyState == 1")
+            await page.evaluate(lose)
         await page.wait_for_function("state.socket.readyState == 1 && state.tries == 0")
         await frames(page, 2)
         assert await page.inner_text("#name") == "arm" and not page.faults

@@ -8,16 +8,10 @@ pytest.importorskip("aiohttp", reason="needs the extra `play`")
 pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
 
 from experiments.applications.play import recording  # noqa: E402
-from tests.experiments.applications.test_play_page import (  # noqa: E402
-    browsing,  # noqa: F401  a fixture
-    chromium,  # noqa: F401  a fixture
-    edit_page,
-    frames,
-    opened,
-)
+from tests.experiments.applications.browser import edit_page, frames, opened  # noqa: E402
 
 
-def test_a_page_without_input_says_why_time_stands_still(browsing):  # noqa: F811
+def test_a_page_without_input_says_why_time_stands_still(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.evaluate("state.input -= 61e3")
@@ -35,7 +29,7 @@ def test_a_page_without_input_says_why_time_stands_still(browsing):  # noqa: F81
     browsing(test)
 
 
-def test_a_page_that_was_hidden_says_why_time_stands_still(browsing):  # noqa: F811
+def test_a_page_that_was_hidden_says_why_time_stands_still(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         hide = "Object.defineProperty(document, 'hidden', {value: true}); document.dispatchEvent(new Event('visibilitychange'))"
@@ -53,7 +47,7 @@ def test_a_page_that_was_hidden_says_why_time_stands_still(browsing):  # noqa: F
     browsing(test)
 
 
-def test_what_is_chosen_is_told_without_colours_and_keeps_the_focus(browsing):  # noqa: F811
+def test_what_is_chosen_is_told_without_colours_and_keeps_the_focus(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         pressed = "[...document.querySelectorAll('[aria-pressed=true]')].map(b => b.ariaLabel)"
@@ -70,7 +64,7 @@ def test_what_is_chosen_is_told_without_colours_and_keeps_the_focus(browsing):  
     browsing(test)
 
 
-def test_frames_say_nothing_again_and_leave_an_error_readable(browsing, monkeypatch):  # noqa: F811
+def test_frames_say_nothing_again_and_leave_an_error_readable(browsing, monkeypatch):
     edit_page(monkeypatch, "STAYS = 4e3", "STAYS = 1e3")
 
     async def test(browser, address, client):
@@ -89,7 +83,7 @@ def test_frames_say_nothing_again_and_leave_an_error_readable(browsing, monkeypa
     browsing(test)
 
 
-def test_a_recording_that_is_full_says_so_until_another_begins(browsing, monkeypatch):  # noqa: F811
+def test_a_recording_that_is_full_says_so_until_another_begins(browsing, monkeypatch):
     monkeypatch.setattr(recording, "MOST_FRAMES", 4)
 
     async def test(browser, address, client):

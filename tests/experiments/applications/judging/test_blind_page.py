@@ -4,17 +4,13 @@ import json
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from experiments.applications.judging.blind import write_blind
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
 from experiments.applications.policies.tasks import RecordedTask
 
-playwright = pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
-from tests.experiments.applications.test_play_page import chromium  # noqa: E402, F401  a fixture
 
-
-def test_labels_outlive_a_page_that_is_loaded_again(chromium, tmp_path):  # noqa: F811
+def test_labels_outlive_a_page_that_is_loaded_again(chromium, tmp_path):
     runner, browser = chromium
     films = np.random.default_rng(0).integers(256, size=(3, 2, 8, 8, 3), dtype=np.uint8)
     judged = SimpleNamespace(
