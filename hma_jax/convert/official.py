@@ -263,7 +263,7 @@ def _hash_of(params: Params) -> str:
 
 def _without_constant_actions(arrays: dict[str, np.ndarray], table: EmbodimentTable) -> dict[str, np.ndarray]:
     """The parameters that multiply actions, with zeros for action values that do not vary: this model normalises those
-    to 0, the release divides their rounding noise by about 0 (`EmbodimentTable.normalise`)."""
+    to 0, the release divides their rounding noise by about 0 (`ActionUnits.normalise`)."""
     alive_EU = table.alive()
     return {path: np.where(alive_EU[..., None], arrays[path], 0) for path in ACTIONS_IN if path in arrays}
 

@@ -98,7 +98,12 @@ class ActionUnits(NamedTuple):
     unit_EU: jax.Array | np.ndarray  # the raw differences that are normalised to 1; 0: no signal
 
     def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """Raw chunks [B, ..., U] on each robot's own scale."""
+        """Raw chunks [B, ..., U] on each robot's own scale: see `Embodiment`.
+
+        DIFFERS: padding and dead dimensions become exactly 0; the release divides by std + 1e-10,
+        which turns rounding noise on a constant dimension into values of order 100 (reference
+        section 5.6).
+        """
         return normalise(actions, *self._of(embodiment_B, actions.ndim))
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
@@ -180,19 +185,6 @@ class EmbodimentTable:
                 for e in self.entries
             )
         )
-
-    def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """Raw chunks [B, ..., U] on each robot's own scale: see `Embodiment`.
-
-        DIFFERS: padding and dead dimensions become exactly 0; the release divides by std + 1e-10,
-        which turns rounding noise on a constant dimension into values of order 100 (reference
-        section 5.6).
-        """
-        return self.scale().normalise(actions, embodiment_B)
-
-    def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """The inverse of `normalise`: raw units; dead dimensions take their centre."""
-        return self.scale().unnormalise(actions, embodiment_B)
 
 
 def normalise(actions: Array, centre: Array, unit: Array, xp: Any = jnp) -> Array:

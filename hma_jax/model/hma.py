@@ -155,7 +155,7 @@ class HMA(nnx.Module):
         return self
 
     def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """Raw chunks [B, ..., U] as the model computes with them: see `EmbodimentTable.normalise`."""
+        """Raw chunks [B, ..., U] as the model computes with them: see `ActionUnits.normalise`."""
         return (self._units or self.table.scale()).normalise(actions, embodiment_B)
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:

@@ -144,7 +144,7 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
 
 
 def _normalised(batch: Mapping[str, np.ndarray], scale: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """A batch of the host with its actions as `EmbodimentTable.normalise` has them; `scale` is the table's."""
+    """A batch of the host with its actions as `ActionUnits.normalise` has them; `scale` is the table's."""
     of_rows = [x[batch["embodiment"]][:, None] for x in scale]
     return {**batch, "actions": normalise(np.asarray(batch["actions"], np.float32), *of_rows, xp=np)}
 

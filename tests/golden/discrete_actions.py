@@ -28,7 +28,7 @@ def check_joint(case: Case) -> None:
             logits, predicted = read(case.params, case.actions(robot), robots, hidden)
             check_channels_first(case, f"states_{way}__{robot}", logits)
             case.check(f"actions_{way}__{robot}", predicted[..., :chunk])
-        raw = case.table.unnormalise(predicted, robots)
+        raw = case.table.scale().unnormalise(predicted, robots)
         case.check(f"actions_policy_unnormalized__{robot}", raw[..., :chunk])
     if "train_loss" in case.outputs:
         _check_training(case)
@@ -46,7 +46,7 @@ def _check_policy(case: Case, everything: jax.Array) -> None:
     case.check("generate_policy_tokens", window.reshape(batch, -1))
     robots = case.robot(robot, batch)
     predicted = case.declared.merge(case.params).action_head(out.actions, robots)
-    raw = case.table.unnormalise(predicted, robots)
+    raw = case.table.scale().unnormalise(predicted, robots)
     chunk = case.table.entries[case.table.index(robot)].chunk
     case.check("generate_policy_actions_unnormalized", raw[..., :chunk])
 

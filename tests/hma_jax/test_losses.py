@@ -53,11 +53,11 @@ def action_losses(config, action_head):
     """Of `action_head(target, *its arguments)` in a model's place."""
     batch = random_batch(0, config)
     robots, actions = jnp.asarray(batch["embodiment"]), batch["actions"]
-    target = TABLE.normalise(actions, robots)
+    target = TABLE.scale().normalise(actions, robots)
     model = SimpleNamespace(
         config=config,
         table=TABLE,
-        normalise=TABLE.normalise,
+        normalise=TABLE.scale().normalise,
         action_head=lambda *given: action_head(target, *given),
     )
     return action_loss_per_step(model, jnp.zeros((*actions.shape[:2], 1)), actions, robots, robots, KEYS), robots

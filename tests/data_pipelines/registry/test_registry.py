@@ -150,10 +150,10 @@ def test_constant_action_dimensions_are_safe_to_normalise():
     """Planar robots, flags that never rise: std 0 and rounding noise give exactly 0, not infinity."""
     table = EmbodimentTable((Embodiment("flat", 3, 2, mean=(1.0, 0.1, -2.0), std=(0.5, 0.0, 1e-8)),))
     raw = np.tile(np.float32([2.0, 0.1 + 1e-7, -2.0 + 1e-6]), (1, 4, 2))
-    normal = np.asarray(table.normalise(raw, np.array([0])))
+    normal = np.asarray(table.scale().normalise(raw, np.array([0])))
     assert np.allclose(normal, np.tile([2.0, 0.0, 0.0], 2), atol=1e-6)
     assert not normal[..., [1, 2]].any()
-    assert np.allclose(table.unnormalise(normal, np.array([0])), raw, atol=1e-5)
+    assert np.allclose(table.scale().unnormalise(normal, np.array([0])), raw, atol=1e-5)
 
 
 # --- entries ----------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def test_missing_packages_are_named_with_the_extra_and_what_draws(monkeypatch):
 @pytest.mark.parametrize("robot", ["robosuite_panda_lift", "robosuite_g1"])  # of robosuite-models, which needs it too
 def test_another_version_of_robosuite_is_refused(monkeypatch, robot):
     """Of 1.5.2 episodes would ignore their seeds."""
-    specs, installed = select([robot]), {"robosuite": "1.5.1"}
+    specs, installed = select([robot]), dict(packages.USED_VERSIONS)
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(packages.ctypes.util, "find_library", lambda name: "lib")
     monkeypatch.setattr(packages.importlib.metadata, "version", lambda name: installed.get(name, "1"))

@@ -106,9 +106,9 @@ def test_manifest_keeps_the_quantiles_whoever_makes_the_parts(tmp_path):
 def test_quantiles_become_minus_one_and_one_and_back():
     table = EmbodimentTable((Embodiment("arm", 2, 2, (0.0, 5.0), (3.0, 1e-9), low=(-2.0, 5.0), high=(6.0, 5.0)),))
     raw = np.float32([[[-2, 5, 6, 5.1], [2, 5, 10, 5]]])
-    given = np.asarray(table.normalise(raw, np.array([0])))
+    given = np.asarray(table.scale().normalise(raw, np.array([0])))
     np.testing.assert_allclose(given, [[[-1, 0, 1, 0], [0, 0, 2, 0]]])  # not cut off; dead values are 0
-    back = np.asarray(table.unnormalise(given, np.array([0])))
+    back = np.asarray(table.scale().unnormalise(given, np.array([0])))
     np.testing.assert_allclose(back, [[[-2, 5, 6, 5], [2, 5, 10, 5]]])
 
 
