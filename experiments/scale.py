@@ -44,9 +44,9 @@ def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
 def say_average(configs: Iterable[TrainConfig]) -> None:
     """A line where a decay of the moving average is larger than any that a run comes to, so that others would have the
     same effect."""
-    from hma_jax.training.average import risen_decay
+    from hma_jax.training.average import warmup_decay
 
-    last = {(config.ema_decay, config.steps): risen_decay(config.steps - 1) for config in configs}
+    last = {(config.ema_decay, config.steps): warmup_decay(config.steps - 1) for config in configs}
     short = [
         f"{decay:g} in {counted(steps, 'step')} ({last[decay, steps]:.6g} at the end)"
         for decay, steps in sorted(last)

@@ -88,7 +88,7 @@ def _every_frame(
         def predict(frame: Frame) -> jax.Array:
             later = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= t)[None, :, None], tokens.shape)
             values, masked = tokens.at[:, t].set(frame.values), later.at[:, t].set(frame.masked)
-            return hma(values, masked, aligned, robots, hidden_BT=hidden).predictions[:, t]
+            return hma(values, masked, aligned, robots, action_hidden_BT=hidden).token_outputs[:, t]
 
         first = predict(blank_frame(hma.config, len(tokens)))
         keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)

@@ -40,7 +40,7 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
     cache = jax.jit(lambda p: window(declared.merge(p)).start(past, size - 1))(weights)
 
     def window_pass(model: HMA) -> jax.Array:
-        return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).predictions
+        return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).token_outputs
 
     def whole(params: Any) -> jax.Array:
         return window_pass(declared.merge(params))

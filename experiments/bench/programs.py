@@ -40,7 +40,7 @@ def program(
 
     def forward(params: Any) -> jax.Array:
         model = declared.merge(params)
-        return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).predictions
+        return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).token_outputs
 
     def slide(params: Any) -> Any:
         return steps.slide(window(params), past, keys, decode)

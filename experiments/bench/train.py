@@ -32,7 +32,7 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
         def forward(params: Params, batch: dict[str, jax.Array]) -> jax.Array:
             model, key = declared.merge(params), jax.random.key(subject.seed)
             masked = mask_batch(key, batch["tokens"], batch["embodiment"], config, settings.masking, table)
-            return model(masked.inputs, masked.masked, model.align(batch["actions"]), batch["embodiment"]).predictions
+            return model(masked.inputs, masked.masked, model.align(batch["actions"]), batch["embodiment"]).token_outputs
 
         return forward
 

@@ -78,7 +78,7 @@ def generate_function(
         base = jax.random.wrap_key_data(key, impl=GENERATOR)
         keys = jax.vmap(lambda row: jax.random.fold_in(base, row))(jnp.arange(config.batch))
         hma, hidden = declared.merge(nested(weights)), hidden_at_inference(table, setting, embodiment, config.frames)
-        return rollout(hma, prompt, actions[:, None], embodiment, keys, config.decode, hidden_BT=hidden)[:, 0]
+        return rollout(hma, prompt, actions[:, None], embodiment, keys, config.decode, action_hidden_BT=hidden)[:, 0]
 
     return generate
 

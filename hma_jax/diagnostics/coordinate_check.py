@@ -93,22 +93,22 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     activations: dict[str, jax.Array] = {}
     record = activations.__setitem__
     model.trunk = _RecordingTrunk(model, record)
-    hidden = model.align_hidden(masked.hidden_T, masked.hidden_T.shape)
+    hidden = model.align_hidden(masked.action_hidden_T, masked.action_hidden_T.shape)
     embodiment_B = batch["embodiment"]
-    out = model(masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden)
+    out = model(masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, action_hidden_BT=hidden)
     diffusion = model.config.diffusion
     if diffusion:
-        record("conditions", out.predictions)
+        record("conditions", out.token_outputs)
     else:
-        record("logits", model.logits(out.predictions, batch["tokens"]))
+        record("logits", model.logits(out.token_outputs, batch["tokens"]))
     if diffusion:
         key = key_of(0)
         time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)
         _record_outputs(model.denoiser, "condition", lambda y: record("denoiser condition", y))
-        record("denoiser", model.denoiser(noise, time, out.predictions))
-    if model.action_head is not None and out.actions is not None:
+        record("denoiser", model.denoiser(noise, time, out.token_outputs))
+    if model.action_head is not None and out.action_features_BTD is not None:
         args = draw_noise(key, batch["actions"].shape, diffusion.steps)[::-1] if diffusion else ()
-        record("actions", model.action_head(*args, out.actions, embodiment_B))
+        record("actions", model.action_head(*args, out.action_features_BTD, embodiment_B))
     return activations
 
 

@@ -177,12 +177,14 @@ def make_loss(
 
     def loss(params: Params, batch: dict[str, jax.Array], actions: jax.Array) -> jax.Array:
         hma, tokens, real = declared.merge(params), batch["tokens"][:, : model.frames], batch.get("real")
-        followed = None if real is None else real[:, 1 : model.frames]
+        real_from_1 = None if real is None else real[:, 1 : model.frames]
         hidden = hidden_at_inference(table, setting, batch["embodiment"], model.frames)
-        predictions = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
+        token_outputs = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
         if model.diffusion:
             keys = jax.vmap(key_of)(jnp.arange(len(tokens)))  # common noise under all changes
-            return mean_over_frames(frame_diffusion_loss(hma, predictions, tokens[:, 1:], keys), followed)
-        return mean_over_frames(factored_cross_entropy(hma.logits(predictions, tokens[:, 1:]), tokens[:, 1:]), followed)
+            return mean_over_frames(frame_diffusion_loss(hma, token_outputs, tokens[:, 1:], keys), real_from_1)
+        return mean_over_frames(
+            factored_cross_entropy(hma.logits(token_outputs, tokens[:, 1:]), tokens[:, 1:]), real_from_1
+        )
 
     return loss

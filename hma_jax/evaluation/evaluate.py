@@ -15,10 +15,10 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from einops import rearrange
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
-from hma_jax.evaluation.images import Decode, Decoder, Sample, image_metrics, make_clips
+from hma_jax.evaluation.images import Decoder, Sample, ToImages, image_metrics, make_clips
 from hma_jax.evaluation.lpips import load_lpips
 from hma_jax.evaluation.protocol import Predicted, make_predictor
 from hma_jax.evaluation.summary import Summary, summarise
@@ -31,7 +31,7 @@ from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.processes import compiled_by_all
 from hma_jax.runtime.rows import lay_out
-from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain
+from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain, replicated
 
 T = TypeVar("T")
 REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
@@ -90,7 +90,7 @@ def evaluate(
     require_params(declared, params, "these parameters are not those of the model")
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
-    metric_params, units = lay_out((metric_params, table.scale()), NamedSharding(mesh, PartitionSpec()))
+    metric_params, units = lay_out((metric_params, table.scale()), replicated(mesh))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
         compiled = None
@@ -132,7 +132,7 @@ def make_evaluator(
     config: EvalConfig,
     setting: Setting,
     execution: ExecutionConfig,
-    decode: Decode,
+    to_images: ToImages,
     piece: int,
 ) -> Callable[[Params, MetricParams, ActionUnits, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
     """A jitted f(parameters, MetricParams, ActionUnits, batch with images) -> (metrics {name: [B]}, Predicted).
@@ -147,7 +147,7 @@ def make_evaluator(
         metric_params: MetricParams, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None, Any]
     ) -> dict[str, jax.Array]:
         (decoder_params, lpips_params), (images, real, others) = metric_params, recorded
-        return image_metrics(decode, piece, decoder_params, predicted, images, config, real, others, lpips_params)
+        return image_metrics(to_images, piece, decoder_params, predicted, images, config, real, others, lpips_params)
 
     def evaluate_group(params: Params, metric_params: MetricParams, units: ActionUnits, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
@@ -163,7 +163,7 @@ def make_evaluator(
         groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, devices_per_batch(mesh))
         return in_groups(lambda rows: evaluate_group(params, metric_params, units, rows), batch, groups)
 
-    return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
+    return jax.jit(evaluate_batch, out_shardings=replicated(mesh))
 
 
 def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: Setting) -> None:

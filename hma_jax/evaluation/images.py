@@ -16,7 +16,7 @@ from hma_jax.evaluation.metrics import difference, last_frames, mean_over_frames
 from hma_jax.evaluation.protocol import Predicted
 from hma_jax.model.params import Params
 
-Decode = Callable[[Params, jax.Array], jax.Array]
+ToImages = Callable[[Params, jax.Array], jax.Array]
 """Pure: (parameters, ids [B, S] or latents [B, S, C]) -> uint8 [B, height, width, 3]."""
 
 
@@ -40,7 +40,7 @@ class Decoder(Protocol):
 
 
 def image_metrics(
-    decode: Decode,
+    to_images: ToImages,
     piece: int,
     params: Params,
     predicted: Predicted,
@@ -60,7 +60,7 @@ def image_metrics(
     made, draws = predicted.tokens.shape[1], predicted.random_last.shape[1]
     under_others = [] if predicted.other is None else [predicted.other]
     tokens = jnp.concatenate([predicted.tokens, predicted.random_last, *under_others], axis=1)
-    decoded = decode_in_pieces(decode, piece, params, tokens.reshape(-1, *tokens.shape[2:]))
+    decoded = decode_in_pieces(to_images, piece, params, tokens.reshape(-1, *tokens.shape[2:]))
     decoded = decoded.reshape(*tokens.shape[:2], *decoded.shape[1:])
     require(
         decoded.shape[2:] == images.shape[2:],
@@ -109,14 +109,14 @@ def _repeated(images: jax.Array, count: int) -> jax.Array:
     return jnp.broadcast_to(images[:, None], (len(images), count, *images.shape[1:]))
 
 
-def decode_in_pieces(decode: Decode, piece: int, params: Params, tokens: jax.Array) -> jax.Array:
+def decode_in_pieces(to_images: ToImages, piece: int, params: Params, tokens: jax.Array) -> jax.Array:
     """Images of tokens [n, ...], `piece` of them at a time; memory does not grow with n."""
     count = len(tokens)
     if count <= piece:
-        return decode(params, tokens)
+        return to_images(params, tokens)
     missing = -count % piece
     padded = jnp.pad(tokens, [(0, missing)] + [(0, 0)] * (tokens.ndim - 1))
-    images = jax.lax.map(lambda x: decode(params, x), padded.reshape(-1, piece, *tokens.shape[1:]))
+    images = jax.lax.map(lambda x: to_images(params, x), padded.reshape(-1, piece, *tokens.shape[1:]))
     return images.reshape(-1, *images.shape[2:])[:count]
 
 

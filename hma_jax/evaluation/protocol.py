@@ -140,9 +140,9 @@ def make_predictor(
     def predict(
         params: Params, batch: Batch, units: ActionUnits = table.scale()
     ) -> tuple[dict[str, jax.Array], Predicted | None]:
-        hma, real = declared.merge(params).given_in(units), batch.get("real")
+        hma, real = declared.merge(params).with_action_units(units), batch.get("real")
         window = batch["tokens"][:, : model.frames], batch["actions"][:, : model.frames], batch["embodiment"]
-        seen = None if real is None else real[:, : model.frames]
+        real_window = None if real is None else real[:, : model.frames]
 
         def keys(purpose: Purpose) -> jax.Array:
             return window_keys(config.seed, purpose, table, window[2], batch["episode"], batch["start"])
@@ -152,7 +152,7 @@ def make_predictor(
             metrics, predicted = _frame_metrics(hma, window, batch, table, config, setting, keys("likelihood"))
         if predicts_actions(model, setting):
             causally, statistics = setting != "inverse", action_statistics(batch, table)
-            errors = _policy_errors(hma, *window, keys("policy"), config, causally, statistics, seen)
+            errors = _policy_errors(hma, *window, keys("policy"), config, causally, statistics, real_window)
             metrics |= errors | {"finite": metrics["finite"] & errors["finite"]}
         return metrics, predicted
 
@@ -174,14 +174,14 @@ def _frame_metrics(
     hidden = hidden_at_inference(table, setting, robots, actions.shape[1])
     sequences, decoding = evaluation_inputs(batch, table, config)
     real = batch.get("real")
-    shown = None if hidden is None else hidden[:, : model.frames]
-    followed = None if real is None else real[:, 1 : model.frames]
+    hidden_window = None if hidden is None else hidden[:, : model.frames]
+    real_from_1 = None if real is None else real[:, 1 : model.frames]
 
     def likelihood(out: jax.Array) -> dict[str, jax.Array]:
-        return _likelihood(hma, out, window[0][:, 1:], key_B, followed)
+        return _likelihood(hma, out, window[0][:, 1:], key_B, real_from_1)
 
     def likelihood_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
-        return likelihood(next_frame_outputs(hma, window[0], actions_BTU, robots, shown))
+        return likelihood(next_frame_outputs(hma, window[0], actions_BTU, robots, hidden_window))
 
     if config.context == "recorded":
         require(
@@ -195,7 +195,7 @@ def _frame_metrics(
             before = jnp.arange(tokens.shape[1])[:, None] < config.first_predicted - 1
             sequences = jnp.concatenate([sequences, jnp.where(before, actions[:, None], other)], axis=1)
         prompt = tokens[:, : config.prompt_frames]
-        made = rollout(hma, prompt, sequences, robots, decoding, config.decode, hidden_BT=hidden)
+        made = rollout(hma, prompt, sequences, robots, decoding, config.decode, action_hidden_BT=hidden)
         ahead = None if real is None else real[:, config.prompt_frames :]
         random = made[:, 1 : 1 + config.random_actions]
         last = last_frames(random, ahead, axis=2)
@@ -215,12 +215,12 @@ def _after_recorded(
     sequences: jax.Array,
     key_B: jax.Array,
     config: EvalConfig,
-    hidden_BT: jax.Array | None,
+    action_hidden_BT: jax.Array | None,
     real_BT: jax.Array | None,
 ) -> tuple[jax.Array, Predicted]:
     """(outputs, Predicted) where every frame follows recorded ones."""
     tokens, actions, embodiment = window
-    out, predicted = next_frames(model, tokens, actions, embodiment, key_B, config.decode, hidden_BT)
+    out, predicted = next_frames(model, tokens, actions, embodiment, key_B, config.decode, action_hidden_BT)
     draws = sequences.shape[1] - 1
 
     def each(x: jax.Array) -> jax.Array:
@@ -230,7 +230,7 @@ def _after_recorded(
     # The sequences differ from the first chunk on, so that nothing of the past can be shared.
     if real_BT is not None:  # windows end at different frames: all are made, and each one's last is taken
         others = sequences[:, 1:].reshape(-1, *actions.shape[1:])
-        hidden = None if hidden_BT is None else each(hidden_BT)
+        hidden = None if action_hidden_BT is None else each(action_hidden_BT)
         _, made = next_frames(model, each(tokens), others, each(embodiment), each(key_B), config.decode, hidden)
         last = last_frames(made, each(real_BT[:, 1:]))
         return out, Predicted(predicted, last.reshape(len(tokens), draws, *tokens.shape[2:]), None)
@@ -241,7 +241,7 @@ def _after_recorded(
         each(embodiment),
         each(key_B),
         config.decode,
-        hidden_BT=None if hidden_BT is None else each(hidden_BT),
+        action_hidden_BT=None if action_hidden_BT is None else each(action_hidden_BT),
     )
     return out, Predicted(predicted, last.reshape(len(tokens), draws, *tokens.shape[2:]), None)
 

@@ -44,14 +44,16 @@ class Window(NamedTuple):
 
     model: HMA
     actions_BTU: jax.Array  # as `HMA.align` arranges them
-    hidden_BT: jax.Array | None  # frames that are shown no action
+    action_hidden_BT: jax.Array | None  # frames that are shown no action
     embodiment_B: jax.Array
 
     @classmethod
-    def over(cls, model: HMA, chunks_BTU: jax.Array, hidden_BT: jax.Array | None, embodiment_B: jax.Array) -> Window:
+    def over(
+        cls, model: HMA, chunks_BTU: jax.Array, action_hidden_BT: jax.Array | None, embodiment_B: jax.Array
+    ) -> Window:
         """From recorded chunks and which of them the model is not shown (None: it sees all)."""
         shape = chunks_BTU.shape[:2]
-        return cls(model, model.align(chunks_BTU), model.align_hidden(hidden_BT, shape), embodiment_B)
+        return cls(model, model.align(chunks_BTU), model.align_hidden(action_hidden_BT, shape), embodiment_B)
 
     def empty(self, batch: int, capacity: int) -> FrameCache:
         """A cache without frames."""
@@ -78,7 +80,7 @@ class Window(NamedTuple):
         """Predictions [B, S, ...] for a partly masked frame at position `at`, after frame `last` [B, S (, C)]."""
         visible = jnp.append(cache.valid, True)[None]
         values, masked = frame.values[:, None], frame.masked[:, None]
-        return self._pass(values, masked, at, cache.layers, visible, before=last[:, None]).predictions[:, 0]
+        return self._pass(values, masked, at, cache.layers, visible, before=last[:, None]).token_outputs[:, 0]
 
     def extend_and_query(
         self,
@@ -100,7 +102,7 @@ class Window(NamedTuple):
         masked = jnp.broadcast_to((jnp.arange(count + 1) == count)[None, :, None], values.shape[:3])
         if cache is None:
             out = self._pass(values, masked, at, cache_frames=count, predict_from=count)
-            return FrameCache(out.cache, jnp.ones(count, bool)), out.predictions[:, 0]
+            return FrameCache(out.cache, jnp.ones(count, bool)), out.token_outputs[:, 0]
         # What `finished` takes the place of was still before it, but is past the masked frame's window.
         slots = jnp.arange(cache.capacity)
         remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
@@ -109,7 +111,7 @@ class Window(NamedTuple):
         out = self._pass(
             values, masked, at, cache.layers, visible, positions=positions, cache_frames=count, predict_from=count
         )
-        return cache.write(out.cache, slot), out.predictions[:, 0]
+        return cache.write(out.cache, slot), out.token_outputs[:, 0]
 
     def read(self, cache: FrameCache, frame: jax.Array, at: int | jax.Array) -> Outputs:
         """A pass over one finished frame [B, S (, C)] at position `at`, which does not enter the cache."""
@@ -127,13 +129,13 @@ class Window(NamedTuple):
     ) -> Outputs:
         """One pass over frames that take the actions from `at` on; `options` are the model's."""
         count = values.shape[1]
-        hidden = None if self.hidden_BT is None else cut(self.hidden_BT, at, count)
+        hidden = None if self.action_hidden_BT is None else cut(self.action_hidden_BT, at, count)
         return self.model(
             values,
             masked,
             cut(self.actions_BTU, at, count),
             self.embodiment_B,
-            hidden_BT=hidden,
+            action_hidden_BT=hidden,
             visible=visible,
             first=at,
             past=past,

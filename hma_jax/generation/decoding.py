@@ -56,12 +56,12 @@ def masked_counts(config: ModelConfig, steps: int) -> list[int]:
 def sample_tokens(
     head: Readout | ChainedReadout, predictions_BS: jax.Array, key_B: jax.Array, temperature: float, top_k: int = 0
 ) -> tuple[jax.Array, jax.Array]:
-    """(ids [B, S], confidence [B, S]) from the `predictions` of tokens (`Outputs.predictions`); confidence is the
+    """(ids [B, S], confidence [B, S]) from the `token_outputs` of tokens (`Outputs.token_outputs`); confidence is the
     product of the chosen factors' probabilities."""
 
-    def one(predictions_S: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        choose = choose_sampled(key, head.shape(predictions_S), temperature, top_k)
-        digits, logits = head.decode_factors(predictions_S, choose)
+    def one(token_outputs_S: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        choose = choose_sampled(key, head.shape(token_outputs_S), temperature, top_k)
+        digits, logits = head.decode_factors(token_outputs_S, choose)
         chosen = jnp.take_along_axis(jax.nn.softmax(logits, axis=-1), digits[..., None], axis=-1)[..., 0]
         return compose(digits, logits.shape[-1]).astype(jnp.int32), jnp.prod(chosen, axis=-1)
 
@@ -89,7 +89,7 @@ def _ranks(score_BS: jax.Array) -> jax.Array:
 
 
 Predict = Callable[[Frame], jax.Array]
-"""The model's predictions for a frame's tokens (`Outputs.predictions`): [B, S, Q, V] or [B, S, D]."""
+"""The model's predictions for a frame's tokens (`Outputs.token_outputs`): [B, S, Q, V] or [B, S, D]."""
 
 
 def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
@@ -102,13 +102,13 @@ def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Arra
 
 
 def _decode_tokens(
-    model: HMA, predictions: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig
+    model: HMA, token_outputs: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig
 ) -> jax.Array:
-    batch, size = predictions.shape[:2]
+    batch, size = token_outputs.shape[:2]
 
-    def fill(frame: Frame, predictions: jax.Array, step: int | jax.Array, still_masked: int | jax.Array) -> Frame:
+    def fill(frame: Frame, token_outputs: jax.Array, step: int | jax.Array, still_masked: int | jax.Array) -> Frame:
         keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, step)))(key_B)
-        sampled, score = sample_tokens(model.frame_head, predictions, keys[:, 0], decode.temperature, decode.top_k)
+        sampled, score = sample_tokens(model.frame_head, token_outputs, keys[:, 0], decode.temperature, decode.top_k)
         if decode.order == "random":
             score = jax.vmap(lambda k: jax.random.uniform(k, (size,), jnp.float32))(keys[:, 1])
         return unmask(frame, sampled, score, still_masked)
@@ -117,7 +117,7 @@ def _decode_tokens(
         return fill(frame, predict(frame), *at), None
 
     counts = masked_counts(model.config, decode.unmask_steps)
-    frame = fill(blank_frame(model.config, batch), predictions, 0, counts[0])
+    frame = fill(blank_frame(model.config, batch), token_outputs, 0, counts[0])
     # A loop, so that one pass is compiled and not one for each of M.
     later = jnp.arange(1, len(counts)), jnp.asarray(counts[1:], jnp.int32)
     return jax.lax.scan(unmask_step, frame, later)[0].values

@@ -41,7 +41,7 @@ def start_each(
 
     def one(frames: jax.Array, chunks: jax.Array, robot: jax.Array, given: jax.Array, count: jax.Array) -> Session:
         unseen = jnp.full((1, len(chunks)), hidden)
-        session = start(model, frames[None], chunks[None], robot[None], hidden_BT=unseen)
+        session = start(model, frames[None], chunks[None], robot[None], action_hidden_BT=unseen)
         capacity = session.cache.capacity
         # Attention is causal: no frame that is kept attended to the arbitrary ones after it.
         cache = session.cache._replace(valid=jnp.arange(capacity) < given - 1)
@@ -75,7 +75,9 @@ def advance_each(
     def each(phase: Phase) -> tuple[Episodes, jax.Array]:
         def one(session: Session, chunk: jax.Array, key: jax.Array) -> tuple[Session, jax.Array]:
             unseen = jnp.full(1, hidden)
-            session, frame = advance(model, session, chunk[None], key[None], decode, hidden_B=unseen, phase=phase)
+            session, frame = advance(
+                model, session, chunk[None], key[None], decode, action_hidden_B=unseen, phase=phase
+            )
             return session, frame[0]
 
         return jax.vmap(one)(episodes, chunk_BU, key_B)

@@ -21,14 +21,14 @@ def predict_actions(
     frames: jax.Array,
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
-    hidden_BT: jax.Array,
+    action_hidden_BT: jax.Array,
     key_B: jax.Array,
     decode: DecodeConfig,
     *,
     causally: bool = True,
     real_BT: jax.Array | None = None,
 ) -> jax.Array:
-    """Raw chunks [B, T, U] predicted at every frame; chunks that `hidden_BT` marks are not shown to the model.
+    """Raw chunks [B, T, U] predicted at every frame; chunks that `action_hidden_BT` marks are not shown to the model.
 
     As a policy a frame's chunk is predicted from frames up to it and what is shown of the
     actions; with `causally` False from the whole window (inverse dynamics), of which frames that are not
@@ -36,8 +36,8 @@ def predict_actions(
     """
     count = frames.shape[1]
     visible = None if causally else bidirectional_mask(count, real_BT)
-    hidden = model.align_hidden(hidden_BT, frames.shape[:2])
-    out = model(frames, None, model.align(actions_BTU), embodiment_B, hidden_BT=hidden, visible=visible)
+    hidden = model.align_hidden(action_hidden_BT, frames.shape[:2])
+    out = model(frames, None, model.align(actions_BTU), embodiment_B, action_hidden_BT=hidden, visible=visible)
     return read_actions(model, out, embodiment_B, key_B, decode)
 
 
@@ -66,29 +66,30 @@ def predict_next_actions(
         None,
         jnp.concatenate([actions_BTU, actions_BTU], axis=1),
         embodiment_B,
-        hidden_BT=hidden,
+        action_hidden_BT=hidden,
         visible=teacher_forcing_mask(before),
         positions=jnp.tile(jnp.arange(count), 2),
         predict_from=2 * count,
     )
-    own = out._replace(actions=None if out.actions is None else out.actions[:, count:])
+    features_BTD = out.action_features_BTD
+    own = out._replace(action_features_BTD=None if features_BTD is None else features_BTD[:, count:])
     return read_actions(model, own, embodiment_B, key_B, decode)
 
 
 def read_actions(
     model: HMA, out: Outputs, embodiment_B: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> jax.Array:
-    """Raw chunks [B, T, U] from a pass's action features (`Outputs.actions`). Raises ConfigError without an action
-    head."""
+    """Raw chunks [B, T, U] from a pass's action features (`Outputs.action_features_BTD`). Raises ConfigError without an
+    action head."""
     require(
-        model.action_head is not None and out.actions is not None,
+        model.action_head is not None and out.action_features_BTD is not None,
         "the model predicts no actions; train one with model.action_heads=true and a model.conditioning that "
         "contains concat",
     )
     if model.config.diffusion:
-        normalised = _sample_actions(model, out.actions, embodiment_B, key_B, decode)
+        normalised = _sample_actions(model, out.action_features_BTD, embodiment_B, key_B, decode)
     else:
-        normalised = model.action_head(out.actions, embodiment_B)
+        normalised = model.action_head(out.action_features_BTD, embodiment_B)
     return model.unnormalise(normalised, embodiment_B)
 
 

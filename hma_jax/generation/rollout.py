@@ -47,7 +47,7 @@ def rollout(
     key_B: jax.Array,
     decode: DecodeConfig,
     *,
-    hidden_BT: Array | None = None,
+    action_hidden_BT: Array | None = None,
 ) -> jax.Array:
     """Continues each prompt, [B, T', S] or [B, T', S, C], under R action sequences.
 
@@ -56,25 +56,25 @@ def rollout(
     longer prompt the last T - 1 frames are seen. The sequences of one example may differ from the
     chunk of the last prompt frame on; what comes before is read from the first sequence and
     computed once. All R sequences use the same random numbers (a function of the example's key
-    and the frame), so that they differ by their actions alone. `hidden_BT` marks chunks
+    and the frame), so that they differ by their actions alone. `action_hidden_BT` marks chunks
     that the model is not shown: those that it was trained without (`objective.masking.hidden_at_inference`).
     Raises ConfigError for shapes and types that do not fit the model or each other, and, where arrays are not traced,
     for unknown ids and robots and for actions that are not finite.
     """
-    _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, hidden_BT)
+    _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, action_hidden_BT)
     require_known(model.config, model.table, prompt, actions_BRTU, embodiment_B)
     prompt = as_frames(model.config, prompt)
-    prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
+    prompt, actions_BRTU, action_hidden_BT = _recent(model, prompt, actions_BRTU, action_hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape
     size = min(frames, model.config.frames)
     sequences = Sequences(
         actions_BRTU.reshape(batch * repeats, frames, -1),
-        None if hidden_BT is None else jnp.repeat(hidden_BT, repeats, axis=0),
+        None if action_hidden_BT is None else jnp.repeat(action_hidden_BT, repeats, axis=0),
         jnp.repeat(embodiment_B, repeats, axis=0),
         jnp.repeat(key_B, repeats, axis=0),
     )
     # All prompt frames but the last, whose chunk may differ between sequences.
-    shared = Window.over(model, actions_BRTU[:, 0], hidden_BT, embodiment_B).start(prompt[:, :-1], size - 1)
+    shared = Window.over(model, actions_BRTU[:, 0], action_hidden_BT, embodiment_B).start(prompt[:, :-1], size - 1)
     layers = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=1), shared.layers)
     seen = jnp.repeat(prompt, repeats, axis=0)
     cache, new = _fill(model, sequences, FrameCache(layers, shared.valid), seen, size, decode)
@@ -138,7 +138,7 @@ def rollout_naive(
     decode: DecodeConfig,
     *,
     frames: int | None = None,
-    hidden_BT: jax.Array | None = None,
+    action_hidden_BT: jax.Array | None = None,
 ) -> jax.Array:
     """What `rollout` must equal: the whole window again for every pass over a frame.
 
@@ -147,7 +147,7 @@ def rollout_naive(
     """
     batch = len(prompt)
     actions_BRTU = jnp.zeros((batch, 1, frames, 0)) if actions_BTU is None else actions_BTU[:, None]
-    prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
+    prompt, actions_BRTU, action_hidden_BT = _recent(model, prompt, actions_BRTU, action_hidden_BT)
     frames, count = actions_BRTU.shape[2], prompt.shape[1]
     size = min(frames, model.config.frames)
     blank = blank_frame(model.config, batch)
@@ -158,15 +158,15 @@ def rollout_naive(
         aligned = hidden = None
         if actions_BTU is not None:
             aligned = model.align(cut(actions_BRTU[:, 0], first, size))
-            shown = None if hidden_BT is None else cut(hidden_BT, first, size)
-            hidden = model.align_hidden(shown, (batch, size))
+            recorded = None if action_hidden_BT is None else cut(action_hidden_BT, first, size)
+            hidden = model.align_hidden(recorded, (batch, size))
 
         def predict(frame: Frame) -> jax.Array:
             values = cut(known, first, size)
             unknown = jnp.broadcast_to(jnp.arange(size)[None, :, None] >= t - first, values.shape[:3])
             values = values.at[:, t - first].set(frame.values)
             unknown = unknown.at[:, t - first].set(frame.masked)
-            return model(values, unknown, aligned, embodiment_B, hidden_BT=hidden).predictions[:, t - first]
+            return model(values, unknown, aligned, embodiment_B, action_hidden_BT=hidden).token_outputs[:, t - first]
 
         frame = decode_frame(model, predict(blank), predict, fold_in(key_B, t), decode)
         return known.at[:, t].set(frame), None
@@ -186,7 +186,7 @@ def _require_shapes(
     actions_BRTU: Array,
     embodiment_B: Array,
     key_B: jax.Array,
-    hidden_BT: Array | None,
+    action_hidden_BT: Array | None,
 ) -> None:
     batch, *frames = jnp.shape(prompt)
     token = [*model.config.frame_shape]
@@ -199,12 +199,12 @@ def _require_shapes(
         + ", ".join(str(jnp.shape(x)) for x in (prompt, actions_BRTU, embodiment_B, key_B)),
     )
     require_keys(key_B, batch)
-    if hidden_BT is not None:
-        require_shapes("a rollout takes", {"hidden": hidden_BT}, {"hidden": (batch, sequences[1])})
+    if action_hidden_BT is not None:
+        require_shapes("a rollout takes", {"hidden": action_hidden_BT}, {"hidden": (batch, sequences[1])})
 
 
 def _recent(
-    model: HMA, prompt: Array, actions_BRTU: Array, hidden_BT: Array | None
+    model: HMA, prompt: Array, actions_BRTU: Array, action_hidden_BT: Array | None
 ) -> tuple[Array, Array, Array | None]:
     """Prompt, chunks and marks without the prompt frames that no new frame sees. Raises ConfigError."""
     count, frames = prompt.shape[1], actions_BRTU.shape[2]
@@ -215,4 +215,4 @@ def _recent(
     )
     require(model.config.frames > 1, "a model with model.frames 1 cannot generate frames: it needs at least 2")
     old = max(count - (model.config.frames - 1), 0)
-    return prompt[:, old:], actions_BRTU[:, :, old:], None if hidden_BT is None else hidden_BT[:, old:]
+    return prompt[:, old:], actions_BRTU[:, :, old:], None if action_hidden_BT is None else action_hidden_BT[:, old:]

@@ -30,7 +30,7 @@ class Session(NamedTuple):
     cache: FrameCache  # of finished frames but the newest; T - 1 slots
     frames: jax.Array  # the newest T - 1, oldest first: [B, T - 1, S (, C)]
     chunks_BTU: jax.Array  # raw, the one executed after each of them, then one spare
-    hidden_BT: jax.Array  # chunks the model is not shown
+    action_hidden_BT: jax.Array  # chunks the model is not shown
     embodiment_B: jax.Array
     count: jax.Array  # int32: frames so far
 
@@ -41,7 +41,7 @@ def start(
     chunks_BTU: Array,
     embodiment_B: Array,
     *,
-    hidden_BT: Array | None = None,
+    action_hidden_BT: Array | None = None,
 ) -> Session:
     """A session that has seen `prompt` [B, T', S (, C)], of which the last T - 1 frames count.
 
@@ -52,7 +52,7 @@ def start(
     require(capacity >= 1, "a model with model.frames 1 cannot generate frames: it needs at least 2")
     require(count >= 1, "a session needs at least 1 prompt frame, got 0")
     between = (len(prompt), count - 1)
-    hidden = jnp.zeros(between, bool) if hidden_BT is None else hidden_BT
+    hidden = jnp.zeros(between, bool) if action_hidden_BT is None else action_hidden_BT
     require_shapes(
         f"a session of {count} prompt frames starts with",
         {"frames": prompt, "chunks between them": chunks_BTU, "hidden": hidden, "robots": embodiment_B},
@@ -79,24 +79,24 @@ def advance(
     decode: DecodeConfig,
     *,
     next_chunk_BU: Array | None = None,
-    hidden_B: Array | None = None,
+    action_hidden_B: Array | None = None,
     phase: Phase | None = None,
 ) -> tuple[Session, jax.Array]:
     """(session, frame [B, S (, C)]) after `chunk_BU`, raw, was executed.
 
     Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also
     shown the chunk that comes after it: `next_chunk_BU`, or the same again where nobody knows it
-    (as the release's simulator does). `hidden_B` marks chunks the model is not shown. A caller who knows
+    (as the release's simulator does). `action_hidden_B` marks chunks the model is not shown. A caller who knows
     which `phase` the session is in saves the program of the other. Raises ConfigError as `start`; within `jax.jit`
     for shapes alone, where no values are known.
     """
     capacity, t = model.config.frames - 1, session.count
     batch, _, width = session.chunks_BTU.shape
-    hidden_B = jnp.zeros(batch, bool) if hidden_B is None else hidden_B
+    action_hidden_B = jnp.zeros(batch, bool) if action_hidden_B is None else action_hidden_B
     next_chunk_BU = chunk_BU if next_chunk_BU is None else next_chunk_BU
     require_shapes(
         "a session goes on by",
-        {"chunk": chunk_BU, "next chunk": next_chunk_BU, "hidden": hidden_B},
+        {"chunk": chunk_BU, "next chunk": next_chunk_BU, "hidden": action_hidden_B},
         {"chunk": (batch, width), "next chunk": (batch, width), "hidden": (batch,)},
     )
     require_finite(chunk_BU)
@@ -105,7 +105,7 @@ def advance(
     last = jnp.minimum(t, capacity) - 1
     both = jnp.stack([chunk_BU, next_chunk_BU], axis=1)
     chunks = _written(session.chunks_BTU, both, last)
-    hidden = _written(session.hidden_BT, jnp.stack([hidden_B, hidden_B], axis=1), last)
+    hidden = _written(session.action_hidden_BT, jnp.stack([action_hidden_B, action_hidden_B], axis=1), last)
     window = Window.over(model, chunks, hidden, session.embodiment_B)
     newest = jax.lax.dynamic_index_in_dim(session.frames, last, axis=1, keepdims=False)
     keys = fold_in(key_B, t)

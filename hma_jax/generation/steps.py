@@ -20,14 +20,14 @@ def fill(
     window: Window, cache: FrameCache, last: jax.Array, t: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> tuple[FrameCache, jax.Array]:
     """Frame t at position t; `last` [B, S (, C)] is frame t - 1, which enters the cache."""
-    cache, predictions = window.extend_and_query(cache, last[:, None], t - 1, t - 1)
-    return cache, _decode(window, cache, last, predictions, t, key_B, decode)
+    cache, token_outputs = window.extend_and_query(cache, last[:, None], t - 1, t - 1)
+    return cache, _decode(window, cache, last, token_outputs, t, key_B, decode)
 
 
 def slide(window: Window, past: jax.Array, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     """The frame at the last position after `past` [B, T - 1, S (, C)]."""
-    cache, predictions = window.extend_and_query(None, past, 0, 0)
-    return _decode(window, cache, past[:, -1], predictions, past.shape[1], key_B, decode)
+    cache, token_outputs = window.extend_and_query(None, past, 0, 0)
+    return _decode(window, cache, past[:, -1], token_outputs, past.shape[1], key_B, decode)
 
 
 def stream(
@@ -40,15 +40,15 @@ def stream(
     end = cache.capacity
     oldest = (t - 1) % end  # the slot of frame t - T, which leaves the window
     positions = jnp.array([end, end])  # frame t - 1 was at the last position when it was made
-    cache, predictions = window.extend_and_query(cache, last[:, None], end - 1, oldest, positions)
-    return cache, _decode(window, cache, last, predictions, end, key_B, decode)
+    cache, token_outputs = window.extend_and_query(cache, last[:, None], end - 1, oldest, positions)
+    return cache, _decode(window, cache, last, token_outputs, end, key_B, decode)
 
 
 def _decode(
     window: Window,
     cache: FrameCache,
     last: jax.Array,
-    predictions: jax.Array,
+    token_outputs: jax.Array,
     at: int | jax.Array,
     key_B: jax.Array,
     decode: DecodeConfig,
@@ -56,4 +56,4 @@ def _decode(
     def predict(frame: Frame) -> jax.Array:
         return window.query(cache, last, frame, at)
 
-    return decode_frame(window.model, predictions, predict, key_B, decode)
+    return decode_frame(window.model, token_outputs, predict, key_B, decode)

@@ -19,16 +19,16 @@ def next_frame_outputs(
     frames: Array,
     actions_BTU: Array,
     embodiment_B: Array,
-    hidden_BT: Array | None = None,
+    action_hidden_BT: Array | None = None,
 ) -> jax.Array:
-    """`Outputs.predictions` for frames 1 .. T-1, each wholly masked after its true past: [B, T - 1, S, Q, V] or
+    """`Outputs.token_outputs` for frames 1 .. T-1, each wholly masked after its true past: [B, T - 1, S, Q, V] or
     [B, T - 1, S, D].
 
     Raises ConfigError for a window that is longer than the model's, for other shapes that do not fit the model or each
     other, and for unknown ids and robots as `rollout`.
     """
-    frames = _checked_window(model, frames, actions_BTU, embodiment_B, hidden_BT)
-    return _fully_masked_pass(model, frames, actions_BTU, embodiment_B, hidden_BT).predictions
+    frames = _checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT)
+    return _fully_masked_pass(model, frames, actions_BTU, embodiment_B, action_hidden_BT).token_outputs
 
 
 def next_frames(
@@ -38,7 +38,7 @@ def next_frames(
     embodiment_B: Array,
     key_B: jax.Array,
     decode: DecodeConfig,
-    hidden_BT: Array | None = None,
+    action_hidden_BT: Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """(predictions, frames): those of `next_frame_outputs`, and frames 1 .. T-1 [B, T - 1, S (, C)] decoded from them,
     each after its true past.
@@ -47,12 +47,12 @@ def next_frames(
     one over the true ones, where the official evaluation makes M (T - 1) over the window. Raises ConfigError as
     `next_frame_outputs`.
     """
-    frames = _checked_window(model, frames, actions_BTU, embodiment_B, hidden_BT)
+    frames = _checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT)
     require_keys(key_B, len(frames))
     count = frames.shape[1] - 1
-    out = _fully_masked_pass(model, frames, actions_BTU, embodiment_B, hidden_BT, cache_frames=count)
+    out = _fully_masked_pass(model, frames, actions_BTU, embodiment_B, action_hidden_BT, cache_frames=count)
     actions = model.align(actions_BTU)[:, 1:]
-    hidden = model.align_hidden(hidden_BT, frames.shape[:2])
+    hidden = model.align_hidden(action_hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
 
     def predict(frame: Frame) -> jax.Array:
@@ -62,21 +62,21 @@ def next_frames(
             _by_window(frame.masked, count),
             actions,
             embodiment_B,
-            hidden_BT=hidden,
+            action_hidden_BT=hidden,
             visible=jnp.concatenate([causal_mask(count), jnp.eye(count, dtype=bool)], axis=1),
             first=1,
             past=out.cache,
             before=frames[:, :-1],
         )
-        return _by_frame(out_of_past.predictions)
+        return _by_frame(out_of_past.token_outputs)
 
     keys = jnp.stack([fold_in(key_B, t) for t in range(1, count + 1)], axis=1)
-    filled = decode_frame(model, _by_frame(out.predictions), predict, _by_frame(keys), decode)
-    return out.predictions, _by_window(filled, count)
+    filled = decode_frame(model, _by_frame(out.token_outputs), predict, _by_frame(keys), decode)
+    return out.token_outputs, _by_window(filled, count)
 
 
 def _checked_window(
-    model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, hidden_BT: Array | None
+    model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, action_hidden_BT: Array | None
 ) -> Array:
     """`frames` in the type that the model takes; ConfigError if they, or what comes with them, are not the model's."""
     batch_time, most = frames.shape[:2], model.config.frames
@@ -85,9 +85,9 @@ def _checked_window(
         "chunks": (*batch_time, model.table.action_width),
         "robots": batch_time[:1],
     }
-    if hidden_BT is not None:
+    if action_hidden_BT is not None:
         wanted["hidden"] = batch_time
-    found = {"frames": frames, "chunks": actions_BTU, "robots": embodiment_B, "hidden": hidden_BT}
+    found = {"frames": frames, "chunks": actions_BTU, "robots": embodiment_B, "hidden": action_hidden_BT}
     require_shapes("next frames are predicted of", found, wanted)
     require(
         2 <= frames.shape[1] <= most,
@@ -102,14 +102,14 @@ def _fully_masked_pass(
     frames: Array,
     actions_BTU: Array,
     embodiment_B: Array,
-    hidden_BT: Array | None,
+    action_hidden_BT: Array | None,
     cache_frames: int = 0,
 ) -> Outputs:
     """`teacher_forced_pass` with frames 1 .. T-1 wholly masked."""
     before = frames[:, :-1]  # what lies under a mask does not matter
     masked = jnp.ones(before.shape[:3], bool)
     return teacher_forced_pass(
-        model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, cache_frames=cache_frames
+        model, before, before, masked, actions_BTU, embodiment_B, action_hidden_BT, cache_frames=cache_frames
     )
 
 

@@ -44,7 +44,7 @@ def _by_frame(qkv: jax.Array, scale: float) -> jax.Array:
 def _forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tuple[jax.Array, ...]]:
     frames = qkv.reshape(-1, *qkv.shape[2:])
     y, log_sum = jax.lax.map(partial(_in_head_groups, partial(_attend, scale)), (frames,))
-    y, log_sum = remat.attention(y.reshape(*qkv.shape[:3], *qkv.shape[4:])), remat.attention(log_sum)
+    y, log_sum = remat.tag_costly(y.reshape(*qkv.shape[:3], *qkv.shape[4:])), remat.tag_costly(log_sum)
     return y, (qkv, y, log_sum)
 
 

@@ -19,8 +19,8 @@ from hma_jax.runtime.sharding import BATCH, Layouts, batch_ways, is_split, mesh_
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def contract(x: jax.Array, w: jax.Array, axes: int = 1, dtype: jnp.dtype | None = None) -> jax.Array:
-    """x [..., in] times w [in, ...]; with `axes` 2 both have two axes for `in`. The result is of the type of x,
-    or of `dtype`, in which it is then summed."""
+    """`jnp.tensordot` of x [..., in] and w [in, ...], whose weight gradient copies the narrower factor on CPU; with
+    `axes` 2 both have two axes for `in`. The result has the type of x, or `dtype`, in which it is then summed."""
     return jnp.tensordot(x, w, axes, preferred_element_type=dtype)
 
 
@@ -65,59 +65,59 @@ def _materialised(x: jax.Array) -> jax.Array:
 
 
 @jax.custom_vjp
-def multiply(x: jax.Array, w: jax.Array) -> jax.Array:
-    """x [..., in] @ w [in, out], with the same gradients, on a CPU sooner: a step of the tokenizer takes a sixth less.
+def matmul_direct_grad(x: jax.Array, w: jax.Array) -> jax.Array:
+    """x [..., in] @ w [in, out], whose weight gradient is written as x^T dy.
 
-    JAX asks for the transpose of the gradient of w, for which XLA's CPU compiler first stores the gradient of the
-    result with its axes exchanged. Here the gradient of w is asked for as it is. It was the same to the last bit on an
-    AMD EPYC; that of `contract` is not.
+    JAX's own rule writes it as (dy^T x)^T, for which XLA's CPU compiler first stores dy^T. Without that copy a step of
+    the tokenizer takes a sixth less time. On an AMD EPYC the gradient equals that of x @ w to the last bit; that of
+    `contract` does not.
     """
     return x @ w
 
 
-def _multiply_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _matmul_direct_grad_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, w = saved
     dw = jnp.tensordot(x.reshape(-1, w.shape[0]), dy.reshape(-1, w.shape[1]), (0, 0))
     return jnp.tensordot(dy, w, (-1, 1)), dw
 
 
-multiply.defvjp(lambda x, w: (multiply(x, w), (x, w)), _multiply_backward)
+matmul_direct_grad.defvjp(lambda x, w: (matmul_direct_grad(x, w), (x, w)), _matmul_direct_grad_backward)
 
 
 # --- One weight per robot ------------------------------------------------------------------------
 
 
-def per_robot(x: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
-    """x [B, ..., in] times each example's own slice of w [E, in, out], slice_B [B] -> [B, ..., out].
+def per_robot(x: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+    """x [B, ..., in] times each example's own slice of w [E, in, out], robot_row_B [B] -> [B, ..., out].
 
     `layouts` are those of w on a mesh. The slices are copied to their examples in the type of w. A copy is small
     beside the example's activations: D^2 numbers where those are T P D.
     """
-    y = _per_robot(x.reshape(x.shape[0], -1, x.shape[-1]), w, slice_B, layouts)
+    y = _per_robot(x.reshape(x.shape[0], -1, x.shape[-1]), w, robot_row_B, layouts)
     return y.reshape(*x.shape[:-1], y.shape[-1])
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _per_robot(x_BRi: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
-    return jnp.einsum("bri,bio->bro", x_BRi, _to_examples(w, slice_B, layouts))
+def _per_robot(x_BRi: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+    return jnp.einsum("bri,bio->bro", x_BRi, _to_examples(w, robot_row_B, layouts))
 
 
 def _per_robot_backward(
     layouts: Layouts | None, saved: tuple[jax.Array, ...], dy: jax.Array
 ) -> tuple[jax.Array, jax.Array, None]:
-    x, w, slice_B = saved
-    dx = jnp.einsum("bro,bio->bri", dy, _to_examples(w, slice_B, layouts))
+    x, w, robot_row_B = saved
+    dx = jnp.einsum("bro,bio->bri", dy, _to_examples(w, robot_row_B, layouts))
     each = jax.vmap(_product_over_rows)(x, dy)
-    return dx, _from_examples(each, slice_B, len(w), layouts), None
+    return dx, _from_examples(each, robot_row_B, len(w), layouts), None
 
 
 _per_robot.defvjp(lambda *args: (_per_robot(*args), args[:3]), _per_robot_backward)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
-def take_by_robot(w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+def take_by_robot(w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
     """w [E, ...] -> [B, ...]: each example's own slice. `layouts` are those of w on a mesh."""
-    return _to_examples(w, slice_B, layouts)
+    return _to_examples(w, robot_row_B, layouts)
 
 
 take_by_robot.defvjp(
@@ -130,31 +130,31 @@ TO_EXAMPLES, FROM_EXAMPLES = "robots_to_examples", "examples_to_robots"
 """Scopes of the two communications in compiled programs, by which tests and profiles find them."""
 
 
-def _to_examples(w: jax.Array, slice_B: jax.Array, layouts: Layouts | None) -> jax.Array:
+def _to_examples(w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None) -> jax.Array:
     """w [E, ...] -> [B, ...]; on a mesh, from the storage layout of w to the devices that hold the examples.
 
     If a device has as many examples as there are robots, w is gathered; otherwise only each example's slice is sent.
     """
     if layouts is None:
-        return jnp.take(w, slice_B, axis=0)
+        return jnp.take(w, robot_row_B, axis=0)
     storage, compute = layouts
     with jax.named_scope(TO_EXAMPLES):
-        if _few(len(w), slice_B):
-            each = jnp.take(pinned(w, None, *compute[1:]), slice_B, axis=0)
+        if _few(len(w), robot_row_B):
+            each = jnp.take(pinned(w, None, *compute[1:]), robot_row_B, axis=0)
         else:
-            each = pinned(jnp.take(w, pinned(slice_B, None), axis=0), _free_batch_axes(storage), *storage[1:])
+            each = pinned(jnp.take(w, pinned(robot_row_B, None), axis=0), _free_batch_axes(storage), *storage[1:])
         return pinned(each, BATCH, *compute[1:])
 
 
-def _from_examples(each: jax.Array, slice_B: jax.Array, robots: int, layouts: Layouts | None) -> jax.Array:
+def _from_examples(each: jax.Array, robot_row_B: jax.Array, robots: int, layouts: Layouts | None) -> jax.Array:
     """The way back, of gradients: [B, ...] -> [E, ...], the sum over each robot's examples."""
     if layouts is None:
-        return sum_by_robot(each, slice_B, robots)
+        return sum_by_robot(each, robot_row_B, robots)
     storage, _ = layouts
     with jax.named_scope(FROM_EXAMPLES):
-        if not _few(robots, slice_B):
+        if not _few(robots, robot_row_B):
             each = pinned(each, _free_batch_axes(storage), *storage[1:])
-        return pinned(sum_by_robot(each, slice_B, robots), None, *storage[1:])
+        return pinned(sum_by_robot(each, robot_row_B, robots), None, *storage[1:])
 
 
 def _free_batch_axes(storage: PartitionSpec) -> tuple[str, ...]:
@@ -163,8 +163,8 @@ def _free_batch_axes(storage: PartitionSpec) -> tuple[str, ...]:
     return tuple(name for name in BATCH if name not in used)
 
 
-def _few(robots: int, slice_B: jax.Array) -> bool:
-    return robots * batch_ways() <= len(slice_B)
+def _few(robots: int, robot_row_B: jax.Array) -> bool:
+    return robots * batch_ways() <= len(robot_row_B)
 
 
 CHUNK = 32
@@ -203,21 +203,25 @@ def _in_chunks(x: jax.Array, axis: int) -> jax.Array:
     return jnp.pad(x, padding).reshape(*x.shape[:axis], count, CHUNK, *x.shape[axis + 1 :])
 
 
-def per_robot_from_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+def per_robot_from_actions(
+    x: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None
+) -> jax.Array:
     """`per_robot` for w [E, U, out], by `from_actions`."""
-    return jax.vmap(from_actions)(x, take_by_robot(w, slice_B, layouts))
+    return jax.vmap(from_actions)(x, take_by_robot(w, robot_row_B, layouts))
 
 
-def per_robot_to_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+def per_robot_to_actions(
+    x: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None
+) -> jax.Array:
     """`per_robot` for w [E, in, U], by `to_actions`."""
-    return jax.vmap(to_actions)(x, take_by_robot(w, slice_B, layouts))
+    return jax.vmap(to_actions)(x, take_by_robot(w, robot_row_B, layouts))
 
 
-def sum_by_robot(x: jax.Array, slice_B: jax.Array, robots: int) -> jax.Array:
+def sum_by_robot(x: jax.Array, robot_row_B: jax.Array, robots: int) -> jax.Array:
     """x [B, ...] -> [E, ...]: the sum over each robot's examples."""
     if robots == 1:
         return jnp.sum(x, axis=0, keepdims=True)
-    one_hot = (jnp.arange(robots)[:, None] == slice_B).astype(x.dtype)
+    one_hot = (jnp.arange(robots)[:, None] == robot_row_B).astype(x.dtype)
     if is_split():  # a split dimension must stay one of its own
         return jnp.tensordot(one_hot, x, 1)
     return (one_hot @ x.reshape(len(x), -1)).reshape(robots, *x.shape[1:])

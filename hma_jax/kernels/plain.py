@@ -22,13 +22,13 @@ def within(qkv: jax.Array, scale: float) -> jax.Array:
     q, k, v = split(qkv)
     logits = jnp.einsum("btphi,btshi->bthps", q, k, preferred_element_type=jnp.float32)
     weights = _kept_if_small(softmax(scale * logits).astype(v.dtype), qkv)
-    return remat.attention(jnp.einsum("bthps,btshi->btphi", weights, v))
+    return remat.tag_costly(jnp.einsum("bthps,btshi->btphi", weights, v))
 
 
 def over_time(qkv: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
     q, k, v = split(qkv)
     weights = _kept_if_small(_weights(q, k, visible, scale).astype(v.dtype), qkv)
-    return remat.attention(jnp.einsum("bphts,bsphi->btphi", weights, v))
+    return remat.tag_costly(jnp.einsum("bphts,bsphi->btphi", weights, v))
 
 
 def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
@@ -46,7 +46,7 @@ def _weights(q: jax.Array, k: jax.Array, visible: jax.Array, scale: float) -> ja
 
 def _kept_if_small(weights: jax.Array, qkv: jax.Array) -> jax.Array:
     """Marks attention weights as worth saving for the backward pass if they are smaller than q, k and v."""
-    return remat.product(weights) if weights.size <= qkv.size else weights
+    return remat.tag_product(weights) if weights.size <= qkv.size else weights
 
 
 def split(qkv: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -1,7 +1,7 @@
 """What a block keeps for its backward pass.
 
-Values worth keeping are marked where they are made, by what they are; `ExecutionConfig.remat` decides which
-marks count. What is not kept is computed again.
+Values worth keeping are tagged where they are made; `ExecutionConfig.remat` decides which tags are kept. All other
+values are computed again. To tag a value does not change it.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from jax.ad_checkpoint import checkpoint_name
 from hma_jax.config.execution import Remat
 from hma_jax.runtime.sharding import is_split
 
-PRODUCT, ATTENTION, INPUT, GATHERED = "product", "attention", "input", "gathered"
+PRODUCT, COSTLY, INPUT, GATHERED = "product", "costly", "input", "gathered"
 
 
-def product(x: jax.Array) -> jax.Array:
-    """Marks a product of matrices, or a sum with one: dear to compute, and the backward pass reads it."""
+def tag_product(x: jax.Array) -> jax.Array:
+    """Tags a matrix product, or a sum with one: it is costly to compute, and the backward pass reads it."""
     return checkpoint_name(x, PRODUCT)
 
 
-def attention(x: jax.Array) -> jax.Array:
-    """Marks a result of attention, or the first product of the MLP: dearest for its size."""
-    return checkpoint_name(x, ATTENTION)
+def tag_costly(x: jax.Array) -> jax.Array:
+    """Tags a result of attention, or the first product of an MLP: the costliest to compute for its size."""
+    return checkpoint_name(x, COSTLY)
 
 
-def block_input(x: jax.Array) -> jax.Array:
-    """Marks what a block starts from."""
+def tag_block_input(x: jax.Array) -> jax.Array:
+    """Tags the input of a block."""
     return checkpoint_name(x, INPUT)
 
 
-def gathered(w: jax.Array) -> jax.Array:
-    """Marks a weight that was put together out of several devices' parts: never kept, it is gathered again."""
+def tag_gathered(w: jax.Array) -> jax.Array:
+    """Tags a weight that was gathered from several devices: it is never kept, but gathered again."""
     return checkpoint_name(w, GATHERED)
 
 
@@ -51,8 +51,8 @@ def checkpointed(block: Callable[..., Any], remat: Remat, scanned: bool) -> Call
             block, prevent_cse=not scanned, policy=policies.save_anything_except_these_names(GATHERED)
         )
     policy = {
-        "products": policies.save_from_both_policies(_fused, policies.save_only_these_names(PRODUCT, ATTENTION)),
-        "attention": policies.save_from_both_policies(_fused, policies.save_only_these_names(ATTENTION)),
+        "products": policies.save_from_both_policies(_fused, policies.save_only_these_names(PRODUCT, COSTLY)),
+        "attention": policies.save_from_both_policies(_fused, policies.save_only_these_names(COSTLY)),
         "everything": policies.nothing_saveable,
         "offload": policies.save_and_offload_only_these_names(
             names_which_can_be_saved=[],

@@ -57,7 +57,7 @@ def _attend(qkv: jax.Array, scale: float, interpret: bool) -> jax.Array:
         block_sizes=sizes,
         head_shards=1,
         q_seq_shards=1,
-        residual_checkpoint_name=remat.ATTENTION,
+        residual_checkpoint_name=remat.COSTLY,
         interpret=interpret,
     )
     y = jax.vmap(kernel)(q * jnp.asarray(scale, q.dtype), k, v)

@@ -59,7 +59,7 @@ class Attention(nnx.Module):
         qkv = contract(x, self.qkv.astype(x.dtype))
         if self.qkv_bias is not None:
             qkv = shifted(qkv, self.qkv_bias.get_value())
-        qkv = remat.product(qkv)
+        qkv = remat.tag_product(qkv)
         if self.norm is None:
             return qkv
         return jnp.concatenate([self.norm(qkv[..., :2, :, :]), qkv[..., 2:, :, :]], axis=-3)

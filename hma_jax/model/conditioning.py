@@ -51,12 +51,12 @@ class Modulation(nnx.Module):
         self.out = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")
 
     def __call__(
-        self, x_BTPD: jax.Array, action: ActionFeature, slice_B: jax.Array, visible: jax.Array, past: None
+        self, x_BTPD: jax.Array, action: ActionFeature, robot_row_B: jax.Array, visible: jax.Array, past: None
     ) -> tuple[jax.Array, None]:
         del visible, past
-        both = self.shift_scale(jax.nn.silu(self.hidden(action.feature_BTD, slice_B)), slice_B)
+        both = self.shift_scale(jax.nn.silu(self.hidden(action.feature_BTD, robot_row_B)), robot_row_B)
         shift, scale = (over_tokens(part, x_BTPD.shape[2]) for part in jnp.split(both, 2, axis=-1))
-        y = self.out(layer_norm(x_BTPD, FINE_EPS) * (1 + scale) + shift, slice_B)
+        y = self.out(layer_norm(x_BTPD, FINE_EPS) * (1 + scale) + shift, robot_row_B)
         return _where_shown(action, y), None
 
 
@@ -64,9 +64,9 @@ class Addition(nnx.Module):
     """The feature itself, on every token of its frame; no parameters."""
 
     def __call__(
-        self, x_BTPD: jax.Array, action: ActionFeature, slice_B: jax.Array, visible: jax.Array, past: None
+        self, x_BTPD: jax.Array, action: ActionFeature, robot_row_B: jax.Array, visible: jax.Array, past: None
     ) -> tuple[jax.Array, None]:
-        del slice_B, visible, past
+        del robot_row_B, visible, past
         return _where_shown(action, over_tokens(action.feature_BTD, x_BTPD.shape[2])), None
 
 
@@ -99,16 +99,16 @@ class CrossAttention(nnx.Module):
         self,
         x_BTPD: jax.Array,
         action: ActionFeature,
-        slice_B: jax.Array,
+        robot_row_B: jax.Array,
         visible: jax.Array,
         past: tuple[jax.Array, jax.Array, jax.Array] | None,
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
         """`visible` [T, T_past + T] as for temporal attention; `past` are keys, values and shown."""
         a = action.feature_BTD
         shown = jnp.ones(a.shape[:2], bool) if action.shown_BT is None else action.shown_BT
-        q = self._heads(remat.product(self._map(x_BTPD, self.q, slice_B)), slice_B)
-        k = self._heads(self._map(a, self.k, slice_B), slice_B)
-        v = self._map(a, self.v, slice_B).reshape(k.shape)
+        q = self._heads(remat.tag_product(self._map(x_BTPD, self.q, robot_row_B)), robot_row_B)
+        k = self._heads(self._map(a, self.k, robot_row_B), robot_row_B)
+        v = self._map(a, self.v, robot_row_B).reshape(k.shape)
         new = (k, v, shown)
         if past is not None:
             k, v, shown = (jnp.concatenate([old, own], axis=1) for old, own in zip(past, new, strict=True))
@@ -118,15 +118,15 @@ class CrossAttention(nnx.Module):
         weights = plain.softmax(logits, allowed_BTs[:, None, None]).astype(v.dtype)
         y = jnp.einsum("bphts,bshi->btphi", weights, v).reshape(x_BTPD.shape)
         some = jnp.any(allowed_BTs, axis=-1)
-        return jnp.where(some[:, :, None, None], self.out(y, slice_B), 0), new
+        return jnp.where(some[:, :, None, None], self.out(y, robot_row_B), 0), new
 
-    def _map(self, x: jax.Array, kernel: nnx.Param, slice_B: jax.Array) -> jax.Array:
-        return per_robot(x, kernel.astype(x.dtype), slice_B, layouts_of(kernel))
+    def _map(self, x: jax.Array, kernel: nnx.Param, robot_row_B: jax.Array) -> jax.Array:
+        return per_robot(x, kernel.astype(x.dtype), robot_row_B, layouts_of(kernel))
 
-    def _heads(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
+    def _heads(self, x: jax.Array, robot_row_B: jax.Array) -> jax.Array:
         """[B, ..., D] -> [B, ..., H, I], a layer norm over each head."""
         x = layer_norm(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
-        return shifted(scaled(x, robot_vectors(self.gain, slice_B, x)), robot_vectors(self.bias, slice_B, x))
+        return shifted(scaled(x, robot_vectors(self.gain, robot_row_B, x)), robot_vectors(self.bias, robot_row_B, x))
 
 
 def _own_bonus(allowed_BTs: jax.Array) -> jax.Array:

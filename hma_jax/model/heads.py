@@ -48,10 +48,10 @@ class ResBlock(nnx.Module):
         self.modulation = Linear((width, 3 * width), ("W", "F"), init=zeros, role="vector")
 
     def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
-        modulation = remat.product(self.modulation(jax.nn.silu(condition)))
+        modulation = remat.tag_product(self.modulation(jax.nn.silu(condition)))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
-        h = remat.attention(self.into(self.norm(x) * (1 + scale) + shift))
-        return x + gate * remat.product(self.out(jax.nn.silu(h)))
+        h = remat.tag_costly(self.into(self.norm(x) * (1 + scale) + shift))
+        return x + gate * remat.tag_product(self.out(jax.nn.silu(h)))
 
 
 class Denoiser(nnx.Module):
@@ -119,9 +119,9 @@ class ActionRegression(nnx.Module):
         init = readout_init(config, table.action_width)
         self.linear = EmbodimentLinear(table.size, sizes, ("D", "U"), init=init, role="output")
 
-    def __call__(self, pooled_BTD: jax.Array, slice_B: jax.Array) -> jax.Array:
+    def __call__(self, pooled_BTD: jax.Array, robot_row_B: jax.Array) -> jax.Array:
         """-> normalised actions, float32 [B, T, U]."""
-        return self.linear(pooled_BTD / self.multiplier, slice_B).astype(jnp.float32)
+        return self.linear(pooled_BTD / self.multiplier, robot_row_B).astype(jnp.float32)
 
 
 class ActionDenoiser(nnx.Module):
@@ -131,14 +131,14 @@ class ActionDenoiser(nnx.Module):
         self.dtype = jnp.dtype(execution.dtype)
         self.robots = stack(lambda: Denoiser(config, table.action_width, execution, "U"), table.size, axis="E")
 
-    def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, slice_B: jax.Array) -> jax.Array:
+    def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, robot_row_B: jax.Array) -> jax.Array:
         """Normalised, noised chunks -> float32 [B, T, 2 U], noise first. `time_BT` may have axes of size 1."""
         time_BT = jnp.broadcast_to(time_BT, (len(x_BTU), time_BT.shape[1]))
         graphdef, params = nnx.split(self.robots)
 
         def taken(p: nnx.Param) -> nnx.Param:
             whole = p.get_value() if p.precise else p.astype(self.dtype)
-            return p.replace(take_by_robot(whole, slice_B, layouts_of(p)))
+            return p.replace(take_by_robot(whole, robot_row_B, layouts_of(p)))
 
         own = jax.tree.map(taken, params, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
         return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)

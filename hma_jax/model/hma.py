@@ -37,8 +37,8 @@ class Outputs(NamedTuple):
 
     # The frame head's output for each token, float32: logits [B, T, S, Q, V]; with chained factors the features that
     # logits are computed from, and with latents the denoiser's conditions, both [B, T, S, D].
-    predictions: jax.Array
-    actions: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
+    token_outputs: jax.Array
+    action_features_BTD: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
     cache: TemporalCache | None  # keys and values of the first `cache_frames` frames
 
 
@@ -74,7 +74,7 @@ class HMA(nnx.Module):
         actions_BTU: jax.Array | None,
         embodiment_B: jax.Array,
         *,
-        hidden_BT: jax.Array | None = None,
+        action_hidden_BT: jax.Array | None = None,
         leak: ActionLeak = "none",
         visible: jax.Array | None = None,
         first: int | jax.Array = 0,
@@ -83,12 +83,12 @@ class HMA(nnx.Module):
         before: jax.Array | None = None,
         cache_frames: int = 0,
         predict_from: int = 0,
-        slice_B: jax.Array | None = None,
+        robot_row_B: jax.Array | None = None,
     ) -> Outputs:
         """One pass over ids [B, T, S] or latents [B, T, S, C], masked where bool `masked` says.
 
         `actions_BTU` are raw chunks as `align` arranges them: as released, frame t carries the
-        chunk executed after it was seen (reference section 1.3). Where `hidden_BT` the model is
+        chunk executed after it was seen (reference section 1.3). Where `action_hidden_BT` the model is
         not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
         instead of actions runs without action tokens and conditioning. The frames stand at window
         positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T], or with a
@@ -96,7 +96,7 @@ class HMA(nnx.Module):
         of the shape of `frames`, is the frame that precedes each of them, which `config.recall` reads; by
         default the one before it here. The cache of the first `cache_frames` frames is returned; frames before
         `predict_from` get no predictions. Where the parameters hold the slices of some robots only,
-        `slice_B` [B] is each example's index into them.
+        `robot_row_B` [B] is each example's index into them.
         """
         config = self.config
         count = frames.shape[1]
@@ -104,28 +104,32 @@ class HMA(nnx.Module):
             positions = first + jnp.arange(count)
         if visible is None:
             visible = causal_mask(count)
-        slice_B = embodiment_B if slice_B is None else slice_B
+        robot_row_B = embodiment_B if robot_row_B is None else robot_row_B
         x = self.embed(frames, masked, self.dtype)
         if self.recall is not None and masked is not None:
             unknown = masked.any(axis=-1) if masked.ndim == x.ndim else masked
             x = self.recall(x, unknown, self._a_frame_earlier(frames, unknown, before))
         action = None
         if actions_BTU is not None:
-            feature = self.stem(self.normalise(actions_BTU, embodiment_B).astype(self.dtype), slice_B)
-            from_blocks = hidden_BT if leak == "none" else self._hidden_through_leaks(hidden_BT, positions)
+            feature = self.stem(self.normalise(actions_BTU, embodiment_B).astype(self.dtype), robot_row_B)
+            from_blocks = (
+                action_hidden_BT if leak == "none" else self._hidden_through_leaks(action_hidden_BT, positions)
+            )
             action = ActionFeature(feature, None if from_blocks is None else ~from_blocks)
             if config.concat:
-                from_tokens = hidden_BT if leak != "all" else self._hidden_through_leaks(hidden_BT, positions)
+                from_tokens = (
+                    action_hidden_BT if leak != "all" else self._hidden_through_leaks(action_hidden_BT, positions)
+                )
                 x = jnp.concatenate([x, self._action_tokens(feature, from_tokens, positions)], axis=2)
         x = shifted(x, jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]])
         if self.norm is not None:
             x = self.norm(x)
         x = constrain(x, ("B", None, None, "D_act"))
-        x, cache = self.trunk(x, action, slice_B, visible, past, cache_frames)
-        pooled = x[:, :, config.tokens :].mean(axis=2) if x.shape[2] > config.tokens else None
+        x, cache = self.trunk(x, action, robot_row_B, visible, past, cache_frames)
+        action_features_BTD = x[:, :, config.tokens :].mean(axis=2) if x.shape[2] > config.tokens else None
         x = x[:, predict_from:, : config.tokens]
-        predictions = self.frame_head(x, positions[predict_from:]) if config.diffusion else self.frame_head(x)
-        return Outputs(predictions, pooled, cache)
+        token_outputs = self.frame_head(x, positions[predict_from:]) if config.diffusion else self.frame_head(x)
+        return Outputs(token_outputs, action_features_BTD, cache)
 
     def _a_frame_earlier(self, frames: jax.Array, unknown_BTS: jax.Array, before: jax.Array | None) -> jax.Array:
         """[B, T, S, D]: what stood at each token a frame earlier, 0 where that is not known either."""
@@ -134,23 +138,26 @@ class HMA(nnx.Module):
         x = jnp.where(unknown_BTS[..., None], 0, self.embed(frames, None, self.dtype))
         return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
-    def _hidden_through_leaks(self, hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array | None:
+    def _hidden_through_leaks(self, action_hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array | None:
         """bool [B, T]: frames whose action no leak shows. With `causal` alignment nothing led to the first one
         (`align_hidden`); None: none."""
-        if hidden_BT is None or self.config.action_alignment == "released":
+        if action_hidden_BT is None or self.config.action_alignment == "released":
             return None
-        return hidden_BT & (positions == 0)
+        return action_hidden_BT & (positions == 0)
 
-    def _action_tokens(self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array:
+    def _action_tokens(
+        self, feature_BTD: jax.Array, action_hidden_BT: jax.Array | None, positions: jax.Array
+    ) -> jax.Array:
         """K copies of each frame's feature, or of its learned vector where it is hidden."""
-        if hidden_BT is not None:
+        if action_hidden_BT is not None:
             vectors_TD = jnp.take(self.action_mask.get_value(), positions, axis=0)
-            feature_BTD = replaced(feature_BTD, hidden_BT, vectors_TD)
+            feature_BTD = replaced(feature_BTD, action_hidden_BT, vectors_TD)
         return over_tokens(feature_BTD, self.config.action_tokens)
 
-    def given_in(self, units: ActionUnits) -> HMA:
-        """This model, made within a traced function, whose actions are normalised on another scale than its table's:
-        with inputs of the program for constants. For evaluation; `train_model` says why training does otherwise."""
+    def with_action_units(self, units: ActionUnits) -> HMA:
+        """This model, changed in place, with `units` instead of its table's scale of actions. Within a traced function
+        they may be inputs of the program instead of constants. Evaluation uses this; training does not, and
+        `train_model` says why."""
         self._units = nnx.data(units)
         return self
 
@@ -162,11 +169,11 @@ class HMA(nnx.Module):
         """The inverse of `normalise`."""
         return (self._units or self.table.scale()).unnormalise(actions, embodiment_B)
 
-    def logits(self, predictions: jax.Array, ids: jax.Array) -> jax.Array:
-        """Logits [..., Q, V] of each factor from the `predictions` of tokens [...]; with chained factors, given the
+    def logits(self, token_outputs: jax.Array, ids: jax.Array) -> jax.Array:
+        """Logits [..., Q, V] of each factor from the `token_outputs` of tokens [...]; with chained factors, given the
         factors of `ids` [...] before it."""
         digits = factorise(ids, self.config.factors, self.config.factor_vocab)
-        return self.frame_head.decode_factors(predictions, lambda factor, _: digits[..., factor])[1]
+        return self.frame_head.decode_factors(token_outputs, lambda factor, _: digits[..., factor])[1]
 
     def align(self, actions: jax.Array) -> jax.Array:
         """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own as released,
@@ -176,17 +183,17 @@ class HMA(nnx.Module):
             return actions
         return jnp.concatenate([actions[..., :1, :], actions[..., :-1, :]], axis=-2)
 
-    def align_hidden(self, hidden_BT: jax.Array | None, shape: tuple[int, int]) -> jax.Array | None:
+    def align_hidden(self, action_hidden_BT: jax.Array | None, shape: tuple[int, int]) -> jax.Array | None:
         """Which recorded chunks are hidden (None: none) -> which frames are shown no action.
 
         `shape` is (B, T). With `causal` alignment the first frame never is: nothing led to it, and
         its own chunk lies in its future.
         """
         if self.config.action_alignment == "released":
-            return hidden_BT
-        if hidden_BT is None:
+            return action_hidden_BT
+        if action_hidden_BT is None:
             return jnp.broadcast_to(jnp.arange(shape[1]) == 0, shape)
-        return jnp.concatenate([jnp.ones_like(hidden_BT[:, :1]), hidden_BT[:, :-1]], axis=1)
+        return jnp.concatenate([jnp.ones_like(action_hidden_BT[:, :1]), action_hidden_BT[:, :-1]], axis=1)
 
 
 @lru_cache(maxsize=16)

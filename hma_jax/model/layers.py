@@ -1,4 +1,9 @@
-"""The few layers everything is made of. Each declares its parameters through `params.param`."""
+"""The few layers everything is made of. Each declares its parameters through `params.param`.
+
+Two indices name an example's robot. `embodiment_B` is its row of the embodiment table; `robot_row_B` is its row on the
+embodiment axis of the parameters at hand. They differ in a training step, whose parameters are those of a few robots
+(`hma_jax.training.active_robots`).
+"""
 
 from __future__ import annotations
 
@@ -58,7 +63,7 @@ class Linear(nnx.Module):
 
 
 class EmbodimentLinear(nnx.Module):
-    """One linear map per robot; `slice_B` says which is each example's own."""
+    """One linear map per robot; `robot_row_B` says which is each example's own."""
 
     def __init__(
         self,
@@ -73,10 +78,10 @@ class EmbodimentLinear(nnx.Module):
         self.bias = bias((embodiments, sizes[1]), ("E", axes[1]), precise=axes[1] == "U")  # as `to_actions` is
         self.map = find_map(axes)
 
-    def __call__(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
+    def __call__(self, x: jax.Array, robot_row_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
-        y = self.map(x, self.kernel.astype(x.dtype), slice_B, layouts_of(self.kernel))
-        return shifted(y, robot_vectors(self.bias, slice_B, x))
+        y = self.map(x, self.kernel.astype(x.dtype), robot_row_B, layouts_of(self.kernel))
+        return shifted(y, robot_vectors(self.bias, robot_row_B, x))
 
 
 def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array, Layouts | None], jax.Array]:
@@ -87,7 +92,7 @@ def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array
     return per_robot_to_actions if axes[1] == "U" else per_robot
 
 
-def robot_vectors(vectors: nnx.Param, slice_B: jax.Array, like: jax.Array) -> jax.Array:
+def robot_vectors(vectors: nnx.Param, robot_row_B: jax.Array, like: jax.Array) -> jax.Array:
     """`vectors` [E, D] -> each example's own, [B, 1, ..., D], shaped to broadcast against `like` [B, ..., D]."""
-    taken = take_by_robot(vectors.get_value(), slice_B, layouts_of(vectors))
+    taken = take_by_robot(vectors.get_value(), robot_row_B, layouts_of(vectors))
     return taken.reshape(len(taken), *(1,) * (like.ndim - 2), -1)

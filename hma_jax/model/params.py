@@ -248,7 +248,7 @@ def layer_for_compute(layer: nnx.State, dtype: jnp.dtype) -> nnx.State:
         w, (storage, compute) = variable.get_value(), variable.layouts
         layouts = PartitionSpec(*storage[1:]), PartitionSpec(*compute[1:])
         if EMBODIMENT_AXIS not in variable.axes:
-            w = remat.gathered(for_compute(w, layouts, None if variable.role == "vector" else dtype))
+            w = remat.tag_gathered(for_compute(w, layouts, None if variable.role == "vector" else dtype))
         about = {"role": variable.role, "precise": variable.precise}
         return nnx.Param(w, axes=variable.axes[1:], layouts=layouts, **about)
 

@@ -34,14 +34,14 @@ class Readout(nnx.Module):
         y = self.linear(x / self.multiplier, dtype=jnp.float32)
         return y.reshape(*y.shape[:-1], self.factors, y.shape[-1] // self.factors)
 
-    def shape(self, predictions: jax.Array) -> tuple[int, ...]:
+    def shape(self, token_outputs: jax.Array) -> tuple[int, ...]:
         """[..., Q, V] of the logits."""
-        return predictions.shape
+        return token_outputs.shape
 
-    def decode_factors(self, predictions: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
+    def decode_factors(self, token_outputs: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
         """(digits [..., Q], logits [..., Q, V]): `choose` is called for factor 0, 1, ... with its logits."""
-        digits = [choose(q, predictions[..., q, :]) for q in range(self.factors)]
-        return jnp.stack(digits, axis=-1), predictions
+        digits = [choose(q, token_outputs[..., q, :]) for q in range(self.factors)]
+        return jnp.stack(digits, axis=-1), token_outputs
 
 
 class ChainedReadout(nnx.Module):
@@ -62,12 +62,12 @@ class ChainedReadout(nnx.Module):
         """The trunk's outputs [..., D] in float32: logits follow factor by factor, in `decode_factors`."""
         return x.astype(jnp.float32)
 
-    def shape(self, predictions: jax.Array) -> tuple[int, ...]:
-        return (*predictions.shape[:-1], len(self.out) + 1, self.out.shape[-1])
+    def shape(self, token_outputs: jax.Array) -> tuple[int, ...]:
+        return (*token_outputs.shape[:-1], len(self.out) + 1, self.out.shape[-1])
 
-    def decode_factors(self, predictions: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
-        alone = self.alone(predictions)
-        hidden = self.norm(self.condition(predictions))
+    def decode_factors(self, token_outputs: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
+        alone = self.alone(token_outputs)
+        hidden = self.norm(self.condition(token_outputs))
         logits = [alone[..., 0, :]]
         digits = [choose(0, logits[0])]
         for q in range(len(self.tables)):

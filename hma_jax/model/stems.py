@@ -39,8 +39,8 @@ class Stem(nnx.Module):
         init = hidden_init(config, width, width, config.stem_gain)
         self.out = EmbodimentLinear(size, (width, width), ("D", "D_out"), init=init, role="hidden")
 
-    def __call__(self, actions_BTU: jax.Array, slice_B: jax.Array) -> jax.Array:
+    def __call__(self, actions_BTU: jax.Array, robot_row_B: jax.Array) -> jax.Array:
         """Normalised, zero-padded actions -> features a_BTD in their type."""
-        x = layer_norm(self.into(actions_BTU, slice_B), BLOCK_EPS)
-        x = shifted(scaled(x, robot_vectors(self.gain, slice_B, x)), robot_vectors(self.bias, slice_B, x))
-        return self.out(jax.nn.relu(x), slice_B)
+        x = layer_norm(self.into(actions_BTU, robot_row_B), BLOCK_EPS)
+        x = shifted(scaled(x, robot_vectors(self.gain, robot_row_B, x)), robot_vectors(self.bias, robot_row_B, x))
+        return self.out(jax.nn.relu(x), robot_row_B)

@@ -21,33 +21,33 @@ def teacher_forced_pass(
     masked: jax.Array,
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
-    hidden_BT: jax.Array | None = None,
+    action_hidden_BT: jax.Array | None = None,
     *,
     leak: ActionLeak = "none",
     cache_frames: int = 0,
-    slice_B: jax.Array | None = None,
+    robot_row_B: jax.Array | None = None,
 ) -> Outputs:
     """Predictions for `frames` [B, T - 1, S (, C)] at positions 1 .. T-1, masked where bool `masked` says; frame t
     attends to the first t of `past_frames`, of the same shape, at positions 0 .. T-2.
 
-    `actions_BTU` are the recorded chunks; `hidden_BT` and `leak` as for the model. The first `cache_frames` of
+    `actions_BTU` are the recorded chunks; `action_hidden_BT` and `leak` as for the model. The first `cache_frames` of
     `past_frames` are cached.
     """
     count = frames.shape[1]
-    hidden = model.align_hidden(hidden_BT, actions_BTU.shape[:2])
+    hidden = model.align_hidden(action_hidden_BT, actions_BTU.shape[:2])
     return model(
         jnp.concatenate([past_frames, frames], axis=1),
         jnp.concatenate([jnp.zeros_like(masked), masked], axis=1),
         _for_both_halves(model.align(actions_BTU)),
         embodiment_B,
-        hidden_BT=None if hidden is None else _for_both_halves(hidden),
+        action_hidden_BT=None if hidden is None else _for_both_halves(hidden),
         leak=leak,
         visible=teacher_forcing_mask(causal_mask(count)),
         positions=jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)]),
         cache_frames=cache_frames,
         before=jnp.concatenate([past_frames, past_frames], axis=1),
         predict_from=count,
-        slice_B=slice_B,
+        robot_row_B=robot_row_B,
     )
 
 

@@ -54,20 +54,20 @@ class Block(nnx.Module):
         self,
         x_BTPD: jax.Array,
         action: ActionFeature | None,
-        slice_B: jax.Array,
+        robot_row_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None,
     ) -> tuple[jax.Array, TemporalCache]:
         """`past` and what is returned are this layer's part of the cache."""
         past_time, past_actions = past or (None, None)
         x, new_actions = x_BTPD, None
-        x = remat.product(_by_example(x + self.space.over_space(self.norm_space(x) if self.norm_space else x)))
+        x = remat.tag_product(_by_example(x + self.space.over_space(self.norm_space(x) if self.norm_space else x)))
         if action is not None and self.conditioning is not None:
-            y, new_actions = self.conditioning(x, action, slice_B, visible, past_actions)
-            x = remat.product(_by_example(x + y))
+            y, new_actions = self.conditioning(x, action, robot_row_B, visible, past_actions)
+            x = remat.tag_product(_by_example(x + y))
         y, new_time = self.time.over_time(x, visible, past_time)
-        x = remat.product(_by_example(x + y))
-        h = remat.attention(self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x))
+        x = remat.tag_product(_by_example(x + y))
+        h = remat.tag_costly(self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x))
         x = x + self.mlp_out(gelu(h))
         return x, TemporalCache(new_time, new_actions)
 
@@ -84,7 +84,7 @@ class Trunk(nnx.Module):
         self,
         x_BTPD: jax.Array,
         action: ActionFeature | None,
-        slice_B: jax.Array,
+        robot_row_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None = None,
         cache_frames: int = 0,
@@ -98,9 +98,9 @@ class Trunk(nnx.Module):
 
         def body(x, xs):
             layer, layer_past = xs
-            x = remat.block_input(x)
+            x = remat.tag_block_input(x)
             layer = layer_for_compute(layer, x.dtype)
-            x, new = nnx.merge(block_def, layer)(x, action, slice_B, visible, layer_past)
+            x, new = nnx.merge(block_def, layer)(x, action, robot_row_B, visible, layer_past)
             new = jax.tree.map(lambda y: y[:, :cache_frames], new) if cache_frames else None
             return _by_example(x), new
 

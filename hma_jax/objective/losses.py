@@ -97,25 +97,25 @@ def masked_loss(
     embodiment_B: jax.Array,
     masking: MaskingConfig,
     key_B: jax.Array,
-    slice_B: jax.Array | None = None,
+    robot_row_B: jax.Array | None = None,
     real_BT: jax.Array | None = None,
     training: bool = True,
 ) -> LossSums:
     """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise, and the past that
-    `masking.own_past` and `displaced_past` ask for; `slice_B` as for the model.
+    `masking.own_past` and `displaced_past` ask for; `robot_row_B` as for the model.
 
     `real_BT` (bool; None: all) is False for frames that only fill up a window, at its end. They have no targets
     (`masking`), and where attention is causal no real frame sees them; where it is not, they are hidden here.
     `training` as for `frame_diffusion_loss`.
     """
-    slice_B = embodiment_B if slice_B is None else slice_B
+    robot_row_B = embodiment_B if robot_row_B is None else robot_row_B
     all_shown = masking.setting == "forward" and all(model.table.chunks)
-    hidden = None if all_shown else masked.hidden_T
-    options = {"leak": masking.action_leak, "slice_B": slice_B}
+    hidden = None if all_shown else masked.action_hidden_T
+    options = {"leak": masking.action_leak, "robot_row_B": robot_row_B}
     if masking.teacher_forcing:
         past = masked.inputs[:, :-1]
         if masking.own_past:
-            drawn = masking.own_past, masking.own_past_rounds, key_B, slice_B, masking.action_leak
+            drawn = masking.own_past, masking.own_past_rounds, key_B, robot_row_B, masking.action_leak
             past = draw_own_past(model, past, actions_BTU, embodiment_B, hidden, *drawn)
         if masking.displaced_past:
             # Not the key of a round of `own_past`, nor of a repeat of the diffusion loss.
@@ -129,7 +129,7 @@ def masked_loss(
             masked.masked,
             model.align(actions_BTU),
             embodiment_B,
-            hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
+            action_hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
             visible=bidirectional_mask(tokens.shape[1], real_BT) if masking.setting == "inverse" else None,
             predict_from=FIRST_PREDICTED,
             **options,
@@ -139,15 +139,15 @@ def masked_loss(
     if masking.predicts_frames:
         weight, tokens = weigh_tokens(masked, tokens, masking)[:, FIRST_PREDICTED:], tokens[:, FIRST_PREDICTED:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.predictions, tokens, key_B, training)
+            per_token = frame_diffusion_loss(model, out.token_outputs, tokens, key_B, training)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
-            logits = model.logits(out.predictions, tokens)
+            logits = model.logits(out.token_outputs, tokens)
             per_token, right = smoothed_cross_entropy(logits, labels, masking.label_smoothing)
             correct = jnp.sum(right.astype(weight.dtype) * weight)
         loss = jnp.sum(per_token * weight)
     if masking.predicts_actions:
-        per_step = action_loss_per_step(model, out.actions, actions_BTU, embodiment_B, slice_B, key_B)
+        per_step = action_loss_per_step(model, out.action_features_BTD, actions_BTU, embodiment_B, robot_row_B, key_B)
         action_loss = jnp.sum(per_step * masked.action_targets_T.astype(per_step.dtype))
     return LossSums(loss, correct, action_loss)
 
@@ -198,7 +198,7 @@ def action_loss_per_step(
     pooled_BTD: jax.Array,
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
-    slice_B: jax.Array,
+    robot_row_B: jax.Array,
     key_B: jax.Array,
 ) -> jax.Array:
     """[B, T]: error of predicted, normalised actions, averaged over each robot's own live values.
@@ -213,12 +213,12 @@ def action_loss_per_step(
         time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion.steps))(keys)
 
         def network(x: jax.Array, t: jax.Array) -> jax.Array:
-            return model.action_head(x, t, pooled_BTD, slice_B)
+            return model.action_head(x, t, pooled_BTD, robot_row_B)
 
         noise = jnp.where(alive_BTU, noise, 0)
         process = make_process(model.config.diffusion.steps)
         some_BTU = alive_BTU | ~alive_BTU.any(axis=-1, keepdims=True)  # a mean over nothing is no number
         return sum(diffusion_loss(network, target, time, noise, process, valid=some_BTU))
-    error = jnp.square(model.action_head(pooled_BTD, slice_B) - target)
+    error = jnp.square(model.action_head(pooled_BTD, robot_row_B) - target)
     alive_BTU = alive_BTU.astype(error.dtype)
     return jnp.sum(error * alive_BTU, axis=-1) / jnp.maximum(jnp.sum(alive_BTU, axis=-1), 1)

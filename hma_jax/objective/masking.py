@@ -60,7 +60,7 @@ class Masked(NamedTuple):
     inputs: jax.Array  # ids, corrupted, or latents
     masked: jax.Array  # bool [T, S] or [T, S, cells]: not shown
     targets_TS: jax.Array  # bool: tokens that the loss counts
-    hidden_T: jax.Array  # bool: recorded chunks that are not shown
+    action_hidden_T: jax.Array  # bool: recorded chunks that are not shown
     action_targets_T: jax.Array  # bool: recorded chunks that the loss counts
 
     def without_padding(self, real_T: jax.Array) -> Masked:
@@ -221,6 +221,6 @@ def mask_batch(
 
     masked = jax.vmap(one)(jnp.arange(len(tokens)), tokens, has_actions, has_video)
     if masking.setting == "inverse":
-        outcome_seen = followed(jnp.ones_like(masked.hidden_T) if real_BT is None else real_BT)
+        outcome_seen = followed(jnp.ones_like(masked.action_hidden_T) if real_BT is None else real_BT)
         masked = masked._replace(action_targets_T=masked.action_targets_T & outcome_seen)
     return masked if real_BT is None else masked.without_padding(real_BT)

@@ -23,11 +23,11 @@ def draw_own_past(
     before: jax.Array,
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
-    hidden_BT: jax.Array | None,
+    action_hidden_BT: jax.Array | None,
     greatest_share: float,
     rounds: int,
     key_B: jax.Array,
-    slice_B: jax.Array,
+    robot_row_B: jax.Array,
     leak: ActionLeak = "none",
 ) -> jax.Array:
     """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `greatest_share` u, u uniform in
@@ -43,18 +43,20 @@ def draw_own_past(
         share = greatest_share * jax.random.uniform(share_key, (), jnp.float32)
         return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,), jnp.float32) < share
 
-    def draw(key: jax.Array, predictions_TS: jax.Array) -> jax.Array:
-        digits, _ = head.decode_factors(predictions_TS, choose_sampled(key, head.shape(predictions_TS)))
+    def draw(key: jax.Array, token_outputs_TS: jax.Array) -> jax.Array:
+        digits, _ = head.decode_factors(token_outputs_TS, choose_sampled(key, head.shape(token_outputs_TS)))
         return compose(digits, model.config.factor_vocab).astype(before.dtype)
 
     ids_key_B, own_BT = jax.vmap(choose_frames)(key_B)
     past = before
     for number in range(rounds):
-        shown = actions_BTU, embodiment_B, hidden_BT
-        predictions = teacher_forced_pass(model, past, past, masked, *shown, leak=leak, slice_B=slice_B).predictions
-        predictions = jax.lax.stop_gradient(predictions[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
+        shown = actions_BTU, embodiment_B, action_hidden_BT
+        token_outputs = teacher_forced_pass(
+            model, past, past, masked, *shown, leak=leak, robot_row_B=robot_row_B
+        ).token_outputs
+        token_outputs = jax.lax.stop_gradient(token_outputs[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
         # The first round draws what it draws where it is the only one.
         keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B
-        own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, predictions), before[:, 1:])
+        own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, token_outputs), before[:, 1:])
         past = jnp.concatenate([before[:, :1], own], axis=1)
     return past

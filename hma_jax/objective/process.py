@@ -40,8 +40,9 @@ class Process:
         return len(self.betas)
 
     @property
-    def log_snr(self) -> np.ndarray:
-        """log(sqrt(abar) / sqrt(1 - abar)), falling."""
+    def half_log_snr(self) -> np.ndarray:
+        """log(sqrt(abar) / sqrt(1 - abar)), falling: lambda of DPM-Solver, half the log of the
+        signal-to-noise ratio abar / (1 - abar)."""
         return 0.5 * np.log(self.alphas_cumprod / (1.0 - self.alphas_cumprod))
 
     def noise_over_signal(self, cap: float) -> np.ndarray:
@@ -112,22 +113,22 @@ def _visit(process: Process, chosen: Sequence[int]) -> Process:
 # --- DPM-Solver++ ----------------------------------------------------------------------------
 
 
-FIRST_LOG_SNR = -4.0
-"""Where `dpm++` starts: the signal is 1/55 of the noise there, so that pure noise can stand for it. At the last step
-of the process the signal is 1/20,000 of the noise: the clean vector found there is the error of the network times
-20,000, cut off at the clip."""
+FIRST_HALF_LOG_SNR = -4.0
+"""Where `dpm++` starts: the signal's amplitude is 1/55 of the noise's there, so that pure noise can stand for it. At
+the last step of the process it is 1/20,000: the clean vector found there is the error of the network times 20,000,
+cut off at the clip."""
 
 
 @functools.cache
-def respace_by_log_snr(process: Process, count: int) -> Process:
-    """The process that visits `count` steps of `process`, evenly spaced in the logarithm of signal over noise.
+def respace_by_half_log_snr(process: Process, count: int) -> Process:
+    """The process that visits `count` steps of `process`, evenly spaced in half the log signal-to-noise ratio.
 
-    From FIRST_LOG_SNR to the cleanest step. Of a short process neighbouring steps are taken where the spacing
+    From FIRST_HALF_LOG_SNR to the cleanest step. Of a short process neighbouring steps are taken where the spacing
     asks for the same one twice.
     """
     _require_count(process, count)
-    wanted = np.linspace(process.log_snr[0], FIRST_LOG_SNR, count)
-    nearest = np.abs(process.log_snr - wanted[:, None]).argmin(axis=1)
+    wanted = np.linspace(process.half_log_snr[0], FIRST_HALF_LOG_SNR, count)
+    nearest = np.abs(process.half_log_snr - wanted[:, None]).argmin(axis=1)
     order = np.arange(count)
     apart = np.maximum.accumulate(nearest - order) + order  # every step once
     return _visit(process, np.minimum(apart, process.steps - count + order))
@@ -136,7 +137,7 @@ def respace_by_log_snr(process: Process, count: int) -> Process:
 def sampling_process(process: Process, sampler: SamplerConfig) -> Process:
     """The process with the steps of `process` that `sampler` visits: one evaluation of the network each."""
     if sampler.kind == "dpm++":
-        return respace_by_log_snr(process, sampler.steps)
+        return respace_by_half_log_snr(process, sampler.steps)
     return respace(process, sampler.steps)
 
 
@@ -161,7 +162,7 @@ def multistep(process: Process, eta: float) -> Multistep:
     which the logarithm cannot reach: these two are of first order, and the last one returns its clean vector.
     """
     cleaner = process.alphas_cumprod_prev
-    stride = process.log_snr[:-1] - process.log_snr[1:]  # from index i + 1 to i
+    stride = process.half_log_snr[:-1] - process.half_log_snr[1:]  # from index i + 1 to i
     forgotten = np.append(0.0, np.exp(-eta * stride))
     decay = np.append(0.0, np.exp(-(1.0 + eta) * stride))
     lead = np.zeros(process.steps)

@@ -27,6 +27,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime import watchdog
 from hma_jax.runtime.exits import Exit, exit_of_interrupt
+from hma_jax.runtime.sharding import replicated
 
 T = TypeVar("T")
 COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCESS"
@@ -308,7 +309,7 @@ class AgreedMaximum:
         if jax.process_count() > 1:
             mesh = Mesh(np.array(jax.devices()), ("devices",))
             self._per_device = NamedSharding(mesh, PartitionSpec("devices"))
-            maximum = jax.jit(lambda requests: requests.max(), out_shardings=NamedSharding(mesh, PartitionSpec()))
+            maximum = jax.jit(lambda requests: requests.max(), out_shardings=replicated(mesh))
             shape = jax.ShapeDtypeStruct((jax.device_count(),), np.int32, sharding=self._per_device)
             self._maximum = maximum.lower(shape).compile()
 

@@ -166,6 +166,11 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(BATCH))
 
 
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Every device has all of an array."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
 def put_batch(batch: Any, mesh: Mesh) -> Any:
     """This process's rows of a global batch -> global device arrays."""
     sharding = batch_sharding(mesh)

@@ -15,7 +15,7 @@ from einops import rearrange
 from flax import nnx
 
 from hma_jax.config import TokenizerConfig
-from hma_jax.kernels.dense import multiply
+from hma_jax.kernels.dense import matmul_direct_grad
 from hma_jax.model.params import bias, normal, ones, param
 
 
@@ -39,7 +39,7 @@ class Conv(nnx.Module):
             offsets = [(i, j) for i in range(self.size) for j in range(self.size)]
             shifted = [padded[:, i : i + height, j : j + width] for i, j in offsets]
             x = jnp.concatenate(shifted, axis=-1)
-        return multiply(x, self.kernel[...]) + self.bias[...]
+        return matmul_direct_grad(x, self.kernel[...]) + self.bias[...]
 
 
 class Norm(nnx.Module):

@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import PartitionSpec
 
 from hma_jax.config import MeshConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.model.params import Declared, Params, path_name, require_params
 from hma_jax.runtime.mesh import make_mesh
-from hma_jax.runtime.sharding import BATCH
+from hma_jax.runtime.sharding import BATCH, replicated
 from hma_jax.tokenizers.base import PIECE, in_pieces
 
 
@@ -215,4 +215,4 @@ class BaseTokenizer(abc.ABC):
         """The parameters where the devices need them."""
         if self._mesh.size == 1:
             return self.params
-        return jax.device_put(self.params, NamedSharding(self._mesh, PartitionSpec()))
+        return jax.device_put(self.params, replicated(self._mesh))

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from hma_jax.model.params import Params
 
 
-def risen_decay(updates: int | jax.Array) -> float | jax.Array:
-    """The largest decay of an update that so many `updates` precede, int []."""
+def warmup_decay(updates: int | jax.Array) -> float | jax.Array:
+    """Upper bound on the decay after n `updates`, int []: (1 + n) / (10 + n), the warm-up of TensorFlow's
+    ExponentialMovingAverage(num_updates=n)."""
     return (1 + updates) / (10 + updates)
 
 
@@ -17,11 +18,11 @@ def update_average(ema: Params, params: Params, decay: float, updates: jax.Array
     """d * ema + (1 - d) * params, for all robots, those without an example too, whose parameters stand still.
 
     The average starts as a copy of the initial parameters. So that it is soon free of them, d rises to `decay` with the
-    number of `updates` before this one, int [] (`risen_decay`): by `decay` alone the average of a
+    number of `updates` before this one, int [] (`warmup_decay`): by `decay` alone the average of a
     short run would be in large part of weights that nothing has trained. All of it is of the same steps: were a robot's
     only of those that had examples of it, a rare robot's would be of weights from before the learning rate fell.
     """
-    decay = jnp.minimum(decay, risen_decay(updates))
+    decay = jnp.minimum(decay, warmup_decay(updates))
 
     def update(old: jax.Array, new: jax.Array) -> jax.Array:
         # The average of what is never trained stays the same to the bit, where the sum would be rounded.

@@ -20,8 +20,8 @@ from jax.sharding import PartitionSpec
 from hma_jax.config import MeshConfig, ModelConfig, OptimizerConfig, require
 from hma_jax.model.params import MatrixAxes, Params, ParamSpec, Use, is_spec
 from hma_jax.runtime.sharding import STORAGE, is_split, mesh_axes, partition
-from hma_jax.training import robots
-from hma_jax.training.robots import Active
+from hma_jax.training import active_robots
+from hma_jax.training.active_robots import Active
 
 
 class Presence(NamedTuple):
@@ -245,14 +245,14 @@ def apply_update(
 
 def take_adam(state: AdamState, specs: Params, active: Active, places_G: jax.Array | None) -> AdamState:
     """The moments and counts of a step's robots, and of what all share; their moments are at `places_G`."""
-    first, second = (robots.take(moment, specs, places_G) for moment in (state.first, state.second))
+    first, second = (active_robots.take(moment, specs, places_G) for moment in (state.first, state.second))
     return AdamState(first, second, state.count, {use: n[active.robots_G] for use, n in state.count_E.items()})
 
 
 def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active, places_G: jax.Array | None) -> AdamState:
     """`state` with those of `new` in their places."""
-    first = robots.put(state.first, new.first, specs, places_G)
-    second = robots.put(state.second, new.second, specs, places_G)
+    first = active_robots.put(state.first, new.first, specs, places_G)
+    second = active_robots.put(state.second, new.second, specs, places_G)
     count_E = {use: n.at[active.robots_G].set(new.count_E[use]) for use, n in state.count_E.items()}
     return AdamState(first, second, new.count, count_E)
 

@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MeshConfig
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Params, require_params
 from hma_jax.runtime.audit import param_shardings
-from hma_jax.runtime.sharding import place
+from hma_jax.runtime.sharding import place, replicated
 from hma_jax.training.optimizer import init_adam
-from hma_jax.training.own import own_specs
+from hma_jax.training.train_only import own_specs
 
 FINITE = "finite/"
 """Prefix of the names of a step's checks: metrics that are not logged, but stop a run if false."""
@@ -113,16 +112,16 @@ def state_shapes(
     params = moments = laid_out(declared)
     if only:
         moments = laid_out(replace(declared, specs=own_specs(declared.specs, len(set(only)))))
-    whole = None if device_mesh is None else NamedSharding(device_mesh, PartitionSpec())
-    counters = jax.eval_shape(lambda: init_adam(moments, table.size))
+    layout = None if device_mesh is None else replicated(device_mesh)
+    adam = jax.eval_shape(lambda: init_adam(moments, table.size))
     return TrainState(
-        jax.ShapeDtypeStruct((), jnp.int32, sharding=whole),
+        jax.ShapeDtypeStruct((), jnp.int32, sharding=layout),
         params,
-        counters._replace(
+        adam._replace(
             first=moments,
             second=moments,
-            count=with_sharding(counters.count, whole),
-            count_E=with_sharding(counters.count_E, whole),
+            count=with_sharding(adam.count, layout),
+            count_E=with_sharding(adam.count_E, layout),
         ),
         params if average else None,
     )

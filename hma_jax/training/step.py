@@ -18,7 +18,7 @@ from hma_jax.model.hma import HMA
 from hma_jax.model.params import Declared, Params, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import Masked, mask_batch
-from hma_jax.training import robots
+from hma_jax.training import active_robots
 from hma_jax.training.average import update_average
 from hma_jax.training.optimizer import (
     Presence,
@@ -31,8 +31,8 @@ from hma_jax.training.optimizer import (
     put_adam,
     take_adam,
 )
-from hma_jax.training.own import pick_own, places_among, put_own
 from hma_jax.training.state import FINITE, TrainState, all_finite
+from hma_jax.training.train_only import pick_own, places_among, put_own
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
@@ -109,9 +109,9 @@ def make_train_step(
         real_BT = batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         counts = count_targets(masked, batch["tokens"], masking)
-        active = robots.choose(batch["embodiment"], table.size)
-        own = robots.take(state.params, specs, active.places_G)
-        rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.slice_B}
+        active = active_robots.choose(batch["embodiment"], table.size)
+        own = active_robots.take(state.params, specs, active.places_G)
+        rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.robot_row_B}
         grads, total = accumulated(own, rows, counts)
         if config.only:
             grads = only_per_robot(grads, specs, jnp.asarray(trained_E)[active.robots_G])
@@ -127,7 +127,7 @@ def make_train_step(
         )  # fmt: skip
         opt_state = put_adam(state.opt_state, adam, trained(specs), active, moments_G)
         new = put_own(own, new) if config.only else new
-        params = robots.put(state.params, new, specs, active.places_G)
+        params = active_robots.put(state.params, new, specs, active.places_G)
         ema = update_average(state.ema, params, config.ema_decay, state.step) if config.ema_decay else None
         metrics = loss_metrics(total, counts, masking, discrete=not model.diffusion)
         metrics |= {"grad_norm": norm, "learning_rate": rate}
@@ -179,15 +179,15 @@ def find_presence(
     """Which parameters a batch updates. Of per-robot parameters only those of `trained_E`; shared ones not at all
     unless `everything` is trained. Padding frames (not `real_BT`) do not count. Through a `leak` hidden actions are
     shown."""
-    hidden_BT = masked.hidden_T
+    action_hidden_BT = masked.action_hidden_T
     # Blocks without conditioning have nothing to leak into.
     leaks = leak == "all" or (leak == "conditioning" and model.conditioning != "concat")
-    real_BT = jnp.ones_like(hidden_BT) if real_BT is None else real_BT
+    real_BT = jnp.ones_like(action_hidden_BT) if real_BT is None else real_BT
     rows: dict[Use, jax.Array] = {
         "always": jnp.ones(len(embodiment_B), bool),
-        "actions_shown": ((~hidden_BT | leaks) & real_BT).any(axis=1),
+        "actions_shown": ((~action_hidden_BT | leaks) & real_BT).any(axis=1),
         # With causal alignment the first frame is never shown an action.
-        "actions_hidden": (hidden_BT & real_BT).any(axis=1) | (model.action_alignment == "causal"),
+        "actions_hidden": (action_hidden_BT & real_BT).any(axis=1) | (model.action_alignment == "causal"),
         "actions_predicted": masked.action_targets_T.any(axis=1),
         "frames_predicted": masked.targets_TS.any(axis=(1, 2)),
     }

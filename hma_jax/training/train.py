@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.base import require_shapes
@@ -25,10 +25,10 @@ from hma_jax.runtime.audit import audit_sharding, plan_sharding
 from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.mesh import check_mesh, make_mesh
 from hma_jax.runtime.rows import own_rows
-from hma_jax.runtime.sharding import put_batch
+from hma_jax.runtime.sharding import put_batch, replicated
 from hma_jax.training.divergence import Records
-from hma_jax.training.former import load_trained
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, RunInfo, fit
+from hma_jax.training.old_checkpoints import load_trained
 from hma_jax.training.optimizer import steps_in_common
 from hma_jax.training.reading import load_items
 from hma_jax.training.runs import describe_run, modernise
@@ -70,11 +70,12 @@ def train_model(
     shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0, only=config.only)
 
     rows = len(own_rows(device_mesh, config.batch))
-    # Neither the seed nor the robots' statistics are constants of the programs, so that runs of others share them. With
-    # action heads the statistics are: the loss would have other last bits if its targets came normalised. Evaluation
-    # has them as inputs of its program instead (`HMA.given_in`), with action heads too. Training does not: every result
-    # depends on the last bits of its steps, and nobody has shown on every platform that they would stay the same.
-    scale, known = (None, table) if model.action_heads else (table.scale(), table.standardised())
+    # Runs that differ only in their seed or in the statistics of their robots' actions share one compiled step: the
+    # seed is part of the batch, and the host normalises the actions. With action heads the statistics are constants of
+    # the program instead, because the loss would have other last bits if its targets came normalised. Evaluation has
+    # them as inputs of its program (`HMA.with_action_units`). Training does not: every result depends on the last bits
+    # of its steps, and it has not been shown on every platform that they would stay the same.
+    scale, program_table = (None, table) if model.action_heads else (table.scale(), table.standardised())
 
     def put(batch: Any) -> Any:
         return put_batch(batch if scale is None else _normalised(batch, scale), device_mesh)
@@ -87,10 +88,9 @@ def train_model(
         today = modernise(described)
         return today | {"provenance": modernise_provenance(today["provenance"])}
 
-    everywhere = NamedSharding(device_mesh, PartitionSpec())
     with jax.set_mesh(device_mesh):
-        step = _jitted_step(make_train_step, model, known, replace(config, seed=0), execution, device_mesh)
-        seed = jax.device_put(jax.random.key_data(key_of(config.seed)), everywhere)
+        step = _jitted_step(make_train_step, model, program_table, replace(config, seed=0), execution, device_mesh)
+        seed = jax.device_put(jax.random.key_data(key_of(config.seed)), replicated(device_mesh))
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
             """A run may be resumed with more or fewer steps from a step at which the learning rate did not depend on
@@ -118,7 +118,8 @@ def train_model(
                 peak_flops=peak_flops(execution.dtype),
                 may_change=extendable,
             ),
-            validation=validation and make_validation_hook(validation, model, known, config.masking, execution, put),
+            validation=validation
+            and make_validation_hook(validation, model, program_table, config.masking, execution, put),
             progress=progress,
         )
 
@@ -166,10 +167,9 @@ def _jitted_step(
     """
     declared = declare_model(model, table, execution)
     shapes = state_shapes(declared, table, device_mesh, execution.mesh, average=config.ema_decay > 0, only=config.only)
-    everywhere = NamedSharding(device_mesh, PartitionSpec())
     return jax.jit(
         make(declared, table, model, config, execution.accumulate),
         donate_argnums=0,
-        # Numbers lie everywhere, so that every process can read them.
-        out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), everywhere),
+        # Metrics are replicated, so that every process can read them.
+        out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), replicated(device_mesh)),
     )

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, check_micro_batches, require
 from hma_jax.kernels.random import key_of
@@ -20,6 +20,7 @@ from hma_jax.model.params import Declared, Params
 from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
 from hma_jax.runtime.processes import compiled_by_all
+from hma_jax.runtime.sharding import replicated
 from hma_jax.training.loop import ValidationHook
 from hma_jax.training.state import TrainState
 from hma_jax.training.step import micro_batches
@@ -81,9 +82,9 @@ def _jitted_sums(
     model: ModelConfig, table: EmbodimentTable, masking: MaskingConfig, execution: ExecutionConfig, device_mesh: Mesh
 ) -> Callable:
     """`make_sums` on a mesh, which may be empty; kept for the next run of the same process, as its step is."""
-    everywhere = None if device_mesh.empty else NamedSharding(device_mesh, PartitionSpec())
+    layout = None if device_mesh.empty else replicated(device_mesh)
     declared = declare_model(model, table, execution)
-    return jax.jit(make_sums(declared, table, model, masking, execution.accumulate), out_shardings=everywhere)
+    return jax.jit(make_sums(declared, table, model, masking, execution.accumulate), out_shardings=layout)
 
 
 def make_sums(
@@ -100,7 +101,7 @@ def make_sums(
         key = jax.random.fold_in(key_of(SEED), number)
         valid_B, real_BT = batch["valid"], batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
-        masked = masked.without_padding(jnp.broadcast_to(valid_B[:, None], masked.hidden_T.shape))
+        masked = masked.without_padding(jnp.broadcast_to(valid_B[:, None], masked.action_hidden_T.shape))
         rows = {name: batch[name] for name in ("tokens", "actions", "embodiment", "real") if name in batch}
         rows |= {"masked": masked, "key": noise_keys(key, len(valid_B))}
 

@@ -48,7 +48,7 @@ def applier(case: Case):
 
     @jax.jit
     def apply(params, tokens, masked, actions, robots, hidden):
-        return case.declared.merge(params)(tokens, masked, actions, robots, hidden_BT=hidden)
+        return case.declared.merge(params)(tokens, masked, actions, robots, action_hidden_BT=hidden)
 
     return lambda tokens, masked, actions, robots, hidden=None: apply(
         case.params, tokens, masked, actions, robots, hidden
@@ -96,7 +96,7 @@ def check_forward(case: Case) -> None:
 
     def check_z(output, actions, robot, frames=None):
         robots = case.robot(robot, latents.batch)
-        z = apply(tokens[:, :frames], masked[:, :frames], actions, robots).predictions
+        z = apply(tokens[:, :frames], masked[:, :frames], actions, robots).token_outputs
         case.check(output, latents.channels_first(z))
 
     for robot in case.domains:
@@ -163,7 +163,7 @@ def check_loss(case: Case) -> None:
     def gradient(params, actions, robots):
         def loss(p):
             model = case.declared.merge(p)
-            z = model(tokens, masked, actions, robots).predictions
+            z = model(tokens, masked, actions, robots).token_outputs
             total, *rows = frame_loss(model, case, tokens, z, masked)
             return total, rows
 
@@ -197,7 +197,7 @@ def check_generation(case: Case) -> None:
         states, first = [], None
         for step, keep in enumerate(masked_counts(config, steps)):
             ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
-            z = apply(ids, masked, actions[:, : window.shape[1]], robots).predictions[:, t]
+            z = apply(ids, masked, actions[:, : window.shape[1]], robots).token_outputs[:, t]
             first = z if first is None else first
             chosen = choose_patches(jnp.asarray(order), order.shape[1], keep)
             condition = jnp.take_along_axis(z, chosen[..., None], axis=1)
@@ -240,17 +240,17 @@ def check_joint(case: Case) -> None:
     tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
     for robot in case.domains:
         out = apply(tokens, masked, case.actions(robot), case.robot(robot, latents.batch))
-        case.check(f"z_given__{robot}", latents.channels_first(out.predictions))
-        case.check(f"action_z_given__{robot}", out.actions)
+        case.check(f"z_given__{robot}", latents.channels_first(out.token_outputs))
+        case.check(f"action_z_given__{robot}", out.action_features_BTD)
 
     robot = case.domains[0]
     robots = case.robot(robot, latents.batch)
     everything = jnp.ones(tokens.shape[:2], bool)
     out = apply(tokens, masked, jnp.zeros_like(case.actions(robot)), robots, everything)
-    case.check("z_policy", latents.channels_first(out.predictions))
-    case.check("action_z_policy", out.actions)
+    case.check("z_policy", latents.channels_first(out.token_outputs))
+    case.check("action_z_policy", out.action_features_BTD)
 
-    rows = out.actions.reshape(1, -1, out.actions.shape[-1])
+    rows = out.action_features_BTD.reshape(1, -1, out.action_features_BTD.shape[-1])
 
     def head(model, x, t, z):
         return model.action_head(x[None], t[None], z, robots[:1])[0]
@@ -278,11 +278,11 @@ def _check_joint_training(case: Case, latents: Latents, robot: str) -> None:
     def gradient(params):
         def total(p):
             model = case.declared.merge(p)
-            out = model(tokens, masked, actions, robots, hidden_BT=hidden, leak="all")
-            loss, _, _ = frame_loss(model, case, tokens, out.predictions, masked)
+            out = model(tokens, masked, actions, robots, action_hidden_BT=hidden, leak="all")
+            loss, _, _ = frame_loss(model, case, tokens, out.token_outputs, masked)
 
             def network(x, t):
-                return model.action_head(x, t, out.actions, robots)
+                return model.action_head(x, t, out.action_features_BTD, robots)
 
             mse, vb = diffusion_loss(network, actions, time, noise, process, valid=own)
             action_loss = jnp.sum((mse + vb) * hidden) / jnp.sum(hidden)

@@ -47,7 +47,7 @@ def applier(case: Case):
 
     @jax.jit
     def apply(params, ids, masked, actions, robots, hidden):
-        return case.declared.merge(params)(ids, masked, actions, robots, hidden_BT=hidden)
+        return case.declared.merge(params)(ids, masked, actions, robots, action_hidden_BT=hidden)
 
     return lambda ids, masked, actions, robots, hidden=None: apply(case.params, ids, masked, actions, robots, hidden)
 
@@ -58,7 +58,7 @@ def check_logits(case: Case) -> None:
 
     def check(output, actions, robot, frames=None):
         out = apply(ids[:, :frames], masked[:, :frames], actions, case.robot(robot, batch))
-        check_channels_first(case, output, out.predictions)
+        check_channels_first(case, output, out.token_outputs)
 
     for robot in case.domains:
         check(f"logits__{robot}", case.actions(robot), robot)
@@ -71,7 +71,7 @@ def check_logits(case: Case) -> None:
         robot = case.domains[-1]
         plain = [replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries]
         declared = declare_model(case.run.model, EmbodimentTable(tuple(plain)))
-        out = jax.jit(lambda p, *args: declared.merge(p)(*args).predictions)(
+        out = jax.jit(lambda p, *args: declared.merge(p)(*args).token_outputs)(
             case.params, ids, masked, case.actions(robot), case.robot(robot, batch)
         )
         check_channels_first(case, "logits_skip_normalization", out)
@@ -112,7 +112,7 @@ def check_loss(case: Case) -> None:
         (loss, accuracy), grads = gradient(case.params, actions, robots)
         case.check(f"loss__{robot}", loss)
         case.check(f"acc__{robot}", accuracy)
-        logits = apply(ids, masked, actions, robots).predictions
+        logits = apply(ids, masked, actions, robots).token_outputs
         check_channels_first(case, f"logits__{robot}", logits)
         check_channels_first(case, f"logits_last_frame__{robot}", logits)
         if index == 0:
@@ -122,7 +122,7 @@ def check_loss(case: Case) -> None:
             case.check_zero(named, case.info["unused_parameters"])
 
     if "loss__no_action" in case.outputs:
-        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).predictions
+        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).token_outputs
         digits = factorise(labels, case.run.model.factors, case.run.model.factor_vocab)
         weight = recorded.targets_TS / recorded.targets_TS.sum()
         per_token, _ = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
@@ -162,7 +162,7 @@ class Decoder:
         for step, keep in enumerate(masked_counts(config, steps)):
             ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
             out = self.apply(ids, masked, self.actions, robots, self.hidden)
-            logits = out.predictions[:, t]
+            logits = out.token_outputs[:, t]
             first = logits if first is None else first
             sampled, score = sample_tokens(head, logits, keys, 0.0)
             if keep and scores is not None:

@@ -19,8 +19,8 @@ def check_joint(case: Case) -> None:
     @jax.jit
     def read(params, actions, robots, hidden):
         model = case.declared.merge(params)
-        out = model(ids, masked, actions, robots, hidden_BT=hidden)
-        return out.predictions, model.action_head(out.actions, robots)
+        out = model(ids, masked, actions, robots, action_hidden_BT=hidden)
+        return out.token_outputs, model.action_head(out.action_features_BTD, robots)
 
     for robot in case.domains:
         robots, chunk = case.robot(robot, batch), case.table.entries[case.table.index(robot)].chunk
@@ -45,7 +45,7 @@ def _check_policy(case: Case, everything: jax.Array) -> None:
     window, _, out = Decoder(case, nothing, everything).generate(tokens, prompt, 1, [])
     case.check("generate_policy_tokens", window.reshape(batch, -1))
     robots = case.robot(robot, batch)
-    predicted = case.declared.merge(case.params).action_head(out.actions, robots)
+    predicted = case.declared.merge(case.params).action_head(out.action_features_BTD, robots)
     raw = case.table.scale().unnormalise(predicted, robots)
     chunk = case.table.entries[case.table.index(robot)].chunk
     case.check("generate_policy_actions_unnormalized", raw[..., :chunk])
@@ -69,10 +69,10 @@ def _check_training(case: Case) -> None:
         def total(p):
             model = case.declared.merge(p)
             loss, accuracy = loss_and_accuracy(model, recorded, labels, actions, robots, masking)
-            out = model(ids, masked, actions, robots, hidden_BT=hidden, leak=masking.action_leak)
-            predicted = model.action_head(out.actions, robots)[..., :chunk]
+            out = model(ids, masked, actions, robots, action_hidden_BT=hidden, leak=masking.action_leak)
+            predicted = model.action_head(out.action_features_BTD, robots)[..., :chunk]
             action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(hidden.astype(jnp.float32))
-            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.predictions)
+            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.token_outputs)
 
         return jax.grad(total, has_aux=True)(params)
 

@@ -43,11 +43,11 @@ def test_old_robots_answers_stay_bit_identical(diffusion, conditioning: str):
         def run(p):
             hma = declared.merge(p)
             out = hma(batch["tokens"], None, actions, batch["embodiment"])
-            if out.actions is None:
-                return out.predictions, 0
+            if out.action_features_BTD is None:
+                return out.token_outputs, 0
             keys = jax.random.split(jax.random.key(0), 8)
             chunks = read_actions(hma, out, batch["embodiment"], keys, decode)
-            return out.predictions, chunks[..., : TABLE.action_width]
+            return out.token_outputs, chunks[..., : TABLE.action_width]
 
         return jax.jit(run)(params)
 
@@ -70,7 +70,7 @@ def test_an_old_robot_s_answer_does_not_depend_on_how_wide_the_table_is(rows: in
     def answer(declared, params, width: int) -> tuple[jax.Array, jax.Array]:
         actions = np.pad(batch["actions"][:, :frames], ((0, 0), (0, 0), (0, width - TABLE.action_width)))
         out = jax.jit(lambda p: declared.merge(p)(tokens, None, actions, batch["embodiment"]))(params)
-        return out.predictions, out.actions
+        return out.token_outputs, out.action_features_BTD
 
     predictions, pooled = answer(declared, params, TABLE.action_width)
     for width in (1, 33, 300):

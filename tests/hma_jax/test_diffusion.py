@@ -18,7 +18,7 @@ from hma_jax.objective.losses import draw_noise, frame_diffusion_loss
 from hma_jax.objective.process import (
     make_process,
     respace,
-    respace_by_log_snr,
+    respace_by_half_log_snr,
 )
 from tests.tiny import TABLE, shallow_config
 
@@ -59,18 +59,18 @@ def test_a_process_cannot_be_respaced_to_any_length(count: int):
 
 @pytest.mark.parametrize("count", [2, 8, 10, 12, 100])
 def test_spacing_by_log_snr_is_even_from_the_cleanest_step_to_where_the_signal_is_lost(count):
-    short = respace_by_log_snr(FULL, count)
+    short = respace_by_half_log_snr(FULL, count)
     assert short.timestep_map[0] == 0
-    np.testing.assert_allclose(short.log_snr[[0, -1]], [5.0475, -4.0], atol=0.05)
+    np.testing.assert_allclose(short.half_log_snr[[0, -1]], [5.0475, -4.0], atol=0.05)
     if count <= 12:  # with more, neighbouring steps of the process lie further apart than asked for
-        np.testing.assert_allclose(np.diff(short.log_snr), -9.05 / (count - 1), atol=0.2)
+        np.testing.assert_allclose(np.diff(short.half_log_snr), -9.05 / (count - 1), atol=0.2)
 
 
 @pytest.mark.parametrize("size", [2, 3, 20, 1000])
 def test_spacing_by_log_snr_visits_every_step_at_most_once(size):
     process = make_process(size)
     for count in {2, min(12, size), size - 1, size} - {1}:
-        chosen = respace_by_log_snr(process, count).timestep_map
+        chosen = respace_by_half_log_snr(process, count).timestep_map
         assert len(chosen) == count and np.all(np.diff(chosen) > 0) and chosen[-1] < size
 
 

@@ -48,8 +48,8 @@ def rolled_out(config, decode: DecodeConfig, prompt: int, hidden=None, frames: i
 
     both = np.stack([batch["actions"], other], axis=1)
     args = (batch["embodiment"], keys, decode)
-    cached = jax.jit(lambda p: rollout(declared.merge(p), start, both, *args, hidden_BT=hidden))
-    naive = jax.jit(lambda p, a: rollout_naive(declared.merge(p), start, a, *args, hidden_BT=hidden))
+    cached = jax.jit(lambda p: rollout(declared.merge(p), start, both, *args, action_hidden_BT=hidden))
+    naive = jax.jit(lambda p, a: rollout_naive(declared.merge(p), start, a, *args, action_hidden_BT=hidden))
     return np.asarray(cached(params)), lambda k: naive(params, both[:, k])
 
 
@@ -142,7 +142,7 @@ def test_actions_that_are_all_hidden_make_no_difference(conditioning: str):
     actions = np.stack([batch["actions"], batch["actions"] + 3], axis=1)
     keys = jax.random.split(jax.random.key(0), 2)
     hidden = np.ones((2, 6), bool)
-    blind = jitted_rollout(declared, batch, actions, keys, DecodeConfig(2), 2, hidden_BT=hidden)(params)
+    blind = jitted_rollout(declared, batch, actions, keys, DecodeConfig(2), 2, action_hidden_BT=hidden)(params)
     np.testing.assert_array_equal(blind[:, 0], blind[:, 1])
 
 
@@ -184,7 +184,9 @@ def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
         actions[:, chunk, :2] += 3.0
         hidden = hma.align_hidden(None, (2, config.frames))
         look = jax.jit(
-            lambda a: hma(batch["tokens"], None, hma.align(a), batch["embodiment"], hidden_BT=hidden).predictions
+            lambda a: (
+                hma(batch["tokens"], None, hma.align(a), batch["embodiment"], action_hidden_BT=hidden).token_outputs
+            )
         )
         logits = [look(a) for a in (batch["actions"], actions)]
         changed = np.abs(logits[0] - logits[1]).max((0, 2, 3, 4)) > 1e-3
@@ -203,7 +205,9 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
     hidden = hma.align_hidden(None, batch["tokens"].shape[:2])
     look = jax.jit(
         lambda masked: (
-            hma(batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden).predictions
+            hma(
+                batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], action_hidden_BT=hidden
+            ).token_outputs
         )
     )
     fast = jax.jit(lambda: next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))()
@@ -234,7 +238,9 @@ def test_next_frames_equal_one_rollout_of_a_frame_per_recorded_past(options: dic
     for t in range(1, config.frames):
         given = tokens[:, :t], actions[:, : t + 1], *rest
         shown = hidden[:, : t + 1]
-        slow = jax.jit(lambda p, g=given, h=shown: rollout_naive(declared.merge(p), *g, hidden_BT=h)[:, 0])(params)
+        slow = jax.jit(lambda p, g=given, h=shown: rollout_naive(declared.merge(p), *g, action_hidden_BT=h)[:, 0])(
+            params
+        )
         if config.diffusion:
             np.testing.assert_allclose(fast[:, t - 1], slow, atol=2e-3)
         else:
@@ -268,8 +274,10 @@ def past_the_window(config, decode: DecodeConfig, prompt: int, hidden=None):
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
     batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
     start, rest = batch["tokens"][:, :prompt], (batch["embodiment"], keys, decode)
-    fast = jax.jit(lambda p: rollout(declared.merge(p), start, batch["actions"][:, None], *rest, hidden_BT=hidden))
-    naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, batch["actions"], *rest, hidden_BT=hidden))
+    fast = jax.jit(
+        lambda p: rollout(declared.merge(p), start, batch["actions"][:, None], *rest, action_hidden_BT=hidden)
+    )
+    naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, batch["actions"], *rest, action_hidden_BT=hidden))
     return params, lambda p: (np.asarray(fast(p))[:, 0], np.asarray(naive(p)))
 
 
@@ -376,18 +384,20 @@ def test_a_session_makes_the_frames_of_a_rollout_one_by_one(changes, decode: Dec
     declared, params = lively_params(config, scale=0.5)
     batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
     actions, tokens, robots = jnp.asarray(batch["actions"]), batch["tokens"][:, :prompt], batch["embodiment"]
-    hidden_B = jnp.array([True, False])
-    hidden = jnp.repeat(hidden_B[:, None], LONG, axis=1)
-    whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt, hidden_BT=hidden)(params)[:, 0]
+    action_hidden_B = jnp.array([True, False])
+    hidden = jnp.repeat(action_hidden_B[:, None], LONG, axis=1)
+    whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt, action_hidden_BT=hidden)(params)[
+        :, 0
+    ]
 
     @jax.jit
     def begin(params):
         between, unseen = actions[:, : prompt - 1], hidden[:, : prompt - 1]
-        return start(declared.merge(params), tokens, between, robots, hidden_BT=unseen)
+        return start(declared.merge(params), tokens, between, robots, action_hidden_BT=unseen)
 
     @partial(jax.jit, donate_argnums=1)
     def step(params, session, chunk, following):
-        rest = dict(next_chunk_BU=following, hidden_B=hidden_B)
+        rest = dict(next_chunk_BU=following, action_hidden_B=action_hidden_B)
         return advance(declared.merge(params), session, chunk, keys, decode, **rest)
 
     session, frames = begin(params), []

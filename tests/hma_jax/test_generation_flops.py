@@ -100,7 +100,7 @@ def test_a_pass_counts_exactly_what_is_multiplied(kind, conditioning):
 def whole_pass(case: Case, params) -> jax.Array:
     batch = case.batch
     model = case.declared.merge(params)
-    return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).predictions
+    return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).token_outputs
 
 
 def ways(case: Case, decode: DecodeConfig) -> dict:

@@ -94,7 +94,7 @@ def test_a_session_of_other_shapes_is_refused(tokens, between, chunk, message):
 
     def begin_and_go_on(params):
         model, robots = declared.merge(params), jnp.zeros(2, jnp.int32)
-        session = start(model, jnp.zeros((2, 2, tokens), jnp.int32), chunks, robots, hidden_BT=hidden)
+        session = start(model, jnp.zeros((2, 2, tokens), jnp.int32), chunks, robots, action_hidden_BT=hidden)
         return advance(model, session, jnp.zeros(chunk), jax.random.split(jax.random.key(0), 2), DecodeConfig())
 
     with pytest.raises(ConfigError, match=message):

@@ -46,7 +46,9 @@ def test_the_settings_differ_in_what_is_hidden_and_predicted():
     seen = {}
     for setting in ("forward", "passive", "full", "policy", "inverse"):
         _, masked = masked_batch(config, MaskingConfig(setting=setting))
-        seen[setting] = [float(np.mean(x)) for x in (masked.targets_TS, masked.hidden_T, masked.action_targets_T)]
+        seen[setting] = [
+            float(np.mean(x)) for x in (masked.targets_TS, masked.action_hidden_T, masked.action_targets_T)
+        ]
     assert seen["forward"][1:] == [0, 0] and seen["passive"][1:] == [1, 0]
     assert seen["inverse"] == [0, 1, pytest.approx(5 / 6)]  # what follows the last frame is shown by none
     assert seen["policy"][0] == 0 and seen["policy"][1] == seen["policy"][2]
@@ -56,7 +58,7 @@ def test_the_settings_differ_in_what_is_hidden_and_predicted():
 
 def test_a_policy_s_hidden_actions_are_all_from_one_frame_on():
     _, masked = masked_batch(shallow_config(), MaskingConfig(setting="policy"))
-    hidden = np.asarray(masked.hidden_T)
+    hidden = np.asarray(masked.action_hidden_T)
     assert (np.diff(hidden.astype(int), axis=1) >= 0).all() and hidden[:, -1].all()
     assert len(np.unique(hidden.sum(1))) == 6
 
@@ -72,7 +74,7 @@ def test_how_many_actions_are_hidden_says_nothing_of_how_many_ids_are_corrupted(
     masking = MaskingConfig(setting="full", non_mlm_ratio=0.0)
     data, masked = masked_batch(shallow_config(), masking, batch=512)
     corrupted = (np.asarray(masked.inputs) != data["tokens"]).mean((1, 2))
-    assert abs(np.corrcoef(corrupted, np.asarray(masked.hidden_T).mean(1))[0, 1]) < 0.15
+    assert abs(np.corrcoef(corrupted, np.asarray(masked.action_hidden_T).mean(1))[0, 1]) < 0.15
 
 
 def test_an_example_s_masks_do_not_depend_on_its_batch():
@@ -100,14 +102,14 @@ def test_robots_without_actions_or_video_targets_train_what_they_can(setting: st
     _, masked = masked_batch(shallow_config(), MaskingConfig(setting=setting), MIXED)
     robots = random_batch(0, shallow_config(), 64, MIXED)["embodiment"]
     film, blind = robots == 1, robots == 2
-    assert np.asarray(masked.hidden_T)[film].all() and not np.asarray(masked.action_targets_T)[film].any()
+    assert np.asarray(masked.action_hidden_T)[film].all() and not np.asarray(masked.action_targets_T)[film].any()
     assert not np.asarray(masked.masked)[blind].any()
     if setting != "policy":
         assert np.asarray(masked.targets_TS)[film].any()
     if setting != "forward":
         assert np.asarray(masked.action_targets_T)[blind].any()
         counted = count_targets(masked, masked.inputs, MaskingConfig(setting=setting)).actions
-        assert counted == np.asarray(masked.action_targets_T).sum() < np.asarray(masked.hidden_T).sum()
+        assert counted == np.asarray(masked.action_targets_T).sum() < np.asarray(masked.action_hidden_T).sum()
 
 
 def test_chunks_that_training_never_shows_are_hidden_at_inference():
@@ -257,7 +259,7 @@ def test_a_window_of_one_frame_has_none_to_predict(setting: str):
 
 def poison_hidden(data, masked):
     """Hidden chunks become nonsense, as the model would be given them; targets are not asked for."""
-    nonsense = np.where(np.asarray(masked.hidden_T)[..., None], 1e3, data["actions"])
+    nonsense = np.where(np.asarray(masked.action_hidden_T)[..., None], 1e3, data["actions"])
     return data | {"actions": nonsense.astype(np.float32)}, masked
 
 
@@ -290,8 +292,10 @@ def test_hidden_actions_are_predicted_without_being_seen():
 
     @jax.jit
     def read(batch):
-        out = hma(masked.inputs, masked.masked, batch["actions"], batch["embodiment"], hidden_BT=masked.hidden_T)
-        return hma.action_head(out.actions, batch["embodiment"])
+        out = hma(
+            masked.inputs, masked.masked, batch["actions"], batch["embodiment"], action_hidden_BT=masked.action_hidden_T
+        )
+        return hma.action_head(out.action_features_BTD, batch["embodiment"])
 
     np.testing.assert_array_equal(read(data), read(poisoned))
 
@@ -342,7 +346,7 @@ def test_presence_is_by_use_and_robot():
     no_target = masked._replace(targets_TS=jnp.zeros_like(masked.targets_TS))  # masked in padding alone, say
     presence = find_presence(no_target, jnp.asarray(data["embodiment"]), jnp.ones(3, bool), config)
     assert not presence.shared["frames_predicted"]
-    shown = masked._replace(hidden_T=jnp.zeros_like(masked.hidden_T))
+    shown = masked._replace(action_hidden_T=jnp.zeros_like(masked.action_hidden_T))
     for alignment in ("released", "causal"):  # the first frame is never shown an action where it is causal
         aligned = shallow_config(action_alignment=alignment)
         presence = find_presence(shown, jnp.asarray(data["embodiment"]), jnp.ones(3, bool), aligned)
@@ -366,12 +370,12 @@ def test_stems_and_modulation_learn_from_hidden_actions_that_leak(conditioning: 
     presence = find_presence(masked, data["embodiment"], np.ones(TABLE.size, bool), config, leak=leak)
     declared, params = lively_params(config)
     hma, actions = declared.merge(params), data["actions"]
-    hidden = hma.align_hidden(masked.hidden_T, actions.shape[:2])
+    hidden = hma.align_hidden(masked.action_hidden_T, actions.shape[:2])
 
     @jax.jit
     def predictions(actions):
         shown = hma.align(actions), data["embodiment"]
-        return hma(masked.inputs, masked.masked, *shown, hidden_BT=hidden, leak=leak).predictions
+        return hma(masked.inputs, masked.masked, *shown, action_hidden_BT=hidden, leak=leak).token_outputs
 
     reached = np.asarray(predictions(actions) != predictions(actions + 1))
     assert reached.any() == bool(presence.shared["actions_shown"]) == (conditioning != "concat" or leak == "all")

@@ -19,7 +19,7 @@ from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_bat
 
 def logits_of(config, declared, params, batch, actions=True):
     given = batch["actions"] if actions else None
-    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], None, given, b["embodiment"]).predictions)
+    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], None, given, b["embodiment"]).token_outputs)
     return np.asarray(apply(params, batch))
 
 
@@ -136,7 +136,7 @@ def test_flops_formula_counts_what_the_program_multiplies():
     declared = declare_model(config, table)
     batch = random_batch(0, config, 1, table)
     apply = jax.jit(
-        lambda p: declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).predictions
+        lambda p: declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).token_outputs
     )
     counted = apply.lower(declared.init(0)).compile().cost_analysis()["flops"]
     formula = forward_flops_per_window(config, table)

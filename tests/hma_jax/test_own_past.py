@@ -99,7 +99,7 @@ def test_every_round_draws_with_random_numbers_of_its_own(monkeypatch):
     declared, params = lively_params(config)
     batch, every_frame = random_batch(0, config, 4), 1e9
     before, given = jnp.asarray(batch["tokens"])[:, :-1], (batch["actions"], batch["embodiment"])
-    nothing = SimpleNamespace(predictions=jnp.zeros((*before.shape, config.factors, config.factor_vocab)))
+    nothing = SimpleNamespace(token_outputs=jnp.zeros((*before.shape, config.factors, config.factor_vocab)))
     monkeypatch.setattr(own_past, "teacher_forced_pass", lambda *_, **__: nothing)
 
     @jax.jit

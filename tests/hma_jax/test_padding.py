@@ -61,7 +61,7 @@ def test_what_is_said_of_real_frames_does_not_depend_on_padding(context):
     @jax.jit
     def predictions(params, batch):
         out = declared.merge(params)(batch["tokens"], None, batch["actions"], batch["embodiment"], visible=visible)
-        return out.predictions, out.actions
+        return out.token_outputs, out.action_features_BTD
 
     batch = random_batch(0, MODEL, len(LENGTHS))
     found = [predictions(params, spoilt(batch, other)) for other in (7, 8)]
@@ -123,11 +123,11 @@ def test_actions_that_are_hidden_or_shown_in_padding_only_concern_nobody():
     """Otherwise the weights for these actions would decay without a gradient."""
     batch = random_batch(0, MODEL, len(LENGTHS))
     masked = mask(jax.random.key(0), batch["tokens"], batch["embodiment"], MODEL, MaskingConfig(), TABLE)
-    masked = masked._replace(hidden_T=jnp.asarray(~REAL))
+    masked = masked._replace(action_hidden_T=jnp.asarray(~REAL))
     for real, concerned in ((None, True), (jnp.asarray(REAL), False)):
         presence = find_presence(masked, batch["embodiment"], np.ones(TABLE.size, bool), MODEL, real_BT=real)
         assert bool(presence.shared["actions_hidden"]) == concerned
-        shown = masked._replace(hidden_T=jnp.asarray(REAL))
+        shown = masked._replace(action_hidden_T=jnp.asarray(REAL))
         presence = find_presence(shown, batch["embodiment"], np.ones(TABLE.size, bool), MODEL, real_BT=real)
         assert bool(presence.shared["actions_shown"]) == concerned
 

@@ -42,7 +42,7 @@ def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(changes):
             chosen = predict_actions(hma, window, actions[:, :t], robots, hidden, keys, decode)[:, t - 1]
             actions = actions.at[:, t - 1].set(chosen)
             unknown = jnp.broadcast_to(jnp.arange(t + 1) >= t, (2, t + 1))
-            new = rollout_naive(hma, window, actions[:, : t + 1], robots, keys, decode, hidden_BT=unknown)
+            new = rollout_naive(hma, window, actions[:, : t + 1], robots, keys, decode, action_hidden_BT=unknown)
             window = jnp.concatenate([window, new], axis=1)
         return window[:, prompt.shape[1] :], actions
 

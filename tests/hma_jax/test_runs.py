@@ -235,7 +235,7 @@ def test_a_model_is_loaded_as_it_is_executed(dtype: str, averaged):
 
     def logits(params, batch):
         merged = model.declared.merge(params)
-        return merged(batch["tokens"], None, merged.align(batch["actions"]), batch["embodiment"]).predictions
+        return merged(batch["tokens"], None, merged.align(batch["actions"]), batch["embodiment"]).token_outputs
 
     assert jax.eval_shape(logits, model.params, next(batches(MODEL, 4)(0))).shape == (4, 3, 4, 2, 4)
 
@@ -256,12 +256,14 @@ def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
         model = declared.merge(params)
         out = model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"])
         if not config.diffusion:
-            return model.logits(out.predictions, batch["tokens"]), model.action_head(out.actions, batch["embodiment"])
+            return model.logits(out.token_outputs, batch["tokens"]), model.action_head(
+                out.action_features_BTD, batch["embodiment"]
+            )
         times = jnp.full((4, config.frames), 3)
         tokens, actions = batch["tokens"], batch["actions"]
         return (
-            model.denoiser(tokens, jnp.full(tokens.shape[:-1], 3), out.predictions),
-            model.action_head(actions, times, out.actions, batch["embodiment"]),
+            model.denoiser(tokens, jnp.full(tokens.shape[:-1], 3), out.token_outputs),
+            model.action_head(actions, times, out.action_features_BTD, batch["embodiment"]),
         )
 
     cast = inference_params(declared, params, "bfloat16")

@@ -17,7 +17,7 @@ from hma_jax.objective.process import (
     Process,
     make_process,
     respace,
-    respace_by_log_snr,
+    respace_by_half_log_snr,
     sampling_process,
 )
 
@@ -150,7 +150,7 @@ def test_a_few_steps_of_dpm_have_the_mean_and_spread_of_gaussian_data(steps, eta
 @pytest.mark.parametrize("eta", [0.0, 0.5, 1.0])
 def test_dpm_is_the_multistep_formula_of_second_order(eta):
     """By hand, in float64 (Lu et al. 2022, algorithm 2, and its stochastic form), with a simple network."""
-    process, sampler = respace_by_log_snr(FULL, 5), SamplerConfig("dpm++", 5, temperature=0.7, eta=eta)
+    process, sampler = respace_by_half_log_snr(FULL, 5), SamplerConfig("dpm++", 5, temperature=0.7, eta=eta)
     noise = np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32)
     told = np.array([[0.5, -1.5]])
 

@@ -63,7 +63,7 @@ def test_a_frame_is_told_the_frames_before_it_and_not_their_masks():
 
     @jax.jit
     def said(before: jax.Array, masked: jax.Array) -> jax.Array:
-        return teacher_forced_pass(model, before, tokens[:, 1:], masked, *rest).predictions
+        return teacher_forced_pass(model, before, tokens[:, 1:], masked, *rest).token_outputs
 
     shown = said(tokens[:, :-1], some)
     other_masks = said(tokens[:, :-1], some.at[:, 0].set(~some[:, 0]))
@@ -82,7 +82,7 @@ def test_what_a_masked_token_recalls_is_the_frame_before_and_never_the_truth(dif
 
     @jax.jit
     def said(before: jax.Array, ahead: jax.Array) -> jax.Array:
-        return teacher_forced_pass(model, before, ahead, masked, *rest).predictions
+        return teacher_forced_pass(model, before, ahead, masked, *rest).token_outputs
 
     told = said(before, tokens[:, 1:])
     np.testing.assert_array_equal(said(before, jnp.zeros_like(before)), told)
@@ -99,7 +99,7 @@ def test_in_one_pass_over_masked_frames_only_what_is_shown_is_recalled():
 
     @jax.jit
     def said(tokens: jax.Array) -> jax.Array:
-        return model(tokens, masked, *rest).predictions
+        return model(tokens, masked, *rest).token_outputs
 
     np.testing.assert_array_equal(said(tokens.at[:, 2:].set(0)), said(tokens))
     changed = said(tokens.at[:, 1].set(0)) != said(tokens)

@@ -62,7 +62,7 @@ def main(directory: str) -> None:
         with jax.set_mesh(mesh):
             rows = put_batch(batch, mesh)
             apply = jax.jit(
-                lambda p, b, d=declared: d.merge(p)(b["tokens"], None, b["actions"], b["embodiment"]).predictions
+                lambda p, b, d=declared: d.merge(p)(b["tokens"], None, b["actions"], b["embodiment"]).token_outputs
             )
             logits = np.asarray(apply(state.params, rows))
         split = [x for x in jax.tree.leaves(state.params) if not x.sharding.is_fully_replicated]

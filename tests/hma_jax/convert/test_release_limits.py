@@ -46,13 +46,13 @@ def everything(config, params, execution: ExecutionConfig) -> dict[str, np.ndarr
     def apply(params):
         model = declared.merge(params)
         out = model(batch["tokens"], None, batch["actions"], robots)
-        made = {"frames": out.predictions}
+        made = {"frames": out.token_outputs}
         if config.diffusion:
             time = jnp.asarray(rng.integers(0, 1000, batch["tokens"].shape[:3]))
-            made["denoiser"] = model.denoiser(batch["tokens"], time, out.predictions)
+            made["denoiser"] = model.denoiser(batch["tokens"], time, out.token_outputs)
         if config.action_heads:
             noised = (jnp.where(alive, batch["actions"], 0), time[..., 0]) if config.diffusion else ()
-            actions = model.action_head(*noised, out.actions, robots)
+            actions = model.action_head(*noised, out.action_features_BTD, robots)
             actions = actions.reshape(*actions.shape[:2], -1, TABLE.action_width)
             made["actions"] = jnp.where(own[:, None, None], actions, 0)
         return made

@@ -293,12 +293,12 @@ def test_a_model_that_was_trained_without_actions_is_shown_none(params, monkeypa
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
     hidden = []
 
-    def outputs(model, tokens, actions, robots, hidden_BT):
-        hidden.append(hidden_BT)
+    def outputs(model, tokens, actions, robots, action_hidden_BT):
+        hidden.append(action_hidden_BT)
         return jnp.zeros((4, 5, 9, CONFIG.factors, CONFIG.factor_vocab))
 
-    def rolled_out(_, prompt, sequences, *__, hidden_BT):
-        hidden.append(hidden_BT)
+    def rolled_out(_, prompt, sequences, *__, action_hidden_BT):
+        hidden.append(action_hidden_BT)
         return jnp.zeros((*sequences.shape[:2], 4, 9), jnp.int32)
 
     monkeypatch.setattr(protocol, "rollout", rolled_out)

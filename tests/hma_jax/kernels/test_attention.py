@@ -141,7 +141,7 @@ def test_large_frames_attend_one_by_one_on_cpu_and_say_the_same():
     for how in ("cpu", "plain"):
         declared = declare_model(config, TABLE, ExecutionConfig(attention=how))
         look = jax.jit(
-            lambda p, d=declared: d.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).predictions
+            lambda p, d=declared: d.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).token_outputs
         )
         predictions.append(np.asarray(look(params)))
     np.testing.assert_allclose(*predictions, atol=1e-4 * np.abs(predictions[1]).max())

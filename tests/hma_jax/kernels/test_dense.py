@@ -7,7 +7,7 @@ from hma_jax.kernels.dense import (
     contract,
     from_actions,
     look_up,
-    multiply,
+    matmul_direct_grad,
     per_robot,
     per_robot_from_actions,
     per_robot_to_actions,
@@ -37,10 +37,12 @@ def test_contract_sums_in_the_type_it_is_asked_for():
 
 
 @pytest.mark.parametrize("sizes", [(48, 256), (7, 5)], ids=str)
-def test_multiply_has_the_gradients_of_a_product_and_transposes_none(sizes: tuple):
+def test_matmul_direct_grad_has_the_gradients_of_a_product_and_transposes_none(sizes: tuple):
     x, w = drawn(0, 8, 4, 16, sizes[0]), drawn(1, *sizes)
-    check_equal(multiply, jnp.matmul, x, w, tolerance=1e-6)
-    programs = [str(jax.make_jaxpr(jax.grad(lambda w, f=f: f(x, w).sum()))(w)) for f in (multiply, jnp.matmul)]
+    check_equal(matmul_direct_grad, jnp.matmul, x, w, tolerance=1e-6)
+    programs = [
+        str(jax.make_jaxpr(jax.grad(lambda w, f=f: f(x, w).sum()))(w)) for f in (matmul_direct_grad, jnp.matmul)
+    ]
     assert ["transpose[" in program for program in programs] == [False, True]
 
 

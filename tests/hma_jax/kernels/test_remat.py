@@ -24,7 +24,7 @@ def loss_of(remat: str, config=CONFIG):
 
     def loss(params):
         out = declared.merge(params)(BATCH["tokens"], None, BATCH["actions"], BATCH["embodiment"])
-        return jnp.sum(jnp.sin(out.predictions))
+        return jnp.sum(jnp.sin(out.token_outputs))
 
     return loss
 
@@ -100,7 +100,7 @@ def test_gradients_are_the_same_under_every_policy_and_the_more_is_kept_the_more
 
         def loss(params, declared=declared):
             out = declared.merge(params)(batch["tokens"], None, batch["actions"], batch["embodiment"])
-            return jnp.sum(jnp.sin(out.predictions))
+            return jnp.sum(jnp.sin(out.token_outputs))
 
         compiled = jax.jit(jax.grad(loss)).lower(params).compile()
         gradients[remat] = compiled(params)

@@ -19,7 +19,7 @@ class Active(NamedTuple):
     """The robots of one step: G = min(max(B, 2), E) different ones, those of the batch among them."""
 
     robots_G: jax.Array  # int32: their places on the embodiment axis
-    slice_B: jax.Array  # int32: each example's robot, as a place in `robots_G`
+    robot_row_B: jax.Array  # int32: each example's robot, as a place in `robots_G`
     everyone: bool = False  # all robots, in their order
 
     @property

@@ -1,4 +1,4 @@
-"""Checkpoints of earlier versions, with moments of everything, for runs that have them of some robots alone."""
+"""Resumes `train.only` runs from checkpoints of earlier versions, which hold optimiser moments of all parameters."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from hma_jax.model.params import Declared, Params, is_spec
 from hma_jax.runtime.sharding import place
-from hma_jax.training.own import own_specs
 from hma_jax.training.reading import load_items, on_host, saved_shapes
+from hma_jax.training.train_only import own_specs
 
 
 def load_trained(checkpoint: Path, shapes: Mapping[str, Any], declared: Declared, trained_E: np.ndarray) -> Any:

@@ -11,7 +11,7 @@ import pytest
 from hma_jax.config import ConfigError, OptimizerConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import is_spec
-from hma_jax.training import own
+from hma_jax.training import train_only
 from hma_jax.training.branch import begin_from
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.loop import LoopOptions
@@ -46,7 +46,7 @@ def test_what_a_robot_learns_does_not_depend_on_which_others_are_trained(batch: 
         step = jax.jit(make_train_step(DECLARED, SIX, MODEL, settings))
         for number in range(3):
             state, _ = step(state, random_batch(number, MODEL, batch, SIX))
-        kept = [state.opt_state.first, state.opt_state.second, own.pick_own(state.params, DECLARED.specs)]
+        kept = [state.opt_state.first, state.opt_state.second, train_only.pick_own(state.params, DECLARED.specs)]
         places = [sorted(only, key=SIX.index).index("base")] * 2 + [SIX.index("base")]
         found[only] = [
             np.take(np.asarray(x), place, spec.embodiment_axis)
@@ -69,7 +69,7 @@ def as_before(state: TrainState) -> TrainState:
             slices[place] = np.asarray(x)
             return np.concatenate(slices, axis=spec.embodiment_axis)
 
-        return own.put_own(whole, jax.tree.map(one, own.pick_own(specs, specs), moment, is_leaf=is_spec))
+        return train_only.put_own(whole, jax.tree.map(one, train_only.pick_own(specs, specs), moment, is_leaf=is_spec))
 
     adam = state.opt_state
     return state._replace(opt_state=adam._replace(first=widened(adam.first), second=widened(adam.second)))
