@@ -45,6 +45,29 @@ def test_docstrings_and_comments_are_no_wider_than_the_code():
     assert not wide, f"break these lines at {most} characters: {', '.join(wide)}"
 
 
+def shadowed_imports(tree: ast.Module) -> list[tuple[int, str]]:
+    """(line of a function, name) of each parameter or local variable that hides what the module imports."""
+    imports = (node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom))
+    imported = {alias.asname or alias.name.split(".")[0] for node in imports for alias in node.names}
+    found = []
+    for function in (n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.Lambda)):
+        names = {n.arg for n in ast.walk(function) if isinstance(n, ast.arg)}
+        names |= {n.id for n in ast.walk(function) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        found += [(function.lineno, name) for name in sorted(names & imported)]
+    return found
+
+
+def test_no_variable_of_the_core_hides_an_import():
+    text = "from a import robots\ndef f(robots): pass\ndef g():\n    robots = 1\ndef h(): return robots\n"
+    assert shadowed_imports(ast.parse(text)) == [(2, "robots"), (3, "robots")]
+    hidden = [
+        f"{path.relative_to(ROOT)}:{line}: rename the variable {name!r}, which hides an import"
+        for path in sorted((ROOT / "hma_jax").rglob("*.py"))
+        for line, name in shadowed_imports(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert not hidden, "\n".join(hidden)
+
+
 def texts(tree: ast.AST) -> list[tuple[int, str]]:
     """(line, text) of every text of a program but docstrings; what an f-string inserts is left out."""
     docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
