@@ -81,6 +81,12 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
     return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.why_empty() for n, s in sets.items()}))
 
 
+def count_trajectories(store: TokenStore, config: LoaderConfig) -> dict[str, int]:
+    """{dataset: trajectories that windows are drawn of}: of a subset, fewer than asked where some were skipped."""
+    names = config.datasets or store.names
+    return {name: len(_windows(store, name, config, config.max_trajectories).episodes) for name in names}
+
+
 def training_table(store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation") -> EmbodimentTable:
     """The table of the datasets of `config`, in their order, with statistics of exactly the trajectories used."""
     names = config.datasets or store.names

@@ -8,9 +8,11 @@ weighs robots by the trajectories used, those without more lose windows to the o
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 from experiments.analysis.changes import METRICS
 from experiments.analysis.compare import Side, overall_difference
@@ -48,16 +50,21 @@ def find_growth(
     sweeps: Sequence[Sweep],
     provenance: Provenance,
     windows: Mapping[str, WindowTable],
+    results: Mapping[str, Mapping[str, Any]],
     episodes: Mapping[str, int],
 ) -> list[Growth]:
     """Of axes along which the cap of trajectories changes, between neighbouring points that have seeds in common.
-    `episodes` are the training ones that each robot has. Raises NotComparable."""
+    The `results` of trials count their trajectories; `episodes` are the training ones that each robot has, for those
+    that do not. Raises NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.fittable):
         for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
             own = [p for p in sweep.points if (p.role, p.series, p.scope) == (POINT, series, ())]
             if len({p.trial.max_trajectories for p in own}) > 1 and all(keeps_shares(p.trial) for p in own):
-                found += _along(sweep, series, own, provenance, windows, episodes)
+                used = {
+                    p.trial: trajectories_of(p.trial, episodes, results.get(trial_id(p.trial, provenance))) for p in own
+                }
+                found += _along(sweep, series, own, provenance, windows, used)
     return found
 
 
@@ -72,7 +79,7 @@ def _along(
     points: Sequence[Point],
     provenance: Provenance,
     windows: Mapping[str, WindowTable],
-    episodes: Mapping[str, int],
+    used: Mapping[Trial, Mapping[str, int]],
 ) -> list[Growth]:
     trials: dict[float, dict[int, tuple[Trial, WindowTable]]] = {}
     for p in points:
@@ -83,7 +90,8 @@ def _along(
         seeds = trials[first].keys() & trials[last].keys()
         if not seeds:
             continue
-        before, after = (trajectories_of(next(iter(trials[x].values()))[0], episodes) for x in (first, last))
+        # Subsets of one seed are nested, so a sum over seeds is larger where any seed has more.
+        before, after = (sum((Counter(used[trials[x][s][0]]) for s in seeds), Counter()) for x in (first, last))
         known = [name for name in sweep.scope if name in before and name in after]
         groups = {
             GROWS: [name for name in known if after[name] > before[name]],

@@ -6,7 +6,7 @@ Columns:
     config.*                   every setting by its dotted path ("config.train.optimizer.learning_rate"); lists as JSON
     store, manifest, tokenizer, results     what it depends on (`experiments.running.provenance`)
     windows_drawn              in training: steps times batch. Epochs are not one number: robots differ in windows
-    trajectories               that may be drawn from, of all robots; null where unknown
+    trajectories               that windows are drawn of, of all robots, as `trajectories_of` counts; null where unknown
     parameters, train_flops, training_loss  the last is the mean over the last steps
     <metric>, <metric>.sem     over all robots that it was judged on, each counting equally
     windows, episodes, robots  that these are means over
@@ -42,11 +42,11 @@ def trial_row(
     available: Mapping[str, int],
 ) -> dict[str, Any]:
     """One row; `result` is that of result.json (None: there is none), `loss` its training loss, `available` the
-    training trajectories that each robot has."""
+    training trajectories with windows that each robot has."""
     row = {"trial": id, "title": title, "status": status}
     row |= {f"config.{path}": value for path, value in _flat(to_dict(trial))}
     row |= dataclasses.asdict(provenance)
-    used = trajectories_of(trial, available)
+    used = trajectories_of(trial, available, result)
     row["windows_drawn"] = trial.train.steps * trial.train.batch
     row["trajectories"] = sum(used.values()) if used.keys() == set(trial.datasets) else None
     if result is None:

@@ -219,7 +219,7 @@ def _remark(name: str, facts: dict[str, int], no_evaluation: str) -> None:
     if facts["too_short"]:
         remarks.append(f"{facts['too_short']} of {facts['episodes']} training episodes are too short for any window")
     if facts["skipped"]:
-        remarks.append(f"{facts['skipped']} damaged episodes are left out")
+        remarks.append(f"{facts['skipped']} damaged episodes are left out, and not replaced in subsets")
     if no_evaluation:
         remarks.append(f"it is not evaluated: {no_evaluation}")
     if remarks:

@@ -15,6 +15,7 @@ from experiments.running.workspace import Busy, Record, Workspace, load_record
 from experiments.setting import short
 from experiments.sweeps.registry import AXES, KEPT, plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
+from experiments.words import few
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError
 from hma_jax.runtime.outputs import make_directory
@@ -41,9 +42,9 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.analysis.growth import Growth, find_growth
     from experiments.optima import Optimum, find_optima
     from experiments.report.fits import FitRow, fit_rows
-    from experiments.report.numbers import compute_numbers
+    from experiments.report.numbers import compute_numbers, find_fewer, find_other_x
     from experiments.report.page import write_report
-    from experiments.report.robots import read_data
+    from experiments.report.robots import count_usable
     from experiments.report.sweeps import AxisStatistics
     from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
@@ -61,14 +62,22 @@ def _draw(workspace: Workspace, record: Record) -> None:
     checked = check_numbers(written, rows, numbers.results, numbers.windows, record.study.eval.perplexity_group)
     if checked.verdict == "bad":
         say(f"note: {checked.text}")
+    available = count_usable(workspace.data_summary)
+    if fewer := find_fewer(unique_trials(sweeps, provenance), numbers.results, available):
+        say(
+            f"note: trained on fewer trajectories than were asked for, since damaged ones are not replaced: {few(list(fewer))}"
+        )
+    if other := find_other_x(sweeps, provenance, numbers.results, available):
+        say(
+            f"note: x of the axis episodes is by the registry's entries, not by what was trained on: {few(list(other))}"
+        )
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
     others = write_tables(workspace, record, sweeps, states, provenance, numbers.results)
     tables = [workspace.results, workspace.robots, workspace.fits, *others]
     changes = find_changes(sweeps, provenance, numbers.windows)
     at_best = judge_at_best(sweeps, provenance, numbers.windows)
-    episodes = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
-    growth = find_growth(sweeps, provenance, numbers.windows, episodes)
+    growth = find_growth(sweeps, provenance, numbers.windows, numbers.results, available)
     optima = find_optima(rows, sweeps)
     for path, kind, table_rows in (
         (workspace.changes, Change, changes),

@@ -13,6 +13,7 @@ from experiments.analysis.scaling import CurveFit, curves_of, fit_budgets, fit_s
 from experiments.running.attempts import RESULT
 from experiments.running.provenance import Provenance
 from experiments.running.sealed import read_result
+from experiments.running.trial import Trial, trajectories_of, trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
@@ -56,6 +57,31 @@ def compute_numbers(
     predictions = load_predictions(workspace.predictions).values()
     outcomes = [compare(p, curves, windows, hashes) for p in predictions]
     return Numbers(results, windows, fit_study(sweeps, provenance, windows, draws), isoflop, outcomes)
+
+
+def find_fewer(
+    trials: Mapping[str, Trial], results: Mapping[str, Any], available: Mapping[str, int]
+) -> dict[str, None]:
+    """Subsets of which finished trials found only a part, since the others were skipped when tokenising, in words."""
+    found: dict[str, None] = {}
+    for id, trial in trials.items():
+        asked, used = trajectories_of(trial, available), trajectories_of(trial, available, results.get(id))
+        short = [name for name in asked if used.get(name, asked[name]) < asked[name]]
+        found |= {f"{used[name]} of {asked[name]} of {name} (seed {trial.train.seed})": None for name in short}
+    return found
+
+
+def find_other_x(
+    sweeps: Sequence[Sweep], provenance: Provenance, results: Mapping[str, Any], available: Mapping[str, int]
+) -> dict[str, None]:
+    """Points of the axis `episodes` whose finished trials were trained on another number of trajectories, in words."""
+    found: dict[str, None] = {}
+    for p in (p for sweep in sweeps if sweep.name == "episodes" for p in sweep.points):
+        result = results.get(trial_id(p.trial, provenance), {})
+        used = sum(trajectories_of(p.trial, available, result).values())
+        if "trajectories" in result and used != p.x:
+            found[f"{used} at x = {p.x:g} (seed {p.trial.train.seed})"] = None
+    return found
 
 
 def read_numbers(workspace: Workspace, draws: int = DRAWS) -> Numbers:

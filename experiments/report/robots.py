@@ -123,6 +123,11 @@ def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
         ) from error
 
 
+def count_usable(data_summary: Path) -> dict[str, int]:
+    """{robot: training trajectories that have windows}. Raises what `read_data` raises."""
+    return {name: facts["episodes"] - facts.get("too_short", 0) for name, facts in read_data(data_summary).items()}
+
+
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:
     """A line per robot, and the mean; data.json says how much there was of each."""
     data, rows = read_data(data_summary), _rows_of(rows, sweep)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.report.robots import read_data
+from experiments.report.robots import count_usable
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.trial import trial_id
@@ -34,7 +34,7 @@ def write_tables(
     from hma_jax.evaluation.windows import FILE
 
     names, rows = titles(sweeps, provenance), []
-    available = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
+    available = count_usable(workspace.data_summary)
     for id, trial in unique_trials(sweeps, provenance).items():
         state = states[id].event
         result = results[id] if state == FINISHED else None

@@ -233,7 +233,7 @@ def run_trial(
     """
     import jax
 
-    from data_pipelines.loading.selection import training_table
+    from data_pipelines.loading.selection import count_trajectories, training_table
     from experiments.running.sealed import write_result
     from hma_jax.model.flops import train_flops_per_step
     from hma_jax.model.hma import declare_model
@@ -270,6 +270,7 @@ def run_trial(
         "evaluation": evaluation.summary.to_dict(),
         "untrained": untrained,
         "training_loss": loss,
+        "trajectories": count_trajectories(prepared.store, loader_of(trial)),
         "parameters": declared.count(),
         "train_flops": train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         "run": {

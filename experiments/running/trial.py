@@ -63,8 +63,13 @@ def training_of(trial: Trial) -> dict[str, Any]:
     return fields
 
 
-def trajectories_of(trial: Trial, available: Mapping[str, int]) -> dict[str, int]:
-    """{robot: training trajectories that windows may be drawn of}, of the trial's robots that `available` counts."""
+def trajectories_of(
+    trial: Trial, available: Mapping[str, int], result: Mapping[str, Any] | None = None
+) -> dict[str, int]:
+    """{robot: training trajectories that windows are drawn of}, as the trial's `result` counts them. Where it does not,
+    what its cap leaves of those that are `available`: a few more where a subset contains damaged ones."""
+    if result and "trajectories" in result:
+        return dict(result["trajectories"])
     capped, most = trial.capped or trial.datasets, trial.max_trajectories
     return {
         name: available[name] if most is None or name not in capped else min(available[name], most)

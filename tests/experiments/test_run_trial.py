@@ -59,7 +59,8 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     train_passive = train_config(masking=MaskingConfig(setting="passive"))
     trial = trials.Trial(TABLE.names, None, TABLE.names, MODEL, train_passive, STUDY.eval, measure_untrained=True)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(trials, "open_prepared_data", lambda workspace: None)
+        monkeypatch.setattr(trials, "open_prepared_data", lambda workspace: SimpleNamespace(store=None))
+        monkeypatch.setattr("data_pipelines.loading.selection.count_trajectories", lambda *_: {"arm": 3})
         monkeypatch.setattr(trials, "train_trial", train)
         monkeypatch.setattr(trials, "evaluate_on", evaluate)
         monkeypatch.setattr(trials, "write_evaluation", lambda *_: None)
@@ -73,6 +74,7 @@ def test_nothing_but_the_evaluated_weights_is_left_of_a_training_state(evaluated
     assert evaluated.left == [0, 0]  # of the trained model, and of the untrained one
     result = evaluated.result
     assert result["training_loss"]["mean"] == 2 and result["run"]["train_seconds"] == 3
+    assert result["trajectories"] == {"arm": 3}
 
 
 def test_the_average_of_the_weights_is_evaluated_as_it_was_trained_and_an_untrained_model_beside_it(

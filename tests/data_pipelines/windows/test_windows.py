@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.loading.selection import LoaderConfig, count_trajectories
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.windows.slicer import WindowSlicer
@@ -106,6 +107,16 @@ def test_too_short_episodes_use_up_no_trajectories(runs):
     data._manifest = replace(data.manifest("toy"), runs=runs, settings=settings)
     windows = train_windows(data, "toy", 5, max_trajectories=10)
     assert windows.too_short == 160 and len(windows.episodes) == 10 and (windows.episodes % 5 == 1).all()
+
+
+def test_trajectories_of_a_subset_are_counted_without_the_damaged_ones():
+    data = OneDataset([20] * 20)  # of 200, of which 180 were skipped
+    settings = replace(data.manifest("toy").settings, val_fraction=0.0, min_val=0)
+    data._manifest = replace(data.manifest("toy"), runs=(EpisodeRun("toy.tfrecord", 0, 200),), settings=settings)
+    for cap in (None, 1, 40, 150):
+        used = train_windows(data, "toy", 4, cap).episodes
+        assert len(used) == 20 if cap is None else len(used) < min(cap + 1, 20)
+        assert count_trajectories(data, LoaderConfig(4, max_trajectories=cap, datasets=("toy",))) == {"toy": len(used)}
 
 
 def test_nothing_long_enough_says_what_is_needed():

@@ -86,4 +86,6 @@ def test_a_row_per_trial_has_every_setting_and_result(tmp_path):
     poor = trial_row("c", "c", "failed", replace(trial, capped=("rover",)), PROVENANCE, None, 0.0, {**there, "arm": 30})
     assert poor["trajectories"] == 30 + 8 + 8
     assert trial_row("d", "d", "failed", trial, PROVENANCE, None, 0.0, {})["trajectories"] is None
+    short = read_result(directory) | {"trajectories": {"arm": 2, "rover": 5, "pusher": 8}}  # the others were damaged
+    assert trial_row("e", "e", "finished", trial, PROVENANCE, short, 2.0, there)["trajectories"] == 2 + 5 + 8
     assert two["status"] == "failed" and two["cross_entropy"] is two["parameters"] is None
