@@ -74,7 +74,7 @@ def test_the_axis_horizon_is_as_findings_say():
     steps, seeds, _, psnr, ahead, follow, changed, *_ = of_steps
     table = rows_of()
     (copying,) = {f"{r.mean:.2f}" for r in table if (r.sweep, r.scope, r.metric) == ("horizon", OVERALL, "psnr_copy")}
-    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}; better on {ahead} of 40 robots |"
+    said = f"three seeds of {steps} steps: {psnr} dB, copying {copying}; better on {ahead} of 40 robots |"
     assert seeds == "3" and said in readme()
     assert follow == "36" and (
         f"raise the loss on all {follow} robots that have actions; random ones lower PSNR on {changed} |" in readme()
@@ -298,7 +298,7 @@ def test_what_was_found_is_as_readme_says():
     came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
     assert f"predicted at {predicted} before it ran, came to {came}" in text
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
-    assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
+    assert f"loss of five rises by {alone} nats if" in text and f"falls by {company} if these bring their own" in text
     poor = {p.label: p for p in curve(rows_of(root.name), "newcomers", "cross_entropy")}
     gained, error = difference(poor["alone"], poor["all robots"])
     assert f"{gained:.2f} if the five have 8 trajectories each" in text
