@@ -59,7 +59,7 @@ def estimate(trial: Trial) -> Cost:
 
 
 def count_parameters(trial: Trial) -> int:
-    """Of its model, with its own mixture."""
+    """Number of parameters of the trial's model, with one embodiment slice for each of the trial's robots."""
     return _count_parameters(trial.model, _table_of(trial))
 
 

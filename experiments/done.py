@@ -76,7 +76,7 @@ def find_prepared(setting: Setting) -> Done:
 
 
 def newest_step(run: Path) -> int:
-    """Of the checkpoints of a run; 0 without any."""
+    """Step of the run's newest checkpoint; 0 if it has none."""
     return max(list_steps(run / CHECKPOINTS), default=0)
 
 

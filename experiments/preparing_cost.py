@@ -73,7 +73,8 @@ def estimate_preparing(
 
 
 def count_frames(study: Study, name: str) -> Frames | None:
-    """Of all episodes of a dataset, held-out ones included; None where the registry does not say it."""
+    """Number of frames of all episodes of a dataset, held-out ones included; None where the registry does not say
+    it."""
     from data_pipelines.registry import get_spec
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count

@@ -204,7 +204,7 @@ def _number(text: str) -> float:
 
 
 def of_sweep(rows: Iterable[Row], sweep: str) -> list[Row]:
-    """Those of one axis; a study has many more."""
+    """The rows of one axis; a study has many axes."""
     return [r for r in rows if r.sweep == sweep]
 
 

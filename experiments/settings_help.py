@@ -34,7 +34,7 @@ def show_settings(found: list[SettingHelp], title: str) -> None:
 
 
 def describe_settings(config: Any, prefix: str = "") -> Iterator[SettingHelp]:
-    """Of a dataclass of values and further such dataclasses, in their order."""
+    """Help on every setting of a dataclass of values and further such dataclasses, in their order."""
     kinds, texts = typing.get_type_hints(type(config)), comments(type(config))
     for field in fields(config):
         path, value = prefix + field.name, getattr(config, field.name)

@@ -68,6 +68,24 @@ def test_no_variable_of_the_core_hides_an_import():
     assert not hidden, "\n".join(hidden)
 
 
+NO_SUBJECT = {"Of", "Those", "Whose"}
+"""Words that speak of something said before; a docstring has nothing before it where an editor shows it alone."""
+
+
+def test_docstrings_name_what_they_are_of():
+    found = []
+    for path in (p for f in ("hma_jax", "data_pipelines", "experiments") for p in sorted((ROOT / f).rglob("*.py"))):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if (
+                isinstance(node, ast.Expr)
+                and isinstance(node.value, ast.Constant)
+                and isinstance(node.value.value, str)
+            ):
+                if node.value.value.split(None, 1)[:1] and node.value.value.split(None, 1)[0] in NO_SUBJECT:
+                    found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert not found, f"begin these docstrings with what they are of: {', '.join(found)}"
+
+
 def texts(tree: ast.AST) -> list[tuple[int, str]]:
     """(line, text) of every text of a program but docstrings; what an f-string inserts is left out."""
     docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}

@@ -190,7 +190,7 @@ def _finish(
 
 
 def _remove_empty(directories: Sequence[Path]) -> None:
-    """Of those, each in the next, what holds nothing."""
+    """Removes those of `directories` that are empty; each lies in the next."""
     for directory in directories:
         with suppress(OSError):
             directory.rmdir()

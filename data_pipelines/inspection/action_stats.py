@@ -19,7 +19,7 @@ WRAPPING: dict[AngleUnit, str] = dict(zip(RECOGNISED, ("wrapping angle", "wrappi
 
 
 BINS = 24
-"""Of the histogram, from the smallest value to the largest."""
+"""Bins of the histogram, from the smallest value to the largest."""
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,8 @@ def coarse(frame: np.ndarray) -> np.ndarray:
 def take_fingerprint(
     split: str, index: int, steps: int, frames: dict[str, Sequence[np.ndarray]], actions: Sequence[np.ndarray]
 ) -> Fingerprint:
-    """Of an episode: `frames` by camera, whose first and last are compared, and fields of `actions` [N, A]."""
+    """The fingerprint of an episode: of the first and last of its `frames` by camera, and of fields of `actions` [N,
+    A]."""
     pictures = [coarse(own[at]) for _, own in sorted(frames.items()) for at in (0, -1)]
     times = np.linspace(0, steps - 1, TIMES).round().astype(int)
     rows = [np.asarray(field, np.float64)[times] for field in actions]

@@ -139,7 +139,7 @@ class _Stream:
         return f"{self.source.name}: {describe(self.source.runs, self.number(i))}"
 
     def number(self, i: int) -> int:
-        """Of the i-th episode drawn, among all that its files have."""
+        """Number, among all episodes in the files, of the i-th episode that was drawn."""
         return int(self.source.numbers[self.episodes[self._drawn(i)]])
 
     def _drawn(self, i: int) -> int:

@@ -35,7 +35,7 @@ EPISODES: dict[str, int] = {
 }  # fmt: skip
 
 STEPS: dict[str, int] = {"fractal20220817_data": 3_786_400, "language_table": 7_045_476}
-"""Of all episodes together."""
+"""Steps of all episodes together."""
 
 
 def mean_steps(name: str) -> float:

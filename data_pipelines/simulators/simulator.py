@@ -60,8 +60,8 @@ class PhysicsWorld:
         return PhysicsState(self.simulator.physics(), len(self._actions))
 
     def set_state(self, state: PhysicsState) -> None:
-        """Of this episode, an earlier one. The episode is begun again and its actions are repeated: the controllers of
-        some robots remember more than is in the physics."""
+        """Returns to an earlier state of this episode. The episode is begun again and its actions are repeated: the
+        controllers of some robots remember more than the physics holds."""
         earlier = self._actions[: state.actions]
         self.reset(self._seed)
         for action in earlier:

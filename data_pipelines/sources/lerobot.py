@@ -200,7 +200,7 @@ class LeRobotSource:
         return rows.reshape(len(rows), -1)
 
     def success(self, table: Any, where: str) -> bool | None:
-        """Of the episode's last row; None where it does not say."""
+        """Success by the episode's last row; None where it does not say."""
         if SUCCESS not in table.column_names:
             return None
         last = self.numbers(table, SUCCESS, where)[-1]

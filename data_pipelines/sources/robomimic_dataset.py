@@ -169,7 +169,7 @@ class _Frames(Sequence[SourceFrame]):
         self._rows = max(array.chunks[0] if array.chunks else 1, BLOCK)
         self._at, self._block = -1, np.zeros((0, 0, 0, 3), np.uint8)
         self.nbytes = 0
-        """Of the frames that were read."""
+        """Bytes read so far."""
 
     def __len__(self) -> int:
         return self._length
@@ -189,7 +189,7 @@ class _LazyFrames(Sequence[SourceFrame]):
     def __init__(self, source: RobomimicDataset, i: int, key: str, length: int):
         self._source, self._i, self._key, self._length = source, i, key, length
         self.nbytes = 0
-        """Of the frames that were read for those that were asked for."""
+        """Bytes read for the frames that were asked for."""
 
     def __len__(self) -> int:
         return self._length

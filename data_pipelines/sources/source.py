@@ -92,7 +92,7 @@ class OpenEpisode:
         return self.decode(n, self.fetch(n))
 
     def images(self, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
-        """Those that `choose`, which maps N to frame numbers, names."""
+        """The images of the frames that `choose` names; it maps N to frame numbers."""
         chosen = choose(self.steps)
         seen = {t: self.image(t) for t in sorted(set(chosen))}
         return [seen[t] for t in chosen]

@@ -30,7 +30,7 @@ DARK = 60.0
 """Grey levels that a shadow takes away."""
 
 CAP = 0.7
-"""Of an object's contrast to mid-grey in the flat cap on its middle."""
+"""Share of an object's contrast to mid-grey in the flat cap on its middle."""
 
 SHADOW = 0.06
 """How far shadows fall from what throws them, world units."""

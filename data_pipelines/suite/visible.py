@@ -14,7 +14,7 @@ from data_pipelines.suite.render import View
 from data_pipelines.suite.spec import EmbodimentSpec
 
 RINGS = ((0.0, 1), (0.45, 6), (0.8, 12))
-"""Of each object: (share of its radius, points)."""
+"""Sample points of each object: (share of its radius, number of points)."""
 
 
 def object_colours(spec: EmbodimentSpec, seeds: Sequence[int]) -> np.ndarray:

@@ -28,12 +28,12 @@ class Moments:
 
     @classmethod
     def none(cls, dim: int) -> Moments:
-        """Of no rows."""
+        """The moments of no rows."""
         return cls(0, (0.0,) * dim, (0.0,) * dim, (0.0,) * dim, (0.0,) * dim)
 
     @classmethod
     def of(cls, rows: np.ndarray) -> Moments:
-        """Of `rows` [N, A], at least one."""
+        """The moments of `rows` [N, A], at least one."""
         rows = rows.astype(np.float64)
         mean = rows.mean(axis=0)
         square = ((rows - mean) ** 2).sum(axis=0)
@@ -41,7 +41,7 @@ class Moments:
         return cls(len(rows), *(tuple(part.tolist()) for part in parts))
 
     def merge(self, other: Moments) -> Moments:
-        """Of the rows of both."""
+        """The moments of both sets of rows together."""
         if not (self.count and other.count):
             return self if self.count else other
         total = self.count + other.count
@@ -62,7 +62,7 @@ class Moments:
 
 
 def merge_all(pieces: Iterable[Moments], dim: int) -> Moments:
-    """Of the rows of all, merged one after the other."""
+    """The moments of all rows together, merged piece by piece."""
     merged = Moments.none(dim)
     for piece in pieces:
         merged = merged.merge(piece)

@@ -138,7 +138,8 @@ def sampled_episodes(episodes: np.ndarray, steps: np.ndarray, limit: int = ROWS)
 
 
 def merge_samples(samples: Iterable[RowSample]) -> RowSample:
-    """Of the rows of all, which are of different episodes; the same in whatever order and groups."""
+    """A sample of all rows together; they are of different episodes. The result does not depend on order or
+    grouping."""
     sampler = RowSampler()
     for sample in samples:
         sampler.add_sample(sample)

@@ -21,7 +21,7 @@ REMEMBERED = 4096
 
 
 class TurnWatch:
-    """Of one dataset. `warn` is called once at most with the same value of the action."""
+    """Watches the angles of one dataset. `warn` is called at most once for each value of the action."""
 
     def __init__(self, spec: DatasetSpec, warn: Callable[[str], None]):
         self._spec, self._warn = spec, warn

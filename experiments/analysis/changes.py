@@ -46,7 +46,8 @@ class Change:
 
 
 def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[Change]:
-    """Of every curve over a number, between its outermost points that are finished. Raises NotComparable."""
+    """The change of every metric along each axis of numbers, from its smallest to its largest finished x. Raises
+    NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.fittable):
         for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
@@ -59,7 +60,8 @@ def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mappi
 def find_differences(
     sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[Change]:
-    """Of every variant of an axis of names, `last`, from its default, `first`. Raises NotComparable."""
+    """The change of every metric from an axis's default variant (`first`) to each other variant (`last`). Raises
+    NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.labels):
         trials = _finished(sweep, "", provenance, windows)
@@ -84,7 +86,7 @@ def _finished(sweep: Sweep, series: str, provenance: Provenance, windows: Mappin
 
 
 def _ends(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends | None:
-    """Of the first and the last x; None without two that have a seed in common."""
+    """The trials at the first and at the last x; None unless these share a seed."""
     trials = _finished(sweep, series, provenance, windows)
     if len(trials) < 2:
         return None

@@ -84,8 +84,9 @@ def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
 
 
 def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:
-    """Of one metric over the mean of `robots`; None where no window has it. Raises NotComparable, and NoNumbers where
-    a window has it in one model alone, or a metric that no sound model lacks in none."""
+    """The difference of one metric, averaged over `robots`; None where no window of either model has it. Raises
+    NotComparable, and NoNumbers where the windows of one model alone have it, or where none has a metric that every
+    sound model has."""
     pairs = _pairs(a, b)
     if not all(metric in table.metrics for pair in pairs for table in pair):
         return None
@@ -93,7 +94,8 @@ def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> 
 
 
 def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
-    """Of all seeds that both have; of two models of one seed each, whichever these are, unless both are of studies."""
+    """The pairs of tables that are compared: one for each seed that both sides have. Two models of one seed each are
+    paired whatever their seeds are, unless both are of studies."""
     if len(a.seeds) == len(b.seeds) == 1 and not (a.of_study and b.of_study):
         return [(*a.seeds.values(), *b.seeds.values())]
     shared = [seed for seed in a.seeds if seed in b.seeds]
@@ -157,7 +159,7 @@ def _difference(scope: str, metric: str, a: Panel, b: Panel) -> Difference:
 
 
 def _interval(panel: Panel) -> Interval:
-    """Of one point: in closed form where there is one seed."""
+    """The interval of one point's mean; in closed form where there is one seed."""
     if len(panel.seeds[0]) > 1:
         return bootstrap_intervals(panel)[0]
     values = panel.points[0][0]

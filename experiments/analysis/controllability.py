@@ -56,8 +56,8 @@ class Controllability:
 def controllability(
     seeds: dict[int, WindowTable], role: str = POINT, rate: float | None = FRAME_RATE
 ) -> list[Controllability]:
-    """Of one model of that `role` and frame rate under several seeds, {seed: table}: every robot that has the metric,
-    in the order of the tables.
+    """Measures of controllability of one model, given its tables by seed, for that `role` and frame rate: one entry for
+    each robot that has the metric, in the order of the tables.
 
     Raises NotComparable unless all seeds saw the same windows.
     """

@@ -53,9 +53,9 @@ def find_growth(
     results: Mapping[str, Mapping[str, Any]],
     episodes: Mapping[str, int],
 ) -> list[Growth]:
-    """Of axes along which the cap of trajectories changes, between neighbouring points that have seeds in common.
-    The `results` of trials count their trajectories; `episodes` are the training ones that each robot has, for those
-    that do not. Raises NotComparable."""
+    """The growth of data between neighbouring points that share seeds, along axes that change the cap of
+    trajectories. A trial's trajectories are those that its entry of `results` counts, else its robots' training
+    `episodes` up to the cap. Raises NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.fittable):
         for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):

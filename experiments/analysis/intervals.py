@@ -21,7 +21,7 @@ OVERALL = "overall"
 """The scope that averages over all robots that are judged, each counting equally."""
 
 LEVEL = 0.95
-"""Of intervals of means and differences; those of fits have `fits.FIT_LEVEL`."""
+"""Confidence level of intervals of means and differences; fits have `fits.FIT_LEVEL`."""
 
 HELD_OUT_LOSS = "cross_entropy"
 """Nats per held-out token, which models of latents have not: what is fitted. Its exponential, the perplexity, is no sum
@@ -51,8 +51,8 @@ class Interval:
         return standard_errors(self.mean, self.sem)
 
     def exp(self) -> Interval:
-        """Of exp(x), the interval transformed: perplexity beside nats, a ratio of perplexities beside a difference of
-        nats. The standard error is by the delta method, sem exp(mean)."""
+        """The interval of exp(x), by transforming the ends: perplexity beside nats, a ratio of perplexities beside a
+        difference of nats. The standard error is by the delta method, sem exp(mean)."""
         mean = _exp(self.mean)
         return Interval(mean, self.sem * mean, _exp(self.low), _exp(self.high), self.n, self.episodes)
 
@@ -65,12 +65,13 @@ def standard_errors(mean: float, sem: float) -> float:
 
 
 def interval_of(stat: Stat) -> Interval:
-    """Of the mean over windows of one robot, t with as many degrees of freedom as episodes less one."""
+    """Student's t interval of the mean over one robot's windows, with one degree of freedom less than it has
+    episodes."""
     return _around(stat, stat.clusters - 1)
 
 
 def overall(stats: Iterable[Stat]) -> Interval:
-    """Of the mean over robots, each counting equally (`stratified`).
+    """The interval of the mean over robots, each counting equally (`stratified`).
 
     The robots are fixed: the interval is about other episodes of these robots, not about other robots. Degrees of
     freedom: `satterthwaite`'s, G - 1 for each robot's variance, over those with an error of their own.

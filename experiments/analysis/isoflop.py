@@ -107,8 +107,9 @@ class IsoFlop:
 
 
 def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws: int = DRAWS) -> IsoFlop:
-    """Of losses over (size N, training FLOPs C). Without `budgets`, BUDGETS of them, evenly spread in log C over
-    where at least MIN_SIZES sizes were measured."""
+    """Fits the best size for each budget, and its power law, to losses over (size N, training FLOPs C). Without
+    `budgets`, BUDGETS of them are evenly spread in log C over the range in which at least MIN_SIZES sizes were
+    measured."""
     sizes = np.unique(measured.x[:, 0])
     if len(sizes) < MIN_SIZES:
         return IsoFlop(refused=f"{len(sizes)} sizes; a minimum over sizes needs at least {MIN_SIZES}")
@@ -231,8 +232,9 @@ def _lowest_of_three(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
 
 
 def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:
-    """Of `residuals` [m, 1 + R] of log losses, those of the values before those of the draws, which scatter around them
-    as means over `seeds` [m] do: an F test of lack of fit, as `fits` makes it of a power law."""
+    """Says that sizes lie off the parabola; empty where they do not. `residuals` [m, 1 + R] of log losses: column 0
+    is of the measured values, the others are of the draws, which scatter around it as means over `seeds` [m] do. An
+    F test of lack of fit, as `fits` makes it of a power law."""
     scatter = float(((residuals[:, 1:] - residuals[:, :1]) ** 2).sum(0).mean())
     if min(seeds) < 2 or scatter == 0:
         return ""

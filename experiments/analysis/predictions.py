@@ -29,7 +29,7 @@ from hma_jax.runtime.files import write_file
 
 @dataclass(frozen=True)
 class Prediction:
-    """Of the mean loss, in nats per token, of `trials` at `x`."""
+    """A prediction of the mean loss, in nats per token, of `trials` at `x`."""
 
     curve: str
     axes: tuple[str, ...]
@@ -73,10 +73,10 @@ def predict(
     windows: Mapping[str, WindowTable],
     hashes: Mapping[str, str],
 ) -> Prediction:
-    """Of the trials at one position, from the other finished ones of the curve.
+    """Predicts the loss of the `held_out` trials at one position from the other finished trials of the curve.
 
-    `windows` are those of all finished trials of the study, `hashes` of their results. Raises ConfigError if one of
-    the trials is finished already, or the others identify no power law.
+    `windows` are those of all finished trials of the study, `hashes` of their results. Raises ConfigError if one of the
+    held-out trials is finished already, or if the others identify no power law.
     """
     ids = tuple(p.trial for p in held_out)
     finished = [id for id in ids if id in windows]

@@ -89,8 +89,8 @@ def read_side(path: Path) -> Side:
 
 
 def _said_of(run: Path) -> tuple[str, int | None]:
-    """Of a model that was evaluated: the identity of the tokenizer whose tokens were judged, and the seed of its
-    training, by the stamp of `hma evaluate`, else by the run's latest checkpoint; "" and None where neither says it."""
+    """The identity of the tokenizer on whose tokens a model was evaluated, and the seed of its training, by the
+    stamp of `hma evaluate`, else by the run's latest checkpoint; "" and None where neither says it."""
     from hma_jax.training.reading import list_steps, read_description
 
     if (stamp := read_stamp(run, STAMP)) is not None:

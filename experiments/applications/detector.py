@@ -222,14 +222,14 @@ def reconstructed(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> S
 
 
 def suite_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
-    """Those of the suite, whose true positions are known. Raises ConfigError if there are none."""
+    """The robots of the suite, whose true positions are known. Raises ConfigError if there are none."""
     known = {name: robot for name, robot in robots.items() if name in SPECS}
     require(bool(known), "the model has no robot of the suite, and only for these the positions of tools are known")
     return known
 
 
 def select_robots(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
-    """Those of `names`, or all. Raises ConfigError for one that is not there."""
+    """The robots named in `names`, or all if it is empty. Raises ConfigError for a name that is not there."""
     unknown = sorted(set(names) - set(robots))
     require(not unknown, f"--robots: {', '.join(unknown)} cannot be used; choose from {', '.join(robots)}")
     return {name: robot for name, robot in robots.items() if not names or name in names}

@@ -110,8 +110,9 @@ def points_loss(
     there: jax.Array,
     known: jax.Array,
 ) -> jax.Array:
-    """Of frames [n, H, W, 3] with points [n, P, 2], there or not [n, P], of which `known` [n, P] are the robot's: the
-    cross-entropy of all cells, above its least value."""
+    """The mean cross-entropy of heat maps, above its least value, for frames [n, H, W, 3]. `position` [n, P, 2] are
+    true points and `there` [n, P] says which are in the picture; only points that the robot has, `known` [n, P],
+    count."""
     heat = heat_logits(weights, images, robot_n)
     wanted = target_heat(position, there, heat.shape[1])
     cost = jax.nn.softplus(heat) - wanted * heat

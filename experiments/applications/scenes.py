@@ -47,7 +47,7 @@ def point_names(spec: EmbodimentSpec) -> tuple[str, ...]:
 
 
 def points_of(spec: EmbodimentSpec, seed_F: np.ndarray, q: np.ndarray, objects: np.ndarray) -> Points:
-    """Of configurations q [F, C] with objects [F, K, 2] in the episodes with the seeds [F]."""
+    """The points of F frames, given configurations q [F, C], objects [F, K, 2] and the seeds [F] of their episodes."""
     tools, frames = len(spec.body.tools), np.arange(len(q))
     true = positions_of(spec, q, objects)
     position = np.zeros((len(q), len(point_names(spec)), 2), np.float32)

@@ -84,7 +84,7 @@ def short_hash(content: bytes) -> str:
 
 
 def hash_of(params: Params) -> str:
-    """Of every parameter's path, shape and bytes."""
+    """Hash of every parameter's path, shape and bytes."""
     found = hashlib.sha256()
     for path, x in sorted((jax.tree_util.keystr(path), x) for path, x in jax.tree_util.tree_leaves_with_path(params)):
         array = np.asarray(x)

@@ -99,7 +99,8 @@ def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 
 
 
 def true_worlds(robots: Sequence[Robot], **options: Any) -> TrueSimulator:
-    """Of robots that are all of the suite, or all of physics simulators. Raises ConfigError for others."""
+    """The true simulator of `robots`, which are all of the suite or all of physics simulators. Raises ConfigError
+    for others."""
     physics = bool(robots) and all(robot.name in PHYSICS for robot in robots)
     mixed = not physics and any(robot.name in PHYSICS for robot in robots)
     require(

@@ -49,8 +49,8 @@ class Sent:
 
 
 def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sent]:
-    """Those of a program compiled for a mesh of those sizes, most bytes first. One that does not tell its groups is
-    taken to be among all devices."""
+    """The collectives of a program compiled for a mesh of these sizes, those with most bytes first. A collective
+    that does not list its groups is taken to be among all devices."""
     devices = math.prod(mesh.values())
     counts: Counter[Collective] = Counter()
     received: Counter[Collective] = Counter()
@@ -135,8 +135,8 @@ def _first_group(line: str, devices: int) -> list[int] | None:
 
 
 def count_bytes(result: str, started: bool = False) -> int:
-    """Of the arrays in the type of an instruction's result, such as 'f32[8]{0}' or '(f32[8], u32[])'; of one that is
-    only `started`, of the second part of that type: (operands, results, ...)."""
+    """Bytes of the arrays in an instruction's result type, such as 'f32[8]{0}' or '(f32[8], u32[])'. The type of an
+    instruction that is only `started` is (operands, results, ...): its second part counts."""
     arrays = re.sub(r"\{[^}]*\}|/\*.*?\*/", "", result)
     second = SECOND.match(arrays) if started else None
     found = ARRAY.finditer(second[1] if second else arrays)

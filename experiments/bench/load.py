@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
 DATASETS, EPISODES, STEPS = 40, 20, 200
-"""Of the store that is made when none is given: forty robots, 2 to 28 action values, 10 Hz."""
+"""Size of the store that is made when none is given: forty robots, 2 to 28 action values, 10 Hz."""
 
 FACTS = TokenizerFacts("drawn", 256, 16, 256, 2**18, 2, 512)
 
@@ -133,7 +133,7 @@ def plot_memory(timings: Sequence[LoadTiming], path: Path) -> None:
 
 
 def resident_bytes() -> int:
-    """Of this process, now."""
+    """Resident memory of this process now, in bytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     import resource
 

@@ -60,7 +60,7 @@ class Plan:
 
     @property
     def stored(self) -> int:
-        """Of the parameters, in float32."""
+        """Bytes of the parameters, in float32."""
         return 4 * sum(d.device_size for d in self.decisions)
 
 

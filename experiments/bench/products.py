@@ -14,7 +14,7 @@ from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.diagnostics.products import Product, count_products, total_flops
 
 LEAST_SECONDS = 0.02
-"""Of one timed call: a product is repeated in a loop until it takes so long."""
+"""Least duration of one timed call: a product is repeated in a loop until a call takes so long."""
 
 ASSUMED_RATE = 1e11
 """FLOP/s by which the repetitions are chosen."""

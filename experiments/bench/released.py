@@ -46,7 +46,7 @@ def stand_in(**names) -> None:
 
 
 def attend(q, k, v, attn_bias=None, scale=None):
-    """Of [B, N, H, D], causal with an `attn_bias`, which is the only one that the release gives."""
+    """Attention for q, k, v [B, N, H, D]; causal if `attn_bias` is given, since the release gives no other bias."""
     from torch.nn.functional import scaled_dot_product_attention
 
     turned = (x.transpose(1, 2) for x in (q, k, v))

@@ -24,7 +24,7 @@ class Timing:
     repeats: int
 
     def scaled(self, factor: float) -> Timing:
-        """Of `factor` as many calls."""
+        """The timing of `factor` times as many calls."""
         return Timing(self.median * factor, self.p90 * factor, self.best * factor, self.repeats)
 
 
@@ -79,7 +79,7 @@ def matmul_rate(dtype: str, size: int = 2048) -> float:
 
 
 def peak_memory_bytes() -> int:
-    """Of the device where it says so, otherwise the largest resident size of this process."""
+    """Peak memory of the device where it reports one, otherwise the largest resident size of this process."""
     stats = jax.devices()[0].memory_stats() or {}
     if "peak_bytes_in_use" in stats:
         return int(stats["peak_bytes_in_use"])

@@ -197,9 +197,9 @@ def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore)
 
 
 def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStore) -> list[str]:
-    """Those of `names` that a model, or the one it goes on from, was trained on and not, as far as can be told, with
-    the tokens of `store`: another choice of held-out episodes is another store. A run holds one hash of all its
-    datasets, so that one of them that is another, or not here, makes all of them doubtful."""
+    """The robots of `names` that the model, or the model that it was initialised from, was trained on with other
+    tokens than those of `store`, as far as can be told. Another choice of held-out episodes makes another store. A
+    run keeps one hash of all its datasets: if one of these differs or is missing here, all are listed."""
     found: list[str] = []
     provenance = trained.provenance
     while "loader" in provenance:

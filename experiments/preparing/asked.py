@@ -114,7 +114,7 @@ def _wait_for_asked(workspace: Workspace, busy: Busy, began: float, *, opened: b
 
 
 def _read(workspace: Workspace) -> Asked | None:
-    """Of the process that holds the directory; None if it has written nothing."""
+    """What the process that holds the directory was asked for; None if it has written nothing."""
     holder = workspace.holder
     try:
         written = json.loads((workspace.root / FILE).read_text())

@@ -106,9 +106,9 @@ def _given(tokenizer: Tokenizer) -> str:
 
 
 def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[Source]) -> None:
-    """Of a tokenizer that was trained on datasets of the study: with fewer episodes held out (those are among these) or
-    others, or on datasets as they were before they grew (the hold-out is drawn among all episodes of a dataset), or on
-    robots that no model of the study is trained on."""
+    """Warns where a given tokenizer was trained on frames that the study holds out: it was trained on datasets of
+    the study with fewer episodes held out (those are among these) or with others, on datasets before they grew (the
+    hold-out is drawn among all episodes of a dataset), or on robots that no model of the study is trained on."""
     trained_with, study_settings = training.inputs.get("store", {}), to_dict(study.store)
     data = {name: facts for name, facts in training.inputs.get("data", {}).items() if name in study.all_names()}
     more = [

@@ -91,7 +91,8 @@ def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[
 
 
 def _with_corrections(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a dataset, `image_corrections` by their own name, which `image_key` has in the same text (`camera_key`)."""
+    """A dataset's facts with `image_corrections` under their own name; `image_key` holds them in the same text
+    (`camera_key`)."""
     from data_pipelines.registry.spec import split_camera_key
 
     if not isinstance(facts.get("image_key"), str):

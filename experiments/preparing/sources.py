@@ -101,8 +101,8 @@ def check_sources(study: Study, sources: Sequence[Source]) -> dict[str, EpisodeS
 
 
 def check_entries(study: Study, data: Sequence[str]) -> None:
-    """Of `check_sources` on the user's directories what takes no time, for a dry run: whether their entries fit the
-    fields that their files declare; says which rates are not reached. The records of RLDS are not looked for."""
+    """The part of `check_sources` that takes no time, for a dry run: whether the entries of the user's directories
+    fit the fields that their files declare. Says which rates are not reached. RLDS records are not looked for."""
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.open import find_format
     from data_pipelines.sources.rlds.schema import FEATURES, check_fields, read_metadata, resolve_version

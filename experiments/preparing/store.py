@@ -81,7 +81,7 @@ def data_differences(study: Study, workspace: Workspace, data: Sequence[str], to
 
 
 def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
-    """Of datasets whose files say another native rate than their entry, which counts."""
+    """Notes datasets whose files state another native rate than their entry; the entry counts."""
     from data_pipelines.sources.open import read_rate
     from data_pipelines.sources.source import same_rate
 

@@ -15,7 +15,7 @@ from hma_jax.config import require
 from hma_jax.runtime.cores import usable_cores
 
 MOST_LINES = 8
-"""Of what differs, in a message."""
+"""Most lines of differences in a message."""
 
 
 def require_simulated(names: Sequence[str], advice: str = "Give RLDS directories with --data") -> None:

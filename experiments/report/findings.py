@@ -34,8 +34,8 @@ class Findings:
 
 
 def read_findings(path: Path, axes: Sequence[str]) -> Findings:
-    """Of a study with these axes, in their order on the page; empty without a file. Raises ConfigError for one that is
-    no UTF-8."""
+    """The findings of a study with these axes, in their order on the page; empty without a file. Raises ConfigError
+    for a file that is not UTF-8."""
     if not path.exists():
         return Findings({})
     of_axes: dict[str, str] = {}

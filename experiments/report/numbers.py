@@ -85,7 +85,7 @@ def find_other_x(
 
 
 def read_numbers(workspace: Workspace, draws: int = DRAWS) -> Numbers:
-    """Of the study that lives there. Raises ConfigError without any."""
+    """The numbers of the study in `workspace`. Raises ConfigError if there is no study."""
     record = load_record(workspace)
     require(record.provenance is not None, f"the study in {workspace.root} has not run yet; run `{record.command}`")
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)

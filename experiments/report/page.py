@@ -179,7 +179,7 @@ def _headline(
 
 
 def _name(workspace: Workspace, study: Study) -> str:
-    """Of the preset, and of the directory where that tells more: studies of one preset would bear one name."""
+    """The study's name: its preset's, with the directory's where studies of one preset would otherwise share a name."""
     directory = workspace.root.absolute().name
     return study.name if directory == study.name else f"{study.name} ({directory})"
 
@@ -261,7 +261,7 @@ def _fits(workspace: Workspace, numbers: Numbers) -> str:
 
 
 def _clips(path: Path, record: Record, robots: Sequence[Robot], aside: str) -> str:
-    """Of one trial, the most controllable robots first; without samples there are none."""
+    """The clips of one trial, the most controllable robots first; empty without samples."""
     if not path.exists():
         return ""
     order = [robot.name for robot in robots]

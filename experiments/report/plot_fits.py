@@ -42,8 +42,8 @@ POINTS = dict(marker="o", linestyle="none", markersize=4, alpha=0.6, markeredgew
 
 
 def plot_fits(fits: Sequence[CurveFit], outcomes: Sequence[Outcome], path: Path) -> None:
-    """Of each curve with a fit the loss, and below it residuals; ABREAST beside each other. Without any, there is no
-    file."""
+    """Plots the loss of each curve with a fit, and its residuals below, ABREAST curves beside each other. Writes no
+    file if no curve has a fit."""
     path.unlink(missing_ok=True)
     fits = [f for f in fits if f.measured is not None and len(f.curve.axes) == 1 and not f.fit.refused]
     if not fits:

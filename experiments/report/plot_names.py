@@ -38,7 +38,7 @@ DOTS: dict[bool, dict[str, Any]] = {
     True: dict(alpha=0.45, markersize=4, markeredgewidth=0),
     False: dict(markersize=4.5, markerfacecolor="white", zorder=4),
 }
-"""Of seeds, by whether there are several: a single one lies on the mean."""
+"""Style of the dots of seeds, by whether there are several: a single one lies on the mean."""
 
 
 def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:

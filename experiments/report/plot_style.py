@@ -28,7 +28,7 @@ INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
 COLOURS = {"perplexity": "#2b5c8a", "delta_psnr": "#b3541e"}
 COLOURS |= dict.fromkeys(("diffusion_loss", "action_error"), COLOURS["perplexity"])  # in its place, never beside it
 DEFAULT = "#6b3fa0"
-"""Of the variant that the presets use, as in the paper's figure 5."""
+"""Colour of the variant that the presets use, as in the paper's figure 5."""
 LABELS = {
     "perplexity": "perplexity: exp of the mean nats",
     "diffusion_loss": "diffusion loss",
@@ -38,7 +38,7 @@ LABELS = {
 """The metrics that are drawn, where there are any."""
 USUAL = ["perplexity", "delta_psnr"]
 ON_LOG = ("perplexity", "diffusion_loss")
-"""Those whose axis is logarithmic."""
+"""Metrics that have a logarithmic axis."""
 EXP_OF = {"perplexity": HELD_OUT_LOSS}
 """{what is drawn: the metric of which it is exp of the mean}. The release's perplexity, which tables have, is a mean of
 exponentials: of a few hard robots, so that it may rank models otherwise than nats do."""
@@ -46,7 +46,7 @@ OVER = {False: "seeds and episodes", True: "seeds, each with its own robots"}
 """What errors of several seeds are over, by whether judged robots are drawn anew for every seed."""
 ONE_SEED = "one seed: s.e. over episodes"
 CAPTION_LETTERS = 15.5
-"""Of a caption, on an inch."""
+"""Letters of a caption that fit into an inch."""
 MARKERS = "o^DvPXs"
 SHADES = 0.55
 """Where the colours of curves end on viridis: beyond it they are too light for white paper."""
@@ -73,8 +73,8 @@ STYLE = {
 
 
 def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
-    """Those of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity), as
-    `choose_metrics` says."""
+    """The metrics of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity),
+    as chosen by `choose_metrics`."""
     measured = {r.metric for r in rows if r.sweep in sweeps}
     return choose_metrics([m for m in LABELS if EXP_OF.get(m, m) in measured], USUAL)
 
@@ -93,7 +93,7 @@ def drawn_curve(
 
 
 def _exp(p: CurvePoint) -> CurvePoint:
-    """Of the mean and of every seed's; errors by the delta method."""
+    """The point with exp of its mean and of every seed's mean; errors by the delta method."""
     mean = math.exp(p.mean)
     seeds = {seed: math.exp(value) for seed, value in p.seeds.items()}
     return replace(p, mean=mean, sem=mean * p.sem, seed_sem=mean * p.seed_sem, seeds=seeds)

@@ -47,8 +47,8 @@ class Robot:
 def robots_of(
     rows: Sequence[Row], sweep: Sweep, provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[Robot]:
-    """Of the scope of a sweep, by the trials at its default, the most controllable first. Where each seed judges robots
-    of its own, of those seeds that judge all of the scope."""
+    """The robots in the scope of a sweep, measured in the trials at its default, the most controllable first. Where
+    each seed judges robots of its own, only seeds that judge all of the scope are used."""
     judging = _judging(sweep)
     ids = {seed: trial_id(trial, provenance) for seed, trial in judging.items()}
     tables = {seed: windows[id] for seed, id in ids.items() if id in windows}
@@ -77,13 +77,13 @@ def _judging(sweep: Sweep) -> dict[int, Trial]:
 
 
 def _rows_of(rows: Sequence[Row], sweep: Sweep) -> list[Row]:
-    """Of one sweep, and of the seeds whose robots are shown: what they judge is one set of windows."""
+    """Rows of one sweep, of the seeds whose robots are shown: these judge one set of windows."""
     seeds = _judging(sweep)
     return [r for r in of_sweep(rows, sweep.name) if r.seed in seeds]
 
 
 def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
-    """Of trials that kept no numbers of their windows."""
+    """The standard error for trials that kept no numbers of their windows."""
     points = (_at_reference(rows, sweep, metric, name) for metric in ORDER)
     return next((p.mean / p.sem for p in points if p and p.sem > 0), math.nan)
 

@@ -264,9 +264,12 @@ def _held_out(optima: Sequence[Optimum]) -> bool:
 
 
 def _optima(optima: Sequence[Optimum], rows: Sequence[Row]) -> list[Check]:
-    """Of muP's curves, on held-out data where there is a likelihood. Where the standard parametrisation is best is a
-    finding, not a condition. What the seeds do not tell from an end of the grid is open: more of them may. It is inside
-    where on either side a rate is told to be worse."""
+    """Checks of the optimal learning rate of muP's curves, on held-out data where there is a likelihood.
+
+    Where the standard parametrisation is best is a finding, not a condition. An optimum is inside the grid where on
+    either side a rate is significantly worse. It is open where the seeds do not tell it from an end of the grid: more
+    seeds may.
+    """
     mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT_LOSS if _held_out(optima) else TRAINING_LOSS)]
     if not mup:
         return []

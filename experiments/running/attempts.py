@@ -81,8 +81,8 @@ def is_alive(directory: Path) -> bool:
 
 
 def read_start(directory: Path) -> dict[str, Any] | None:
-    """Of the latest attempt: host, process, an engine's job and a token of its own; None before its process is up, or
-    if the file cannot be read now."""
+    """Host, process, an engine's job and a token of the latest attempt; None before its process is up, or if the
+    file cannot be read now."""
     return _read_now(directory / STARTED)
 
 

@@ -128,8 +128,8 @@ def _statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _hash(tree: ast.AST) -> str:
-    """Of what a file means: equal for files that differ in comments, docstrings or layout alone, and the same under
-    every version of Python that reads the file to the same syntax tree."""
+    """Hash of what a file means: equal for files that differ in comments, docstrings or layout alone, and the same
+    under every version of Python that reads the file to the same syntax tree."""
     pieces: list[str] = []
     _write(tree, pieces)
     return hashlib.sha256("".join(pieces).encode()).hexdigest()[:16]

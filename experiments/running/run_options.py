@@ -62,4 +62,4 @@ class RunOptions:
 
 
 UNWATCHED = RunOptions(validate_every=0)
-"""Of a study's trials: they are evaluated at their end."""
+"""Options of a study's trials, which are evaluated only at their end."""

@@ -166,7 +166,7 @@ class _Run:
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
     def _runnable(self) -> list[tuple[Job, str]]:
-        """Those of `waiting` that wait for no other trial."""
+        """The jobs of `waiting` that wait for no other trial."""
         pending = (
             {job.id for job, _ in self.waiting} | {a.job.id for a in self.running} | {j.id for j in self.elsewhere}
         )

@@ -36,7 +36,7 @@ STEPS = 40
 """Steps at 2 Hz taken of an episode, at most."""
 
 RIDGE = 3e-3
-"""Of the mean squared feature, for each sample."""
+"""Ridge penalty for each sample, as a share of the mean squared feature."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file
 
 DESIGNS = ("dilution", "transfer", "newcomers", "fewshot", "episodes", "compute", "horizon", "lr_horizon")
-"""Those of a study that is to be believed (`DesignConfig`)."""
+"""The axes of a study that is meant as evidence (`DesignConfig`)."""
 
 AXES = (*SCALING, "settings", "conditioning", "ladder", "lr", *DESIGNS)
 """Each is `experiments.sweeps.<name>`."""

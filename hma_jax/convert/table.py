@@ -153,7 +153,7 @@ class Part:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the official tensor."""
+        """Shape of the official tensor."""
         groups = re.findall(r"\(([^)]*)\)|(\S+)", self.pattern.split(" -> ")[1])
         names = [(group or single).split() for group, single in groups]
         return tuple(math.prod(self.sizes.get(name, 1) for name in axis) for axis in names)

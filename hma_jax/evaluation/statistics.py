@@ -50,7 +50,7 @@ class Estimate(NamedTuple):
 
 
 def estimate_mean(values: Any) -> Estimate:
-    """Of a 1-D collection. Raises ConfigError for an empty one."""
+    """The mean of a 1-D collection. Raises ConfigError for an empty one."""
     x = np.asarray(values, np.float64).ravel()
     require(len(x) > 0, "no values to average")
     mean = float(np.mean(x))

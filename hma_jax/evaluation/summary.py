@@ -97,7 +97,7 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
 
 
 def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimate]:
-    """Of one dataset: the mean of each metric, and for discrete tokens the perplexities."""
+    """The estimates for one dataset: the mean of each metric, and for discrete tokens the perplexities."""
     own = {metric: column for metric, column in windows.metrics.items() if metric not in OPTIONAL_METRICS}
     estimates = {metric: estimate_mean(column) for metric, column in own.items()}
     if "cross_entropy" in windows.metrics:

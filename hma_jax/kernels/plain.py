@@ -39,7 +39,7 @@ def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.
 
 
 def _weights(q: jax.Array, k: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
-    """Of every position's frames, float32 [B, P, H, T, T_past + T]."""
+    """Attention weights between every position's frames, float32 [B, P, H, T, T_past + T]."""
     logits = jnp.einsum("btphi,bsphi->bphts", q, k, preferred_element_type=jnp.float32)
     return softmax(scale * logits, visible if visible.ndim == 2 else visible[:, None, None])
 

@@ -10,7 +10,7 @@ from hma_jax.config import ModelConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
 
 Array = jax.Array | np.ndarray
-"""Of a device, traced, or of the host."""
+"""An array on a device, traced, or on the host."""
 
 
 def require_known(

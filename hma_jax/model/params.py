@@ -256,7 +256,8 @@ def layer_for_compute(layer: nnx.State, dtype: jnp.dtype) -> nnx.State:
 
 
 def layouts_of(variable: nnx.Param) -> Layouts | None:
-    """Of a parameter that every robot has, inside a merged module; None without a mesh."""
+    """(storage, compute) layouts of a parameter with an axis of robots, E, inside a merged module; None without a
+    mesh."""
     return variable.get_metadata().get("layouts")
 
 

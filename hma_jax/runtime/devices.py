@@ -52,13 +52,13 @@ counts."""
 
 
 def find_peak(kind: str) -> Peak | None:
-    """Of one device; None where it is not known: CPUs, slices of a GPU (MIG), variants not in the table."""
+    """Peak of one device; None where it is not known: CPUs, slices of a GPU (MIG), variants not in the table."""
     fitting = [prefix for prefix in PEAKS if kind.startswith(prefix) and "MIG" not in kind]
     return PEAKS[max(fitting, key=len)] if fitting else None
 
 
 def peak_flops(dtype: str) -> float | None:
-    """Of all this program's devices together, for products of `dtype`; None where it is not known."""
+    """Peak FLOP/s of all this program's devices together, for products of `dtype`; None where it is not known."""
     peak = find_peak(jax.devices()[0].device_kind)
     if peak is None or dtype not in ("bfloat16", "float32"):
         return None

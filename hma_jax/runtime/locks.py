@@ -154,10 +154,8 @@ def _open(path: Path, lease: bool) -> tuple[int, bool]:
 
 
 def find_held(path: Path) -> Held | None:
-    """That a running process holds the lease `path`, as the error that says so. Nothing is written to the lock file.
-
-    None if nobody does. Raises OSError if it cannot be read now.
-    """
+    """Returns (does not raise) the error that names the running process which holds the lease `path`; None if nobody
+    holds it. Nothing is written to the lock file. Raises OSError if it cannot be read now."""
     try:
         while True:
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

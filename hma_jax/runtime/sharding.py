@@ -71,11 +71,11 @@ def partition(axes: Axes, shape: tuple[int, ...], mesh: Any, rules: Rules = COMP
 
 
 Layouts = tuple[PartitionSpec, PartitionSpec]
-"""Of one parameter: how it is stored, and how it is computed with."""
+"""(storage, compute) layouts of one parameter."""
 
 
 def find_layouts(axes: Axes, shape: tuple[int, ...], smallest: int) -> Layouts | None:
-    """Of a parameter of that shape under the current mesh; None without one."""
+    """Layouts of a parameter of that shape under the current mesh; None without a mesh."""
     if not is_split():
         return None
     mesh = jax.sharding.get_abstract_mesh()

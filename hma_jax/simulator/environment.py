@@ -219,7 +219,7 @@ class RobotVectorEnv(VectorEnv):
         return np.flatnonzero(mask).tolist()
 
     def _seed(self, seed: int | Sequence[int | None] | None, which: Sequence[int]) -> None:
-        """Of the episodes `which`, those that `seed` is of."""
+        """Seeds the episodes `which` with their entries of `seed`."""
         if np.ndim(seed) == 0:
             super().reset(seed=seed)
             new = [None if seed is None else self.np_random] * self.num_envs

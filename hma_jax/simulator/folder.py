@@ -60,7 +60,7 @@ def find_robots(directory: Path, table: EmbodimentTable) -> tuple[Robot, ...]:
 
 
 def find_starts(directory: Path) -> tuple[Start, ...]:
-    """Of starts.npz; none where there is no such file."""
+    """The starts in starts.npz; none without that file."""
     path = directory / STARTS
     return load_starts(path) if path.exists() else ()
 

@@ -90,8 +90,9 @@ def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
 
 
 Judge = Callable[[Any], tuple[np.ndarray, np.ndarray]]
-"""Of an `AnySimulator`, rewards and termination at the present frames: (float [B], bool [B]: the task is done and the
-episode over). A judge with a method `begin(simulator, episodes)` has it called after `episodes` were reset."""
+"""A function of an `AnySimulator` to rewards and termination at its present frames: (float [B], bool [B]: the task
+is done and the episode over). If a judge has a method `begin(simulator, episodes)`, it is called after `episodes`
+were reset."""
 
 
 def no_judge(simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:

@@ -99,11 +99,13 @@ class Simulator:
         weights: Weights = "auto",
         **options: Any,
     ) -> Simulator:
-        """Of a training run, with what lies beside it (`folder`); `options` are the constructor's. None is as if it was
-        not given, and robots that are not among those given stay as they are described there.
+        """Loads the simulator of a training run, with the files beside it (`folder`).
 
-        Raises ConfigError where there is no run, one that predicts no frames, or not the tokenizer that it was trained
-        with.
+        `options` are the constructor's and override these files; an option that is None counts as not given. Robots
+        that are not among those given stay as the files describe them.
+
+        Raises ConfigError if there is no run, if it predicts no frames, or if the tokenizer is not the one that it was
+        trained with.
         """
         run = Path(run)
         model = load_model(run, execution, weights)

@@ -20,7 +20,7 @@ from hma_jax.model.params import param, zeros
 from hma_jax.tokenizers.layers import Attention, Conv, GroupNorm, ResBlock, TimeConv
 
 TIME_EPS = 1e-5
-"""Of the normalisations over a clip; all others have 1e-6."""
+"""Epsilon of the normalisations over a clip; all others have 1e-6."""
 
 
 def _block(config: SvdVaeConfig, c_in: int, c_out: int) -> ResBlock:

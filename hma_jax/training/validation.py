@@ -26,7 +26,7 @@ from hma_jax.training.state import TrainState
 from hma_jax.training.step import micro_batches
 
 SEED = 0
-"""Of masks and noise: the same for every run, so that runs that mask alike compare."""
+"""Seed of masks and noise, the same for every run, so that runs with the same masking can be compared."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,10 @@ def make_sums(
 ) -> Callable[[Params, Mapping[str, jax.Array], jax.Array], tuple[LossSums, TargetCounts]]:
     """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function.
 
-    In as many micro-batches as a training step: where that fits into memory, this does too. What weighs
-    targets or degrades the past in training alone is left out: runs that differ in it compare. Masks, random ids and
-    label smoothing are those of training."""
+    The batch is split into as many micro-batches as a training step's, so it fits into memory if a step does. Settings
+    that weigh targets or degrade the past in training alone are switched off, so that runs with different values of
+    them can be compared. Masks, random ids and label smoothing are those of training.
+    """
     masking = replace(masking, change_weight=1.0, own_past=0.0, own_past_rounds=1, displaced_past=0.0)
 
     def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:

@@ -29,7 +29,7 @@ class Backend(PhysicsBackend):
         self.high = np.tile(np.append(arm + SPAN, 1.0), 2)
 
     def vector(self) -> np.ndarray:
-        """Of the arms alone: one task has one loose object, the other two."""
+        """The state of the arms alone: one task has one loose object, the other two."""
         return np.concatenate([self.data.qpos[:JOINTS], self.data.qvel[:JOINTS]]).astype(np.float32)
 
     def advance(self, action: np.ndarray) -> tuple[float, bool]:

@@ -56,7 +56,7 @@ class Drive:
         return render_frames(self.spec, looks, self.goals, q, objects, np.zeros(len(q), int))
 
     def points(self) -> Points:
-        """Of all n + 1 states."""
+        """The points in all n + 1 states."""
         return points_of(self.spec, np.full(len(self.q), self.start.seed), self.q, self.objects)
 
 

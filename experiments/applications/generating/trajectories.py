@@ -82,7 +82,7 @@ class Trajectories(ABC):
 
 
 class RldsTrajectories(Trajectories):
-    """Of a dataset in any format that is read where it lies."""
+    """Trajectories of a dataset in any format that is read in place."""
 
     def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int, max_lost: int = 0):
         """`max_lost`: how many episodes may be missing. Raises ConfigError for a dataset whose actions are not this
@@ -119,7 +119,8 @@ class RldsTrajectories(Trajectories):
 
 
 class StoredTrajectories(Trajectories):
-    """Of a token store: its frames where it kept them, otherwise what the tokenizer makes of its tokens."""
+    """Trajectories of a token store: its frames where it kept them, otherwise its tokens as the tokenizer decodes
+    them."""
 
     def __init__(self, store: TokenStore, name: str, split: str, tokenizer: BaseTokenizer, robot: Robot):
         """Raises ConfigError for tokens of another tokenizer, or of frames too far apart."""

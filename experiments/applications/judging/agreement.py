@@ -21,11 +21,11 @@ from experiments.applications.judging.true_rates import draw_rates, has_one_apar
 DRAWS = 2000
 
 LEAST_POLICIES = 5
-"""Of which intervals of correlations and rank violation over policies are known: of fewer, many resamples have one or
-two different policies, which have no order or are always in perfect order or disorder."""
+"""Fewest policies for which intervals over policies are given. With fewer, many bootstrap resamples contain one or
+two different policies, whose rates have no order or always a perfect one."""
 
 LEAST_STARTS = 20
-"""Of which intervals of correlations and rank violation over starts are known (`tests/stress/judged_starts.py`)."""
+"""Fewest starts for which intervals over starts are given (`tests/stress/judged_starts.py` measured their coverage)."""
 
 Measure = Callable[[np.ndarray, np.ndarray], float]
 
@@ -178,8 +178,8 @@ def _interval(value: float, drawn: np.ndarray, size: dict[str, int]) -> Interval
 
 
 def _of_true_rates(measured: Interval, measure: Measure, rates_nP2: np.ndarray) -> Interval:
-    """Of what is `measured` at some starts the interval over draws of the true rates; it reaches to what was measured,
-    which noise may have put beyond all of them."""
+    """The interval over starts: `measure` of draws of the true rates. It is widened to contain what was `measured`,
+    since noise may have put that outside all draws."""
     if not math.isfinite(measured.mean):
         return measured
     size = {"n": measured.n, "episodes": measured.episodes}
@@ -188,12 +188,12 @@ def _of_true_rates(measured: Interval, measure: Measure, rates_nP2: np.ndarray) 
 
 
 def rate_interval(successes: np.ndarray) -> Interval:
-    """Of the success rate of episodes, bool [n], see `count_interval`."""
+    """The interval of a success rate from outcomes, bool [n]; see `count_interval`."""
     return count_interval(int(np.sum(successes)), len(successes))
 
 
 def count_interval(successes: int, n: int) -> Interval:
-    """Of a success rate: Wilson's score interval, which holds at 0 and 1 too (Wilson 1927, JASA 22)."""
+    """Wilson's score interval of a success rate; it is valid at 0 and 1 too (Wilson 1927, JASA 22)."""
     rate, z = successes / n, 1.959964
     centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))

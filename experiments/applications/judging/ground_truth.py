@@ -66,7 +66,8 @@ class GroundTruth(Protocol):
 
 
 class SimulatedTruth:
-    """Of a robot with a true simulator, whose expert is cloned and whose state says what succeeded."""
+    """Ground truth for a robot with a true simulator: its expert is cloned, and the simulator's state says what
+    succeeded."""
 
     worlds = WORLDS
 

@@ -49,7 +49,7 @@ class LadderConfig:
 
 
 def names(config: LadderConfig) -> list[str]:
-    """Of all policies, in the order of their training."""
+    """The names of all policies, in the order of their training."""
     policies = [RANDOM]
     for kind, count in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
         policies += [f"{kind}-{step}" for step in config.fit(count).keep] if count else []

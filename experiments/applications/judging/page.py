@@ -318,7 +318,7 @@ CALLED = {TRUE: "true", LEARNED: "model", SHUFFLED: "control"}
 
 
 def _clips(judged: Judgement, *sides: tuple[str, str]) -> str:
-    """Of policies spread over the ladder, one start each, and what the judges said."""
+    """Clips of policies spread over the ladder, one start each, with what the judges said."""
     chosen = np.unique(np.linspace(0, len(judged.policies) - 1, CLIPS).round().astype(int))
     successes_by_side = [successes(judged.outcomes, judged.policies, *side) for side in sides]
     figures = []

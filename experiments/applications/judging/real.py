@@ -15,7 +15,7 @@ FEWEST = 3
 
 
 class Count(NamedTuple):
-    """Of one policy."""
+    """Successes and episodes of one policy."""
 
     successes: int
     episodes: int

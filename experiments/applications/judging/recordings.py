@@ -39,8 +39,8 @@ HELD_OUT = 4
 episodes begin as they did."""
 
 TUNED_ON = 5
-"""Of those learnt from, every so many of a kind say after how many steps training was best: of few recordings a head
-soon knows each by heart."""
+"""Every TUNED_ON-th training recording of a kind chooses the training step at which the head is best: a head soon
+overfits few recordings."""
 
 LIGHT, SHIFT = 0.15, 1 / 8
 """For the same reason frames are shown in more kinds of light than `HeadConfig` does, and moved by up to this share of
@@ -54,7 +54,8 @@ MOST = 0.9
 """This share of the recorded successes is not longer than an episode, where its length is not given."""
 
 LAST = "last frames taken for reached"
-"""Of each success that a head learnt from, where no reward says at which frames its goal was reached."""
+"""Where no reward says at which frames a goal was reached, so many last frames of each recorded success count as
+reached."""
 
 BEFORE = START_FRAMES - 1
 """Frames of a recording before the first that is looked at."""
@@ -171,8 +172,8 @@ class RecordedTruth:
         return heads[best]
 
     def _pairs(self, i: int, reconstruct: Reconstruct) -> tuple[np.ndarray, np.ndarray]:
-        """Of one recording what `fit_heads` takes; half of it, drawn, as the tokenizer shows it. Taken in turn, the
-        frames of one kind could all be of one turn."""
+        """Training pairs and labels of one recording for `fit_heads`. A random half of the frames is shown as the
+        tokenizer reconstructs them: were they taken by turns, all frames of one kind could fall into one half."""
         images, rng = self._images(i), np.random.default_rng([self.config.seed, i, 17])
         chosen, label = self._labelled(i, len(images))
         seen = np.stack([np.broadcast_to(images[0], images[chosen].shape), images[chosen]], 1)

@@ -23,7 +23,7 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 STARTS_SEED = 2
-"""Of the suite whose held-out episodes are the starts: neither trained on (0) nor used by `ship` (1)."""
+"""Seed of the suite whose held-out episodes are the starts: neither trained on (0) nor used by `ship` (1)."""
 
 
 @dataclass(frozen=True)

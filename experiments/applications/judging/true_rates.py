@@ -17,7 +17,8 @@ SPREADS = np.geomspace(0.01, 0.5, 20)
 """Standard deviations over policies that a world may have, all of [0, 0.5] equally likely; rates cannot have more."""
 
 CORRELATIONS = np.sin(np.linspace(-0.5, 0.5, 31) * np.pi)
-"""Of the two worlds' rates. Their angles are equally likely, but for the ends."""
+"""Correlations between the rates in the two worlds, evenly spaced in their angle. All angles are equally likely, but
+for the ends."""
 
 PERFECT = 0.1
 """Probability of each end, where the rates of one world are a line of the other's. Were it below 2.5 %, intervals of
@@ -125,6 +126,6 @@ def _det(matrices: np.ndarray) -> np.ndarray:
 
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
-    """Of many [2, 2], faster than np.linalg.inv."""
+    """Inverses of many [2, 2] matrices, faster than np.linalg.inv."""
     adjugate = matrices[..., ::-1, ::-1].swapaxes(-1, -2) * np.array([[1, -1], [-1, 1]])
     return adjugate / _det(matrices)[..., None, None]

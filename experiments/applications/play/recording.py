@@ -33,10 +33,10 @@ from data_pipelines.sources.rlds.writer import (
 from hma_jax.simulator.robots import Robot
 
 MOST_FRAMES = 3000
-"""Of a recording, which ends there: downloads of all visitors are made one after the other."""
+"""A recording ends after so many frames: downloads of all visitors are encoded one after the other."""
 
 MOST_BYTES = 2**26
-"""Of its pictures, which are kept in memory: with so many it ends, too."""
+"""A recording also ends after so many bytes of pictures, which are kept in memory."""
 
 SHOWN = 2.0
 """Frames per second of a video of a robot whose own time is not known."""

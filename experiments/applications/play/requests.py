@@ -26,7 +26,7 @@ Truth = Callable[[Robot], TrueSimulator | None]
 
 
 LARGEST_VALUE = 3e38
-"""Of a number of an action, which is single precision."""
+"""Largest absolute value of an action's number, which is stored in single precision."""
 
 MAX_VALUES = 4096
 """Numbers of an action."""

@@ -49,13 +49,13 @@ BACKLOG = 32
 """Connections that are accepted at once. So many may come before the first of them counts."""
 
 MAX_DOWNLOADS = 2
-"""Of one visitor, one of each kind, that are being made or wait; for more there is 429."""
+"""Downloads of one visitor, one of each kind, that may be running or waiting; further ones are answered with 429."""
 
 SESSIONS = web.AppKey("sessions", SessionManager)
 SOCKETS = web.AppKey("sockets", dict)
 """Websockets and the transport of each."""
 DOWNLOADS = web.AppKey("downloads", ThreadPoolExecutor)
-"""Of one thread: downloads are made one after the other, or they would take the cores from those who drive."""
+"""The executor of downloads. It has one thread: downloads side by side would take the cores from those who drive."""
 REFUSED = web.AppKey("refused", set)
 """Reasons of refusals that were logged: strangers cannot fill the log."""
 HEADERS = {

@@ -27,7 +27,7 @@ class Policy(Protocol):
 
 
 class Counts:
-    """Of B episodes, whose number is known with the first images: seeds, and how many actions each has had."""
+    """Counts the actions of each of B episodes, and keeps their seeds. B is known with the first images."""
 
     def __init__(self):
         self.seeds: dict[int, int] = {}

@@ -94,7 +94,7 @@ class Task:
 
     @property
     def in_suite(self) -> bool:
-        """Of a robot of the suite, not of a physics simulator."""
+        """Whether the task is of a robot of the suite, not of a physics simulator."""
         return self.robot in SPECS
 
     @property

@@ -116,7 +116,7 @@ def _view_one(
 
 
 def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
-    """Of another split, which need not be readable: the page is about the one that was asked for."""
+    """Fingerprints of another split. It need not be readable: the page is about the split that was asked for."""
     from data_pipelines.errors import DataError
     from data_pipelines.inspection.inspect import inspect_dataset
 

@@ -47,7 +47,7 @@ class LocalLauncher(Launcher):
 
     @classmethod
     def share(cls, workers: int | None, settings: LocalSettings) -> float | None:
-        """Of this machine's; None without any."""
+        """The share of this machine's accelerators that each trial gets; None if there are none."""
         accelerators = find_accelerators()
         if accelerators is None or not workers or workers == 1:
             return accelerators and float(len(accelerators.names))

@@ -50,7 +50,7 @@ LINGER = 30.0
 
 @dataclass(frozen=True)
 class SlurmSettings:
-    """Of the job of each trial."""
+    """Settings of the job of each trial."""
 
     partition: str | None = None
     account: str | None = None
@@ -161,7 +161,7 @@ class SlurmLauncher(Launcher):
         return AttemptEnd(None, f"job {job.job_id} ended with {str(value).strip().splitlines()[-1]}")
 
     def _state(self, id: str) -> str:
-        """Of one job; all are asked for at once, not more often than is good for the cluster."""
+        """The state of one job. All jobs are queried at once, and no more often than is good for the cluster."""
         if time.monotonic() - self._polled >= self.pause:
             self._polled = time.monotonic()
             answer = ask_states()
