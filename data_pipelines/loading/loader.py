@@ -21,6 +21,9 @@ from data_pipelines.windows.windows import WindowSet
 from hma_jax.config import require
 from hma_jax.model.embodiments import EmbodimentTable
 
+PREFETCH = 2
+"""Batches that each thread of a loader makes ahead."""
+
 
 def make_loader(
     store: TokenStore,
@@ -29,7 +32,6 @@ def make_loader(
     *,
     start_step: int = 0,
     rows: Sequence[int] | None = None,
-    prefetch: int = 2,
     threads: int = 2,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Endless batches from step `start_step` on.
@@ -38,7 +40,7 @@ def make_loader(
     [B, T, U] in raw units, zero-padded; `embodiment` int32 [B], index into `table`; `real` bool [B, T],
     False for frames that only fill up a window of a short episode. `rows` are those of the
     global batch that are wanted, in their order: each process of several takes its own
-    (`hma_jax.runtime.rows`). Each of the `threads` prefetches `prefetch` batches.
+    (`hma_jax.runtime.rows`). Each of the `threads` prefetches PREFETCH batches.
 
     Raises ConfigError for unknown datasets or rows, DataError if no episode is long enough for one window.
     """
@@ -53,7 +55,7 @@ def make_loader(
     require(len(grids) == 1, f"the datasets were tokenised with different tokenizers: {sorted(map(str, grids))}")
     store.check_table(table, names, config.rate)
     batches = _Batches(store, table, selected, config, wanted)
-    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads * prefetch, 1))
+    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads * PREFETCH, 1))
     iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
     return iterator

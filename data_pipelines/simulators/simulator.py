@@ -109,14 +109,12 @@ def new_seeds(name: str, count: int, seed: int, split: str) -> np.ndarray:
     return np.array([zlib.crc32(f"{split}/{seed}/{name}/{i}".encode()) for i in range(count)], np.int64)
 
 
-def physics_starts(
-    name: str, count: int, frames: int, *, stride: int, image_size: int, seed: int = 0, split: str = "starts"
-) -> list[Start]:
+def physics_starts(name: str, count: int, frames: int, *, stride: int, image_size: int, seed: int = 0) -> list[Start]:
     """The first `frames` frames, every `stride` native steps, of `count` new episodes under the dataset's behaviour."""
     spec, starts = PHYSICS[name], []
     world = PhysicsWorld(spec, image_size)
     try:
-        for number in new_seeds(name, count, seed, split):
+        for number in new_seeds(name, count, seed, "starts"):
             world.reset(int(number))
             sim, rng = world.simulator, np.random.default_rng([int(number), 1])
             behaviour = Behaviour(spec, sim.low, sim.high, sim.rest(), sim.expert(rng), rng)

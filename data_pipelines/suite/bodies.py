@@ -183,14 +183,13 @@ class Body:
                 result[:, m, :, link.joint] += link.gain * step
         return result
 
-    def solve(self, pose: Pose, move: np.ndarray, tool: int | None = None) -> np.ndarray:
+    def solve(self, pose: Pose, move: np.ndarray) -> np.ndarray:
         """Configuration change [n, C] that moves the tools by about `move` [n, M, 2].
 
-        With `tool`, only that tool counts and `move` is [n, 2]. Damped least squares, one
-        step: exact for small moves away from singular poses.
+        Damped least squares, one step: exact for small moves away from singular poses.
         """
         j = self.jacobian(pose)
-        j = j.reshape(len(j), -1, self.size) if tool is None else j[:, tool]
+        j = j.reshape(len(j), -1, self.size)
         gram = j @ j.swapaxes(1, 2) + DAMPING * np.eye(j.shape[1])
         weights = np.linalg.solve(gram, move.reshape(len(j), -1, 1))
         return (j.swapaxes(1, 2) @ weights)[..., 0]

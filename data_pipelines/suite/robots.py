@@ -55,7 +55,7 @@ def arm(
     return Body(tuple(links), tuple(joints), (len(links) - 1,), (-1,))
 
 
-def gripper(size: float = 0.2, radius: float = 0.06, paint: int = 2) -> Body:
+def gripper(size: float = 0.2, radius: float = 0.06) -> Body:
     """Two fingers on one joint: 0 closed, 1 open. The tool is the point between them."""
     links = [Link(length=0.6 * size)]
     for side in (1, -1):
@@ -67,7 +67,7 @@ def gripper(size: float = 0.2, radius: float = 0.06, paint: int = 2) -> Body:
                 mount=(0.0, 0.35 * size * side),
                 length=size,
                 radius=radius,
-                paint=paint,
+                paint=2,
             )
         )
     return Body(tuple(links), (Joint(0.0, 1.0, 4.0),), (0,), (0,))

@@ -180,11 +180,15 @@ def slopes(rows: Sequence[Size]) -> dict[str, Slope]:
     return fitted
 
 
-def check_coordinates(rows: Sequence[Size], grow: float = 0.2, fade: float = 0.4) -> list[str]:
+GROW, FADE = 0.2, 0.4
+"""Exponents of the width that sizes may grow, and changes by training may fade with (`check_coordinates`)."""
+
+
+def check_coordinates(rows: Sequence[Size]) -> list[str]:
     """What is wrong, a line for each finding; empty where width transfer can be expected.
 
-    Neither a size nor its change by training may grow faster than width^grow, nor the change fade
-    faster than width^-fade. Fading has more room: while learning has not outgrown it, what the
+    Neither a size nor its change by training may grow faster than width^GROW, nor the change fade
+    faster than width^-FADE. Fading has more room: while learning has not outgrown it, what the
     random start does fades as width^-0.5 also where all is well. Passing is necessary for transfer,
     not sufficient.
     """
@@ -193,9 +197,9 @@ def check_coordinates(rows: Sequence[Size], grow: float = 0.2, fade: float = 0.4
         if not np.isfinite(slope).all():
             findings.append(f"{quantity}: zero or not finite at some width")
             continue
-        if slope.size > grow:
+        if slope.size > GROW:
             findings.append(f"{quantity}: grows as width^{slope.size:.2f}")
-        if slope.change > grow or slope.change < -fade:
+        if slope.change > GROW or slope.change < -FADE:
             verb = "grows" if slope.change > 0 else "fades"
             findings.append(f"{quantity}: its change in training {verb} as width^{slope.change:.2f}")
     return findings

@@ -4,7 +4,7 @@ One way of filling a frame (`decoding`), one cache of finished frames (`cache`),
 (`steps`); the rest is who asks for which frame.
 """
 
-from hma_jax.generation.policy import predict_actions, predict_next_actions, read_actions, rollout_policy
+from hma_jax.generation.policy import predict_actions, predict_next_actions, read_actions
 from hma_jax.generation.rollout import rollout, rollout_naive
 from hma_jax.generation.session import Session, advance, start
 from hma_jax.generation.teacher import next_frame_outputs, next_frames
@@ -19,6 +19,5 @@ __all__ = [
     "read_actions",
     "rollout",
     "rollout_naive",
-    "rollout_policy",
     "start",
 ]

@@ -113,11 +113,6 @@ class Window(NamedTuple):
         )
         return cache.write(out.cache, slot), out.token_outputs[:, 0]
 
-    def read(self, cache: FrameCache, frame: jax.Array, at: int | jax.Array) -> Outputs:
-        """A pass over one finished frame [B, S (, C)] at position `at`, which does not enter the cache."""
-        visible = jnp.append(cache.valid, True)[None]
-        return self._pass(frame[:, None], None, at, cache.layers, visible)
-
     def _pass(
         self,
         values: jax.Array,

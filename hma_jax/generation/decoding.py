@@ -17,7 +17,7 @@ from hma_jax.config import DecodeConfig, ModelConfig, check_decoding
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
 from hma_jax.model.readout import ChainedReadout, Readout, choose_sampled
-from hma_jax.objective.diffusion import sample_with_key
+from hma_jax.objective.diffusion import sample
 from hma_jax.objective.process import make_process, sampling_process
 
 
@@ -156,7 +156,7 @@ def denoise(model: HMA, z: jax.Array, key_B: jax.Array, decode: DecodeConfig) ->
     def network(x: jax.Array, t: jax.Array) -> jax.Array:
         return model.denoiser(x, t, z)
 
-    return sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)
+    return sample(network, key_B, shape, process, decode.sampler, config.clip)
 
 
 def commit(frame: Frame, chosen_Bn: jax.Array, values_BnC: jax.Array) -> Frame:

@@ -1,4 +1,4 @@
-"""Actions predicted from frames: after recorded frames, or acting in the model's own rollouts."""
+"""Actions predicted from frames."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
-from hma_jax.generation import steps
-from hma_jax.generation.cache import FrameCache, Window
-from hma_jax.generation.rollout import fold_in
+from hma_jax.kernels.random import Tag
 from hma_jax.model.hma import HMA, Outputs
 from hma_jax.model.teacher_forcing import teacher_forcing_mask
-from hma_jax.objective.diffusion import sample_with_key
+from hma_jax.objective.diffusion import sample
 from hma_jax.objective.losses import bidirectional_mask
 from hma_jax.objective.process import make_process, sampling_process
 
@@ -101,7 +99,7 @@ def _sample_actions(
     config, width = model.config.diffusion, model.table.action_width
     process = sampling_process(make_process(config.steps), decode.sampler)
     shape = (*features_BTD.shape[:2], width)
-    value = 2**16 * jnp.arange(shape[1])[:, None] + jnp.arange(width)
+    value = Tag.PER_FRAME * jnp.arange(shape[1])[:, None] + jnp.arange(width)
     keys = jax.vmap(lambda key: jax.vmap(jax.vmap(lambda n: jax.random.fold_in(key, n)))(value))(key_B)
     # In training padding and dead dimensions are 0 also when noised.
     alive_BTU = jnp.asarray(model.table.alive())[embodiment_B][:, None]
@@ -109,49 +107,4 @@ def _sample_actions(
     def network(x: jax.Array, t: jax.Array) -> jax.Array:
         return model.action_head(jnp.where(alive_BTU, x, 0), t, features_BTD, embodiment_B)
 
-    return sample_with_key(network, keys, shape, process, decode.sampler, config.clip)
-
-
-def rollout_policy(
-    model: HMA,
-    prompt: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
-    key_B: jax.Array,
-    decode: DecodeConfig,
-) -> tuple[jax.Array, jax.Array]:
-    """The model acts in its own rollout: (new frames [B, T - T', S (, C)], raw chunks [B, T, U]).
-
-    `actions_BTU` are recorded for the T' - 1 transitions within the prompt; from its last frame on
-    the model chooses: it predicts a chunk from the newest frame, then the frame that follows it. The last
-    returned chunk, after the last frame, is as given.
-    """
-    frames, count = actions_BTU.shape[1], prompt.shape[1]
-    require(
-        1 <= count < frames <= model.config.frames,
-        f"a policy's rollout of {frames} frames from a prompt of {count} does not fit a window of "
-        f"{model.config.frames}",
-    )
-    shape = (len(prompt), frames)
-
-    def window(chunks: jax.Array, unknown_from: int | jax.Array) -> Window:
-        """While the chunks from some frame on are unknown."""
-        unknown = jnp.broadcast_to(jnp.arange(frames) >= unknown_from, shape)
-        return Window.over(model, chunks, unknown, embodiment_B)
-
-    cache = window(actions_BTU, count - 1).start(prompt[:, :-1], frames - 1)
-
-    def next_frame(carry: tuple[FrameCache, jax.Array, jax.Array], t: jax.Array):
-        cache, last, chunks = carry
-        # The chunk after frame t - 1, read with that chunk hidden.
-        out = window(chunks, t - 1).read(cache, last, t - 1)
-        keys = jax.vmap(jax.random.split)(fold_in(key_B, t))
-        chunk = read_actions(model, out, embodiment_B, keys[:, 0], decode)
-        chunks = jax.lax.dynamic_update_slice_in_dim(chunks, chunk, t - 1, axis=1)
-        # Now it is known; the one after frame t is not.
-        cache, frame = steps.fill(window(chunks, t), cache, last, t, keys[:, 1], decode)
-        return (cache, frame, chunks), frame
-
-    carry = (cache, prompt[:, -1], actions_BTU)
-    (_, _, chunks), new = jax.lax.scan(next_frame, carry, jnp.arange(count, frames))
-    return jnp.moveaxis(new, 0, 1), chunks
+    return sample(network, keys, shape, process, decode.sampler, config.clip)

@@ -40,6 +40,39 @@ GENERATOR = generators.define_prng_impl(
 )
 """JAX's default, from which JAX_DEFAULT_PRNG_IMPL may lead away; of others, numbers depend on batches and devices."""
 
+
+class Tag:
+    """What `fold_in` is given to branch a stream of random numbers off a key. Results depend on the values.
+
+    Streams of one key need different tags. `jax.random.split(key, n)[i]` is `fold_in(key, i)` with this generator, so a
+    split takes the tags 0 .. n - 1. `->` is one `fold_in`:
+
+        seed's key -> training step      the key of a step (validation: its seed's key -> batch)
+        step -> row                      masks and corruption of an example
+                    -> HIDDEN_ACTIONS    which of its actions are hidden
+        step -> NOISE -> row             the noise key of an example
+                    -> 0, 1, 2           models on ids: `objective.own_past`, by a split
+                    -> 0 .. repeats - 1  models on latents: each noised copy of the tokens
+                    -> ACTION_NOISE      models on latents: noise of its actions
+                    -> DISPLACED_PAST    `objective.displaced`
+
+        key of a rollout -> frame t      one frame that is decoded
+                    -> 0 .. M - 1        its unmasking steps
+                    -> M                 models on latents: the order of its patches
+        key of a policy -> PER_FRAME * t + u
+                                         models on latents: value u of the chunk of frame t
+        key of a sampler -> step         noise of each step of the process; the initial noise has the tag after the last
+
+    Those of an evaluation are in `evaluation.draws`.
+    """
+
+    HIDDEN_ACTIONS = 1
+    NOISE = 2**31 - 1  # beyond every row
+    ACTION_NOISE = 2**20  # beyond every repeat
+    DISPLACED_PAST = 2**31 - 1  # beyond every repeat and the split of `own_past`
+    PER_FRAME = 2**16  # beyond every value of a chunk
+
+
 Sample = Callable[[jax.Array, tuple[int, ...], jnp.dtype], jax.Array]
 """A function of `jax.random`: (key, shape, dtype) -> numbers."""
 

@@ -107,43 +107,7 @@ def _binned_log_likelihood(x: jax.Array, gap: jax.Array, log_variance: jax.Array
 # --- Sampling --------------------------------------------------------------------------------
 
 
-class Trajectory(NamedTuple):
-    """Every step of a sampling run, noisiest first."""
-
-    x: jax.Array  # [steps, ..., C], after the step
-    x0: jax.Array  # [steps, ..., C], the clean vectors predicted in the step
-
-
 def sample(
-    network: Network,
-    noise_init: jax.Array,
-    noise_steps: jax.Array | None,
-    process: Process,
-    sampler: SamplerConfig,
-    clip: float,
-    trajectory: bool = False,
-) -> jax.Array | tuple[jax.Array, Trajectory]:
-    """Clean vectors [..., C] from recorded noise; with `trajectory` also every step.
-
-    noise_init [..., C]; noise_steps [steps, ..., C], first the noisiest step's (the last step
-    adds none), or None where `sampler.noisy_steps` is false. Predicted clean vectors are kept in
-    +-clip.
-    """
-    shape = (sampler.steps, *noise_init.shape)
-    require(
-        not sampler.noisy_steps or (noise_steps is not None and noise_steps.shape == shape),
-        f"{sampler.kind} at temperature {sampler.temperature} needs noise of shape {shape}, "
-        f"got {None if noise_steps is None else noise_steps.shape}",
-    )
-    recorded = jnp.asarray(noise_steps if sampler.noisy_steps else [], jnp.float32)
-
-    def noise_at(index: jax.Array) -> jax.Array:
-        return recorded[-1 - index]
-
-    return _run(network, noise_init, noise_at, process, sampler, clip, trajectory)
-
-
-def sample_with_key(
     network: Network,
     key: jax.Array,
     shape: tuple[int, ...],
@@ -165,26 +129,44 @@ def sample_with_key(
         keys = jax.vmap(lambda k: jax.random.fold_in(k, index))(key.reshape(-1))
         return draw_flat(jax.random.normal, keys.reshape(key.shape), shape[key.ndim :])
 
-    return _run(network, draw(process.steps), draw, process, sampler, clip)
+    return run_sampler(network, draw(process.steps), draw, process, sampler, clip)
 
 
-def _run(
+def run_sampler(
     network: Network,
     noise_init: jax.Array,
     noise_at: Callable[[jax.Array], jax.Array],
     process: Process,
     sampler: SamplerConfig,
     clip: float,
-    trajectory: bool = False,
-) -> jax.Array | tuple[jax.Array, Trajectory]:
-    """From the last index of the process down to 0; noise_at(index) -> [..., C]."""
+) -> jax.Array:
+    """Clean vectors [..., C] from noise_init [..., C], by every step of `process`, from its last index down to 0.
+
+    `noise_at`: index -> the noise [..., C] of that step; it is called only where `sampler.noisy_steps`.
+    """
     require(
         process.steps == sampler.steps,
         f"sampler.steps is {sampler.steps} but the process has {process.steps}; use sampling_process(process, sampler)",
     )
+    step = sampler_step(network, noise_at, process, sampler, clip)
+    x = jnp.asarray(noise_init, jnp.float32) * (sampler.temperature if sampler.scale_initial_noise else 1.0)
+    indices = jnp.arange(process.steps - 1, -1, -1)
+    (x, _), _ = jax.lax.scan(lambda carry, index: (step(carry, index), None), (x, jnp.zeros_like(x)), indices)
+    return x
+
+
+def sampler_step(
+    network: Network,
+    noise_at: Callable[[jax.Array], jax.Array],
+    process: Process,
+    sampler: SamplerConfig,
+    clip: float,
+) -> Callable[[tuple[jax.Array, jax.Array], jax.Array], tuple[jax.Array, jax.Array]]:
+    """step((x, x0 of the step before), index) -> (x after the step, the clean vectors x0 predicted in it), [..., C]
+    each. x0 is kept in +-clip."""
     solver = multistep(process, sampler.eta)
 
-    def step(carry: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[tuple, Trajectory | None]:
+    def step(carry: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[jax.Array, jax.Array]:
         x, before = carry
         # Every vector is at the same step: what the network makes of the step alone, it makes once.
         t = jnp.full((1,) * (x.ndim - 1), index)
@@ -205,8 +187,6 @@ def _run(
             if sampler.noisy_steps:
                 scale = jnp.where(index > 0, sampler.temperature, 0.0)
                 x += scale * jnp.exp(0.5 * predicted.log_variance) * noise_at(index)
-        return (x, x0), Trajectory(x, x0) if trajectory else None
+        return x, x0
 
-    x = jnp.asarray(noise_init, jnp.float32) * (sampler.temperature if sampler.scale_initial_noise else 1.0)
-    (x, _), visited = jax.lax.scan(step, (x, jnp.zeros_like(x)), jnp.arange(process.steps - 1, -1, -1))
-    return (x, visited) if trajectory else x
+    return step

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import MaskingConfig
-from hma_jax.kernels.random import draw_flat
+from hma_jax.kernels.random import Tag, draw_flat
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
 from hma_jax.model.teacher_forcing import teacher_forced_pass
@@ -54,7 +54,7 @@ def loss_metrics(sums: LossSums, counts: TargetCounts, masking: MaskingConfig, d
 
 def noise_keys(key: jax.Array, rows: int) -> jax.Array:
     """Keys [B] of the diffusion noise of a batch whose masks are drawn with `key`."""
-    noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
+    noise_key = jax.random.fold_in(key, Tag.NOISE)
     return jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(rows))
 
 
@@ -115,14 +115,31 @@ def masked_loss(
     if masking.teacher_forcing:
         past = masked.inputs[:, :-1]
         if masking.own_past:
-            drawn = masking.own_past, masking.own_past_rounds, key_B, robot_row_B, masking.action_leak
-            past = draw_own_past(model, past, actions_BTU, embodiment_B, hidden, *drawn)
+            past = draw_own_past(
+                model,
+                past,
+                actions_BTU,
+                embodiment_B,
+                hidden,
+                share=masking.own_past,
+                rounds=masking.own_past_rounds,
+                key_B=key_B,
+                robot_row_B=robot_row_B,
+                leak=masking.action_leak,
+            )
         if masking.displaced_past:
-            # Not the key of a round of `own_past`, nor of a repeat of the diffusion loss.
-            keys = jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(key_B)
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, Tag.DISPLACED_PAST))(key_B)
             past = displace_patches(past, masking.displaced_past, keys)
-        inputs = past, masked.inputs[:, FIRST_PREDICTED:], masked.masked[:, FIRST_PREDICTED:]
-        out = teacher_forced_pass(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
+        out = teacher_forced_pass(
+            model,
+            past,
+            masked.inputs[:, FIRST_PREDICTED:],
+            masked.masked[:, FIRST_PREDICTED:],
+            actions_BTU,
+            embodiment_B,
+            hidden,
+            **options,
+        )
     else:
         out = model(
             masked.inputs,
@@ -209,7 +226,7 @@ def action_loss_per_step(
     target = model.normalise(actions_BTU, embodiment_B)
     alive_BTU = jnp.broadcast_to(jnp.asarray(model.table.alive())[embodiment_B][:, None], target.shape)
     if model.config.diffusion:
-        keys = jax.vmap(lambda k: jax.random.fold_in(k, 2**20))(key_B)  # not one of the repeats'
+        keys = jax.vmap(lambda k: jax.random.fold_in(k, Tag.ACTION_NOISE))(key_B)
         time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion.steps))(keys)
 
         def network(x: jax.Array, t: jax.Array) -> jax.Array:

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import MaskingConfig, ModelConfig, Setting
+from hma_jax.kernels.random import Tag
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import compose, factorise
 
@@ -182,7 +183,7 @@ def mask_example(
 ) -> Masked:
     """One window, [T, S] ids or [T, S, C] latents, under `masking.setting`."""
     frames = tokens.shape[0]
-    hidden = hide_actions(jax.random.fold_in(key, 1), frames, masking) | ~has_actions
+    hidden = hide_actions(jax.random.fold_in(key, Tag.HIDDEN_ACTIONS), frames, masking) | ~has_actions
     inputs = tokens
     if masking.predicts_frames:
         draws = draw(key, config, masking)

@@ -24,14 +24,15 @@ def draw_own_past(
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     action_hidden_BT: jax.Array | None,
-    greatest_share: float,
+    *,
+    share: float,
     rounds: int,
     key_B: jax.Array,
     robot_row_B: jax.Array,
     leak: ActionLeak = "none",
 ) -> jax.Array:
-    """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `greatest_share` u, u uniform in
-    [0, 1) of each example, by ids drawn from the model's own distribution at temperature 1, in so many `rounds`.
+    """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `share` u, u uniform in [0, 1)
+    of each example, by ids drawn from the model's own distribution at temperature 1, in so many `rounds`.
 
     Needs the chunks that lead to them alone; for the meaning of the others see `objective.losses.masked_loss`.
     """
@@ -40,8 +41,8 @@ def draw_own_past(
     def choose_frames(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """(a key for the ids, bool [T - 2]: the frames from the second on that are the model's)."""
         ids_key, share_key, frame_key = jax.random.split(key, 3)
-        share = greatest_share * jax.random.uniform(share_key, (), jnp.float32)
-        return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,), jnp.float32) < share
+        rate = share * jax.random.uniform(share_key, (), jnp.float32)
+        return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,), jnp.float32) < rate
 
     def draw(key: jax.Array, token_outputs_TS: jax.Array) -> jax.Array:
         digits, _ = head.decode_factors(token_outputs_TS, choose_sampled(key, head.shape(token_outputs_TS)))
@@ -50,11 +51,20 @@ def draw_own_past(
     ids_key_B, own_BT = jax.vmap(choose_frames)(key_B)
     past = before
     for number in range(rounds):
-        shown = actions_BTU, embodiment_B, action_hidden_BT
-        token_outputs = teacher_forced_pass(
-            model, past, past, masked, *shown, leak=leak, robot_row_B=robot_row_B
-        ).token_outputs
-        token_outputs = jax.lax.stop_gradient(token_outputs[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
+        out = teacher_forced_pass(
+            model,
+            past,
+            past,
+            masked,
+            actions_BTU,
+            embodiment_B,
+            action_hidden_BT,
+            leak=leak,
+            robot_row_B=robot_row_B,
+        )
+        token_outputs = jax.lax.stop_gradient(
+            out.token_outputs[:, :-1]
+        )  # of frames 1 .. T-2; nothing follows the last one
         # The first round draws what it draws where it is the only one.
         keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B
         own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, token_outputs), before[:, 1:])

@@ -269,10 +269,10 @@ class Simulator:
         for i, b in enumerate(rows):
             chunk_nU[i, : chunks[b].size] = chunks[b].ravel()
         seeds = np.array([self._running_episode(b).seed for b in rows], np.uint32)
-        asked = np.array(rows, np.int32), chunk_nU, seeds
+        rows_n = np.array(rows, np.int32)
         with self._donating_state():
-            state, *made = self._programs.advance(self._programs.weights, self._state, *asked)
-            tokens, seen = map(np.asarray, made)
+            state, tokens, seen = self._programs.advance(self._programs.weights, self._state, rows_n, chunk_nU, seeds)
+            tokens, seen = np.asarray(tokens), np.asarray(seen)
             self._state = state
         for b, frame, chunk in zip(chunks, tokens, chunk_nU, strict=False):
             episode = self._running_episode(b)
@@ -300,10 +300,10 @@ class Simulator:
         require(
             1 <= together <= len(self), f"between 1 and {len(self)} episodes can be stepped together, got {together}"
         )
-        rows = np.array(padded(list(range(together)), len(self)), np.int32)
-        chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
-        blank = self._programs.empty(), rows, chunk_nU, np.zeros(len(rows), np.uint32)
-        jax.block_until_ready(self._programs.advance(self._programs.weights, *blank))
+        rows_n = np.array(padded(list(range(together)), len(self)), np.int32)
+        chunk_nU = np.zeros((len(rows_n), self.model.table.action_width), np.float32)
+        seeds, state = np.zeros(len(rows_n), np.uint32), self._programs.empty()
+        jax.block_until_ready(self._programs.advance(self._programs.weights, state, rows_n, chunk_nU, seeds))
 
     # --- Going back, and apart ---------------------------------------------------------------------
 

@@ -135,7 +135,8 @@ def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dic
 
 @lru_cache(maxsize=4)
 def _jitted_step(make: Callable[..., Callable], config: TokenizerConfig, train: TokenizerTrainConfig) -> Callable:
-    """The step that `make` makes, kept for the next training of this process, which is often the same one, resumed."""
+    """The step that `make` makes (`make_train_step`, or what a test put in its place, which must not meet the kept
+    one), kept for the next training of this process, which is often the same one, resumed."""
     return jax.jit(make(config, train, declare_tokenizer(config)), donate_argnums=0)
 
 

@@ -159,7 +159,8 @@ def _jitted_step(
     execution: ExecutionConfig,
     device_mesh: Mesh,
 ) -> Callable:
-    """The step that `make` makes, of runs of any seed, which comes with the batch. With a `table` that is standardised
+    """The step that `make` makes (`make_train_step`, or what a test put in its place, which must not meet the kept
+    one), of runs of any seed, which comes with the batch. With a `table` that is standardised
     the actions come normalised.
 
     Kept for the next run of the same process, which is often the same one, resumed, or one of another seed: tracing

@@ -12,9 +12,10 @@ import numpy as np
 from hma_jax.config import SamplerConfig
 from hma_jax.generation.decoding import Frame, choose_patches, commit, masked_counts
 from hma_jax.model.frames import mask_cells, patchify, unpatchify
-from hma_jax.objective.diffusion import diffusion_loss, sample
+from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.process import make_process, sampling_process
 from tests.golden.case import Case, norms
+from tests.sampling import sample_recorded, trajectory_of
 
 
 class Latents:
@@ -55,7 +56,7 @@ def applier(case: Case):
     )
 
 
-def make_sampler(case: Case, head: Callable, temperature: float, trajectory: bool = False) -> Callable:
+def make_sampler(case: Case, head: Callable, temperature: float, run: Callable = sample_recorded) -> Callable:
     """sample(condition, noise_init, noise_steps): the release's sampler with recorded noise.
 
     head(model, x, t, condition) is a denoising network.
@@ -67,16 +68,16 @@ def make_sampler(case: Case, head: Callable, temperature: float, trajectory: boo
     process = sampling_process(make_process(config.steps), sampler)
 
     @jax.jit
-    def run(params, condition, start, noises):
+    def sample(params, condition, start, noises):
         model = case.declared.merge(params)
 
         def network(x, t):
             return head(model, x, t, condition)
 
         noises = noises if sampler.noisy_steps else None
-        return sample(network, start, noises, process, sampler, config.clip, trajectory)
+        return run(network, start, noises, process, sampler, config.clip)
 
-    return functools.partial(run, case.params)
+    return functools.partial(sample, case.params)
 
 
 def frame_head(model, x: jax.Array, t: jax.Array, condition: jax.Array) -> jax.Array:
@@ -119,8 +120,8 @@ def check_forward(case: Case) -> None:
 def _check_sampler(case: Case) -> None:
     condition = jnp.asarray(case.inputs["sample_c"])
     noise = case.inputs["sample_noise_init"], case.inputs["sample_noise_steps"]
-    last, visited = make_sampler(case, frame_head, 1.0, trajectory=True)(condition, *noise)
-    case.check("sample_temperature1", last)
+    case.check("sample_temperature1", make_sampler(case, frame_head, 1.0)(condition, *noise))
+    visited = make_sampler(case, frame_head, 1.0, trajectory_of)(condition, *noise)
     case.check("sample_trajectory", visited.x)
     case.check("sample_pred_x0", visited.x0)
     case.check("sample_temperature0", make_sampler(case, frame_head, 0.0)(condition, *noise))

@@ -32,7 +32,11 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
     one = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], rows, 0), random_batch(0, config, 1))
     before, given = one["tokens"][:, :-1], (one["actions"], one["embodiment"])
     keys = noise_keys(jax.random.key(0), rows)
-    draw = jax.jit(lambda share: draw_own_past(model, before, *given, None, share, 1, keys, given[1]))
+    draw = jax.jit(
+        lambda share: draw_own_past(
+            model, before, *given, None, share=share, rounds=1, key_B=keys, robot_row_B=given[1]
+        )
+    )
     drawn = np.asarray(draw(1.0))
     assert (drawn[:, 0] == before[:, 0]).all()
     replaced = (drawn != np.asarray(before)).any(-1)[:, 1:]
@@ -49,7 +53,7 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
 
     # The loss is that of what follows this past.
     shown, own = [], before + 1
-    monkeypatch.setattr(losses, "draw_own_past", lambda *_: own)
+    monkeypatch.setattr(losses, "draw_own_past", lambda *_, **__: own)
 
     def recording_pass(model, past, *rest, **how):
         shown.append(past)
@@ -79,8 +83,9 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
     @partial(jax.jit, static_argnums=0)
     def own_share(rounds: int) -> jax.Array:
         """Of each frame, the share of ids that the model says after the frames before it in what is drawn."""
+        keys = noise_keys(jax.random.key(0), rows)
         past = draw_own_past(
-            model, before, *given, None, every_frame, rounds, noise_keys(jax.random.key(0), rows), given[1]
+            model, before, *given, None, share=every_frame, rounds=rounds, key_B=keys, robot_row_B=given[1]
         )
         whole = jnp.concatenate([past, past[:, -1:]], axis=1)
         digits, _ = model.frame_head.decode_factors(next_frame_outputs(model, whole, *given), choose_likeliest)
@@ -105,7 +110,8 @@ def test_every_round_draws_with_random_numbers_of_its_own(monkeypatch):
     @jax.jit
     def draw(keys):
         model = declared.merge(params)
-        return [draw_own_past(model, before, *given, None, every_frame, rounds, keys, given[1]) for rounds in (1, 2, 3)]
+        options = dict(share=every_frame, key_B=keys, robot_row_B=given[1])
+        return [draw_own_past(model, before, *given, None, rounds=rounds, **options) for rounds in (1, 2, 3)]
 
     first, second, third = draw(noise_keys(jax.random.key(0), 4))
     for one, other in ((first, second), (second, third), (first, third)):
@@ -132,14 +138,14 @@ def test_it_is_drawn_after_hidden_actions_where_these_leak_to_the_model(monkeypa
 
     @partial(jax.jit, static_argnums=1)
     def past(hidden: jax.Array | None, leak: ActionLeak) -> jax.Array:
-        drawn = 1.0, 1, keys, given[1], leak
-        return draw_own_past(declared.merge(params), tokens[:, :-1], *given, hidden, *drawn)
+        options = dict(share=1.0, rounds=1, key_B=keys, robot_row_B=given[1], leak=leak)
+        return draw_own_past(declared.merge(params), tokens[:, :-1], *given, hidden, **options)
 
     np.testing.assert_array_equal(past(hidden, "all"), past(None, "none"))
     assert (past(hidden, "none") != past(None, "none")).any()
 
     seen = []
-    monkeypatch.setattr(losses, "draw_own_past", lambda model, past, *asked: seen.append(asked[-1]) or past)
+    monkeypatch.setattr(losses, "draw_own_past", lambda model, past, *_, leak, **__: seen.append(leak) or past)
     masking = replace(OWN, setting="passive", action_leak="all")
     masked = mask_batch(jax.random.key(0), tokens, given[1], config, masking, TABLE)
     jax.eval_shape(lambda: losses.masked_loss(declared.merge(params), masked, tokens, *given, masking, keys).tokens)

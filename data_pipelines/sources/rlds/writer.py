@@ -29,9 +29,9 @@ class Field:
     encoding: str = "jpeg"
 
 
-def image_field(height: int | None, width: int | None, encoding: str = "jpeg") -> Field:
+def image_field(height: int | None, width: int | None) -> Field:
     """An RGB image; None for sizes that differ between episodes."""
-    return Field(IMAGE, (height, width, 3), encoding)
+    return Field(IMAGE, (height, width, 3))
 
 
 def vector_field(size: int) -> Field:

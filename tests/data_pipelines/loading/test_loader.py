@@ -140,7 +140,7 @@ def test_the_records_of_a_batch_are_those_that_its_rows_were_read_from(store, ta
 def test_resuming_with_other_processes_and_threads_continues_exactly(store, table):
     straight = take(store, table, 4)
     parts = [
-        take(store, table, 2, start_step=2, rows=own, threads=4 * p, prefetch=1)
+        take(store, table, 2, start_step=2, rows=own, threads=4 * p)
         for p, own in enumerate(np.split(np.arange(CONFIG.batch), 2))
     ]
     for k in (0, 1):
