@@ -90,6 +90,7 @@ def read_meta(root: Path) -> LeRobotMeta:
                 f"{root / 'meta'}: episode {one.index} is listed twice, as happens when recording was resumed. Remove "
                 "one of the two lines, or download the dataset again."
             )
+    _check_range(info.get("splits") or {}, episodes, info_path)
     stated, lost_why = info.get("total_episodes") or 0, ""
     may_lose = episodes[-1].index < stated <= len(episodes) + MAX_LOST
     if len(episodes) < stated:
@@ -221,10 +222,7 @@ def _check_info(info: dict[str, Any], path: Path) -> None:
     splits = info.get("splits") or {}
     if not isinstance(splits, dict) or set(splits) - {"train"}:
         found = ", ".join(map(quote, splits)) if isinstance(splits, dict) else quote(splits)
-        raise DataError(
-            f"{path}: splits is {found}, but every episode would be read as one of 'train'. Divide the dataset with "
-            'LeRobot\'s own scripts; to train on all its episodes, write "splits": {} there.'
-        )
+        raise DataError(f"{path}: splits is {found}, {_ALL_TRAIN}")
     if not isinstance(features, dict):
         raise DataError(f"{path}: features is {quote(features)}, not an object. {ADVICE}")
     for name, feature in features.items():
@@ -236,6 +234,24 @@ def _check_info(info: dict[str, Any], path: Path) -> None:
         for key in ("info", "video_info"):
             if not isinstance(feature.get(key) or {}, dict):
                 raise DataError(f"{path}: feature {quote(name)}: {key} is no object. {ADVICE}")
+
+
+_ALL_TRAIN = (
+    "but every episode would be read as one of 'train'. Divide the dataset with LeRobot's own scripts; to train on all its "
+    'episodes, write "splits": {} there.'
+)
+
+
+def _check_range(splits: dict[str, Any], episodes: list[EpisodeEntry], path: Path) -> None:
+    """Raises DataError for a range of episodes of 'train' (`0:50`) that leaves out one of the sorted `episodes`."""
+    if "train" not in splits:
+        return
+    match = re.fullmatch(r"(\d+):(\d+)", str(splits["train"]))
+    if not match or not int(match[1]) <= episodes[0].index <= episodes[-1].index < int(match[2]):
+        raise DataError(
+            f"{path}: splits has {quote(splits['train'])} as 'train', not all episodes from {episodes[0].index} to "
+            f"{episodes[-1].index}, {_ALL_TRAIN}"
+        )
 
 
 def _count(row: Mapping[str, Any], name: str, where: str) -> int:

@@ -178,6 +178,9 @@ def test_length_and_rows_must_agree(tmp_path):
     [
         ({"codebase_version": "v1.6"}, "codebase_version is 'v1.6'; only v2.0, v2.1, v3.0 can be read"),
         ({"fps": None}, "no 'fps'"),
+        ({"splits": {"train": "0:1"}}, "splits has '0:1' as 'train', not all episodes from 0 to 1, but .* on all"),
+        ({"splits": {"train": "1:2"}}, "splits has '1:2' as 'train'"),
+        ({"splits": {"train": [0, 1]}}, "splits has a list of 2 as 'train'"),
         ({"splits": {"train": "0:1", "test": "1:2"}}, "splits is 'train', 'test', but .* to train on all"),
         ({"total_episodes": 3}, "it lists 2 episodes, without episode 2"),
         ({"video_path": None}, "'video_path' is missing"),
