@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_pipelines.registry.angles import RECOGNISED, SWITCH_SHARE, AngleUnit, find_turns
+from data_pipelines.registry.angles import RECOGNISED, SWITCH_SHARE, AngleUnit, count_jumps, find_turns
 from data_pipelines.tokens.row_sample import QUANTILES
 from hma_jax.model.embodiments import DEAD_STD
 
@@ -87,4 +87,4 @@ def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, 
 
 def _wraps(columns: list[np.ndarray], unit: AngleUnit) -> bool:
     low, high = np.array(min(c.min() for c in columns)), np.array(max(c.max() for c in columns))
-    return bool(find_turns(low, high, np.array(max(np.abs(np.diff(c)).max(initial=0) for c in columns)), unit))
+    return bool(find_turns(low, high, sum(count_jumps(c, unit) for c in columns), unit))

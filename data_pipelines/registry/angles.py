@@ -25,16 +25,26 @@ SWITCH_SHARE = 0.8
 """A value that takes one of two numbers in at least this share of the steps is a switch, and no angle."""
 
 
-def find_turns(low: np.ndarray, high: np.ndarray, jump: np.ndarray, unit: AngleUnit) -> np.ndarray:
+def count_jumps(actions: np.ndarray, unit: AngleUnit) -> np.ndarray:
+    """int64 [2, A]: how often each value of an episode's actions [N, A] changes by more than half a turn from a step to
+    the next, and by more than 0.9 of one."""
+    changes = np.abs(np.diff(actions, axis=0)) / TURN[unit]
+    return np.stack([(changes > 0.5).sum(0), (changes > 0.9).sum(0)])
+
+
+def find_turns(low: np.ndarray, high: np.ndarray, jumps: np.ndarray, unit: AngleUnit) -> np.ndarray:
     """bool [A]: which values stay within one turn, about 0 or from 0 on, and jump from one end of it to the other.
 
-    Of each value the smallest, the largest and the largest change from a step to the next.
+    `low`, `high` [A]: the smallest and the largest of each value; `jumps` [2, A]: the sum of `count_jumps` over
+    episodes. Noise of that range jumps by a whole turn too, but more often by less: what wraps moves by little or by
+    nearly a whole turn.
     """
     turn = TURN[unit]
     near = 0.002 * turn
     about_zero = (low > -turn / 2 - near) & (high < turn / 2 + near)
     from_zero = (low > -near) & (high < turn + near)
-    return (about_zero | from_zero) & (jump > 0.9 * turn)
+    large, whole = jumps
+    return (about_zero | from_zero) & (whole >= 2) & (2 * whole >= large)
 
 
 def angle_lines(values: Sequence[int], unit: AngleUnit) -> str:

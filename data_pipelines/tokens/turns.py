@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.registry.angles import RECOGNISED, SWITCH_SHARE, AngleUnit, angle_lines, find_turns
+from data_pipelines.registry.angles import RECOGNISED, SWITCH_SHARE, AngleUnit, angle_lines, count_jumps, find_turns
 
 EARLY = 64
 """Episodes after which is looked for the first time; the second is at the end."""
@@ -26,7 +26,8 @@ class TurnWatch:
     def __init__(self, spec: DatasetSpec, warn: Callable[[str], None]):
         self._spec, self._warn = spec, warn
         width = sum(spec.action_dims)
-        self._low, self._high, self._jump = np.full(width, np.inf), np.full(width, -np.inf), np.zeros(width)
+        self._low, self._high = np.full(width, np.inf), np.full(width, -np.inf)
+        self._jumps = {unit: np.zeros((2, width), np.int64) for unit in RECOGNISED}
         self._open = np.ones(width, bool)  # values of which nothing is known yet, neither by the entry nor by a warning
         self._open[list(spec.angles if spec.angle_form != "as_recorded" else ())] = False
         self._first: list[np.ndarray] = []
@@ -38,7 +39,8 @@ class TurnWatch:
             return
         self._low = np.minimum(self._low, actions.min(0))
         self._high = np.maximum(self._high, actions.max(0))
-        self._jump = np.maximum(self._jump, np.abs(np.diff(actions, axis=0)).max(0, initial=0))
+        for unit, jumps in self._jumps.items():
+            jumps += count_jumps(actions, unit)
         if self._steps < REMEMBERED:
             self._first.append(actions)
         self._steps, self._episodes = self._steps + len(actions), self._episodes + 1
@@ -47,8 +49,8 @@ class TurnWatch:
 
     def look(self) -> None:
         """Warns of what was found and not said before."""
-        for unit in RECOGNISED:
-            turning = self._open & find_turns(self._low, self._high, self._jump, unit)
+        for unit, jumps in self._jumps.items():
+            turning = self._open & find_turns(self._low, self._high, jumps, unit)
             found = [int(d) for d in np.flatnonzero(turning) if not self._is_switch(int(d))]
             if found:
                 self._open[found] = False

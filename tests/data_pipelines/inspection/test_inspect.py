@@ -363,7 +363,15 @@ def test_hints_name_what_the_numbers_look_like():
     assert hint(rng.normal(size=(200, 1))) == "delta"
     assert hint(walk) == "absolute"
     assert hint(5 + 0.1 * rng.normal(size=(200, 1))) == "absolute"
-    assert hint((walk + np.pi) % (2 * np.pi) - np.pi) == "wrapping angle"
+    assert hint((walk / 3 + np.pi) % (2 * np.pi) - np.pi) == "wrapping angle"
+
+
+@pytest.mark.parametrize("scale", [1.5, 2.5])
+def test_noise_that_is_clipped_within_a_turn_is_no_wrapping_angle(scale):
+    """Its smallest and largest values are a turn apart, and now and then follow each other."""
+    noise = np.clip(np.random.default_rng(0).normal(scale=scale, size=(5000, 1)), -3, 3)
+    assert np.abs(np.diff(noise, axis=0)).max() > 0.9 * 2 * np.pi
+    assert hint(noise) == "delta" and hint(np.degrees(noise)) == "delta"
 
 
 def test_constant_with_rounding_noise_is_dead():

@@ -109,7 +109,7 @@ def test_a_job_that_ends_early_tells_what_it_saw(tmp_path):
         if done:
             raise KeyboardInterrupt
 
-    directory, said = write_rlds(tmp_path, SPEC, [20] * 8, change=turn), []
+    directory, said = write_rlds(tmp_path, SPEC, [40] * 8, change=turn), []
     with pytest.raises(KeyboardInterrupt):
         tokenize_dataset(SPEC, directory, FakeTokenizer(), tmp_path / "told", warn=said.append, progress=stop)
     assert len(said) == 1 and "angles = [2]" in said[0]
