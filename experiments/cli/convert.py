@@ -13,7 +13,7 @@ from experiments.cli.command_line import Commands
 from experiments.presets import get_preset
 from experiments.progress import say
 from experiments.wrote import wrote
-from hma_jax.config import DecodeConfig, SamplerConfig, Weights
+from hma_jax.config import DecodeConfig, Dtype, SamplerConfig, Weights
 from hma_jax.config.evaluation import SamplerKind
 
 if TYPE_CHECKING:
@@ -159,6 +159,7 @@ def to_stablehlo(
     sampler_steps: Annotated[int | None, arg(name="sampler-steps"), _unless(PLAIN.sampler.steps)] = None,
     sampler: Annotated[SamplerKind | None, _unless(PLAIN.sampler.kind)] = None,
     platforms: tuple[Platform, ...] = ("cpu", "cuda", "tpu"),
+    dtype: Dtype = "float32",
     weights: Weights = "auto",
 ) -> None:
     """Export the generation of frames as a program that runs with JAX only, without this project.
@@ -171,12 +172,14 @@ def to_stablehlo(
         out: Directory to write: model.stablehlo, model.safetensors and model.json.
         batch: Clips at a time.
         prompt: Number of given frames.
-        frames: Total number of frames; those after the prompt are generated.
+        frames: Total number of frames; those after the prompt are generated. Past the model's window it slides as
+            RUN/decode.json's `slide` says, by default exact.
         unmask_steps: Unmasking steps per generated frame.
         temperature: 0 takes the most likely tokens, 1 samples from the model's distribution.
         sampler_steps: Steps of the diffusion sampler; no effect on discrete models.
         sampler: The diffusion sampler; dpm++ needs 8 to 12 steps.
         platforms: Platforms that the program can run on.
+        dtype: Number format of the computation. In bfloat16 the program reads half the bytes of weights.
         weights: last: the last weights; ema: their moving average; auto: the average if there is one.
     """
     from hma_jax.convert import ProgramConfig, require_free, write_stablehlo
@@ -188,7 +191,7 @@ def to_stablehlo(
     loaded = load_run(run, weights)
     frames = loaded.model.frames if frames is None else frames
     prompt = min(ProgramConfig.prompt, frames - 1) if prompt is None else prompt
-    config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
+    config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms), dtype)
     write_stablehlo(loaded, out, config)
     _describe(loaded)
     wrote(out, about=f"{out / 'model.json'} lists the program's inputs and outputs")

@@ -2,7 +2,7 @@
 
 model.stablehlo     `jax.export` bytes; jax.export.deserialize(bytes).call(weights, prompt, actions,
                     embodiment, key) -> new frames
-model.safetensors   the weights, name -> array
+model.safetensors   the weights, name -> array; without action heads, on which no frame depends
 model.json          every input and output, in the order of the program's arguments; and of which model, with its
                     provenance
 """
@@ -10,7 +10,7 @@ model.json          every input and output, in the order of the program's argume
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config import ConfigError, DecodeConfig, Dtype, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.config.json import to_dict, to_plain_json
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.neutral import describe_tensors
@@ -29,6 +29,7 @@ from hma_jax.generation import rollout
 from hma_jax.kernels.random import GENERATOR
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.model.params import inference_params
 from hma_jax.objective.masking import hidden_at_inference
 from hma_jax.training.runs import Run, require_frames
 
@@ -39,13 +40,15 @@ PROGRAM, WEIGHTS, DESCRIPTION = "model.stablehlo", "model.safetensors", "model.j
 
 @dataclass(frozen=True)
 class ProgramConfig:
-    """The fixed shapes of a program: `batch` examples are continued from `prompt` to `frames` frames."""
+    """The fixed shapes of a program: `batch` examples are continued from `prompt` to `frames` frames. Past the model's
+    window it slides, as `decode.slide` says."""
 
     batch: int = 1
     prompt: int = 4
     frames: int = 5
     decode: DecodeConfig = DecodeConfig()
     platforms: tuple[str, ...] = ("cpu", "cuda", "tpu")
+    dtype: Dtype = "float32"  # number format of the computation, and of the weights that are cast to it
 
     def __post_init__(self):
         require(self.batch >= 1, f"batch must be at least 1, got {self.batch}")
@@ -72,7 +75,7 @@ def generate_function(
     looked at.
     """
     # One program for every platform: none of them may be a single platform's own.
-    declared = declare_model(model, table, ExecutionConfig(attention="plain"))
+    declared = declare_model(model, table, ExecutionConfig(config.dtype, attention="plain"))
 
     def generate(weights, prompt, actions, embodiment, key):
         base = jax.random.wrap_key_data(key, impl=GENERATOR)
@@ -95,22 +98,22 @@ def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConf
 
 
 def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
-    """Raises ConfigError if `directory` exists, the model predicts no frames or they do not fit its window."""
+    """Raises ConfigError if `directory` exists or the model predicts no frames."""
     require_frames(run, "generate")
+    # Most parameters of a continuous model are action heads.
+    run = replace(run, model=replace(run.model, action_heads=False))
     model, table, masking = run.model, run.table, run.train.masking
-    require(
-        config.frames <= model.frames,
-        f"{config.frames} frames do not fit the model's window of {model.frames}",
-    )
-    leaves = declare_model(model, table).leaves()
-    weights = {path: jax.ShapeDtypeStruct(spec.shape, jnp.float32) for path, spec in leaves.items()}
+    declared, params = declare_model(model, table), flat(run.params)
+    read = nested({path: np.asarray(params[path]) for path in declared.leaves()})
+    arrays = flat(inference_params(declared, read, config.dtype))
+    weights = {path: jax.ShapeDtypeStruct(x.shape, x.dtype) for path, x in arrays.items()}
     inputs = input_shapes(model, table, config)
     with atomic_directory(directory) as temporary:
         program = jax.jit(generate_function(model, table, masking.setting, config))
         exported = export.export(program, platforms=config.platforms)(weights, *inputs.values())
         (temporary / PROGRAM).write_bytes(exported.serialize())
-        write_safetensors(temporary / WEIGHTS, {path: np.asarray(x) for path, x in flat(run.params).items()})
-        description = _describe(run, config, inputs, exported)
+        write_safetensors(temporary / WEIGHTS, arrays)
+        description = _describe(run, config, weights, inputs, exported)
         (temporary / DESCRIPTION).write_text(to_plain_json(description))
 
 
@@ -124,18 +127,22 @@ MEANINGS = {
 
 
 def _describe(
-    run: Run, config: ProgramConfig, inputs: dict[str, jax.ShapeDtypeStruct], exported: export.Exported
+    run: Run,
+    config: ProgramConfig,
+    weights: dict[str, jax.ShapeDtypeStruct],
+    inputs: dict[str, jax.ShapeDtypeStruct],
+    exported: export.Exported,
 ) -> dict[str, Any]:
-    tensors = describe_tensors(declare_model(run.model, run.table).leaves())
-
     def of_array(x: jax.ShapeDtypeStruct) -> dict[str, Any]:
         return {"shape": list(x.shape), "dtype": x.dtype.name}
 
-    order = [
-        {"name": f"weights/{name}", "shape": t["shape"], "dtype": "float32"} for name, t in sorted(tensors.items())
+    entries = {"embodiment": run.table.size} | ({} if run.model.diffusion else {"prompt": run.model.vocab_size})
+    ranges = {name: {"minimum": 0, "maximum": count - 1} for name, count in entries.items()}
+    order = [{"name": f"weights/{name}", **of_array(x)} for name, x in sorted(weights.items())]
+    order += [
+        {"name": name, **of_array(x), **ranges.get(name, {}), "meaning": MEANINGS[name]} for name, x in inputs.items()
     ]
-    order += [{"name": name, **of_array(x), "meaning": MEANINGS[name]} for name, x in inputs.items()]
-    if [tuple(i["shape"]) for i in order] != [a.shape for a in exported.in_avals]:
+    if [(tuple(i["shape"]), i["dtype"]) for i in order] != [(a.shape, a.dtype.name) for a in exported.in_avals]:
         raise ConfigError("the program's arguments are not in the order of their description")
     frames = {"name": "frames", **of_array(exported.out_avals[0]), "meaning": "the frames after the prompt"}
     return {
@@ -153,5 +160,5 @@ def _describe(
         "table": to_dict(run.table),
         "inputs": order,
         "outputs": [frames],
-        "tensors": tensors,
+        "tensors": describe_tensors(declare_model(run.model, run.table).leaves()),
     }

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, DecodeConfig, DiffusionConfig, MaskingConfig, SamplerConfig
+from hma_jax.config import ConfigError, DecodeConfig, DiffusionConfig, ExecutionConfig, MaskingConfig, SamplerConfig
 from hma_jax.convert import (
     ProgramConfig,
     read_neutral,
@@ -28,11 +30,14 @@ from hma_jax.convert.table import flat
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.generation import rollout
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import inference_params
 from hma_jax.training.runs import Run, load_run
 from hma_jax.training.train import train_model
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
 from tests.tiny import TABLE, batches, lively_params, model_config, random_batch, shallow_config, train_config
 
+PAGE = Path(__file__).parents[3] / "docs" / "checkpoints.md"
 DIFFUSION = DiffusionConfig(channels=2, patch=2, width=8, depth=1)
 
 
@@ -160,6 +165,11 @@ weights = load_file(f"{folder}/model.safetensors")
 given = np.load(f"{folder}/inputs.npz")
 names = [one["name"] for one in about["inputs"]]
 assert names == [f"weights/{name}" for name in sorted(weights)] + ["prompt", "actions", "embodiment", "key"]
+unread = {name for i, name in enumerate(names) if i not in program.module_kept_var_idx}
+assert unread <= {"weights/action_mask"}, unread
+for one in about["inputs"][:-4]:
+    array = weights[one["name"].removeprefix("weights/")]
+    assert list(array.shape) == one["shape"] and array.dtype == one["dtype"], one
 for one in about["inputs"][-4:]:
     assert list(given[one["name"]].shape) == one["shape"] and given[one["name"]].dtype == one["dtype"], one
 out = program.call(weights, *(given[name] for name in names[-4:]))
@@ -170,18 +180,24 @@ assert not [name for name in sys.modules if name.split(".")[0] in ("hma_jax", "e
 
 
 @pytest.mark.parametrize(
-    "changes, decode",
+    "changes, decode, frames, dtype",
     [
-        ({}, DecodeConfig(2, 1.0)),
-        pytest.param({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3)), marks=pytest.mark.slow),
+        ({}, DecodeConfig(2, 1.0), 4, "float32"),
+        ({}, DecodeConfig(2, 1.0, slide="streaming"), 7, "bfloat16"),
+        pytest.param(
+            {"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3)), 6, "float32",
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["discrete", "continuous"],
-)
-def test_the_program_generates_the_same_frames_where_this_project_is_not_installed(changes, decode, tmp_path):
-    run, config = small_run(**changes), ProgramConfig(batch=2, prompt=2, frames=4, decode=decode)
+    ids=["discrete", "past the window in bfloat16", "continuous, past the window"],
+)  # fmt: skip
+def test_the_program_generates_the_same_frames_where_this_project_is_not_installed(
+    changes, decode, frames, dtype, tmp_path
+):
+    run, config = small_run(**changes), ProgramConfig(batch=2, prompt=2, frames=frames, decode=decode, dtype=dtype)
     out = tmp_path / "out"
     write_stablehlo(run, out, config)
-    batch = random_batch(0, run.model, 2)
+    batch = random_batch(0, replace(run.model, frames=frames), 2)
     key = np.array([7, 11], np.uint32)
     given = {
         "prompt": batch["tokens"][:, :2],
@@ -197,15 +213,44 @@ def test_the_program_generates_the_same_frames_where_this_project_is_not_install
         3, "last", "forward", {"data": "random"},
     ]  # fmt: skip
 
-    declared = lively_params(run.model)[0]
+    declared = declare_model(run.model, TABLE, ExecutionConfig(dtype, attention="plain"))
     keys = jnp.stack([jax.random.fold_in(jax.random.wrap_key_data(key), row) for row in range(2)])
     args = (given["prompt"], batch["actions"][:, None], batch["embodiment"], keys, decode)
-    want = jax.jit(lambda p: rollout(declared.merge(p), *args))(run.params)[:, 0]
+    params = inference_params(declared, run.params, dtype)
+    want = jax.jit(lambda p: rollout(declared.merge(p), *args))(params)[:, 0]
     got = np.load(out / "frames.npy")
     if run.model.diffusion:
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4)
     else:
         np.testing.assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize(
+    ("zeros", "others"),
+    [
+        ('np.zeros(inputs["embodiment"]["shape"], np.int32)', 'np.full(inputs["embodiment"]["shape"], 3, np.int32)'),
+        ('np.zeros(inputs["prompt"]["shape"], np.int32)', 'np.full(inputs["prompt"]["shape"], 64, np.int32)'),
+    ],
+    ids=["robot", "id"],
+)
+def test_the_page_s_caller_of_a_program_refuses_robots_and_ids_that_there_are_not(zeros, others, program, monkeypatch):
+    """The program makes frames of them that look like others."""
+    (text,) = (one for one in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S) if "export" in one)
+    monkeypatch.chdir(program)
+    names: dict = {}
+    exec(text, names)
+    assert names["frames"].shape == (1, 1, 9)
+    assert text.count(zeros) == 1
+    with pytest.raises(AssertionError):
+        exec(text.replace(zeros, others), {})
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """Where `program` is what the page calls so."""
+    folder = tmp_path_factory.mktemp("page")
+    write_stablehlo(small_run(), folder / "program", ProgramConfig(prompt=3, frames=4, platforms=("cpu",)))
+    return folder
 
 
 @pytest.mark.slow
@@ -229,8 +274,6 @@ def test_a_program_shows_no_action_that_its_model_was_trained_without():
 
 
 def test_a_program_that_cannot_be_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="9 frames do not fit the model's window of 4"):
-        write_stablehlo(small_run(), tmp_path / "out", ProgramConfig(frames=9))
     policy = replace(small_run(), train=train_config(masking=MaskingConfig(setting="policy")))
     with pytest.raises(ConfigError, match="'policy', which predicts no frames"):
         write_stablehlo(policy, tmp_path / "out", ProgramConfig(prompt=2, frames=4))
