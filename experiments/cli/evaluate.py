@@ -70,14 +70,14 @@ def evaluate_model(
     be replaced."""
     from hma_jax.runtime.processes import is_writer
     from hma_jax.training.run_lock import EVALUATION, locked_run
-    from hma_jax.training.runs import cast_run, load_run
+    from hma_jax.training.runs import load_run
 
     require_local("--to", to)
     require(
         to is None or not (to / JOB).is_file(),
         f"--to {to} is the directory of a trial, whose results must not be changed; choose another --to",
     )
-    trained = cast_run(load_run(run, weights), setting.study.execution)  # not whole on one device
+    trained = load_run(run, weights)  # into memory of the host: it may be too large for one device
     # Before the work: its results can be written, and by no other process.
     with locked_run(to or run, EVALUATION) if is_writer() else nullcontext():
         _evaluate(setting, run, trained, to or run, replace)

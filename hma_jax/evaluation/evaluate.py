@@ -26,7 +26,7 @@ from hma_jax.evaluation.windows import WindowTable, join
 from hma_jax.model.embodiments import ActionUnits, EmbodimentTable
 from hma_jax.model.given import require_known
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import Params, require_params
+from hma_jax.model.params import Params, inference_params, require_params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.processes import compiled_by_all
@@ -88,6 +88,7 @@ def evaluate(
     evaluator = make_evaluator(model, known, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     declared = declare_model(model, known, execution)
     require_params(declared, params, "these parameters are not those of the model")
+    params = inference_params(declared, params, execution.dtype)  # once, and not in every pass
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
     metric_params, units = lay_out((metric_params, table.scale()), replicated(mesh))

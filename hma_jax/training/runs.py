@@ -196,11 +196,6 @@ def load_model(run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig
     `weights` are the last ones, their moving average (`ema`), or the average where the run keeps one
     (`auto`). Raises as `load_run`.
     """
-    run = cast_run(load_run(run_dir, weights), execution)
-    return _rebuild(replace(run, params=jax.device_put(run.params, default_device())), execution)
-
-
-def cast_run(run: Run, execution: ExecutionConfig) -> Run:
-    """`run` with its parameters as generation and evaluation use them, where they lie."""
-    declared = declare_model(run.model, run.table, execution)
-    return replace(run, params=inference_params(declared, run.params, execution.dtype))
+    run = load_run(run_dir, weights)
+    params = inference_params(declare_model(run.model, run.table, execution), run.params, execution.dtype)
+    return _rebuild(replace(run, params=jax.device_put(params, default_device())), execution)

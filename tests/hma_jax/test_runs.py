@@ -27,7 +27,7 @@ from hma_jax.training import reading, runs
 from hma_jax.training.hashes import ReadError
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
-from hma_jax.training.runs import cast_run, describe_run, load_model, load_run, modernise
+from hma_jax.training.runs import describe_run, load_model, load_run, modernise
 from hma_jax.training.train import train_model
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, lively_params, model_config, train_config
 
@@ -205,7 +205,7 @@ def test_loading_a_model_does_not_read_the_moments(averaged, tmp_path: Path):
 def test_a_run_is_read_into_memory_of_the_host(averaged):
     """One device may be too small for a model that trains split over several."""
     with jax.transfer_guard("disallow_explicit"):
-        run = cast_run(load_run(averaged[0]), ExecutionConfig(dtype="bfloat16"))
+        run = load_run(averaged[0])
     assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(run.params))
 
 

@@ -20,6 +20,7 @@ from hma_jax.generation import next_frame_outputs, rollout
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Params, inference_params
 from hma_jax.model.readout import choose_likeliest
 from hma_jax.training.adapt import add_embodiments
 from tests.hma_jax.evaluation.fakes import SIZE, GreyTokenizer, make_batches
@@ -28,6 +29,7 @@ from tests.tiny import DIFFUSION, TABLE, lively_params, shallow_config
 DECODE = DecodeConfig(2, temperature=0.5, sampler=SamplerConfig(steps=3))  # every kind of random number is drawn
 EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=3, other_actions=2)
 CONFIG = shallow_config()
+FOUND = {"finite": np.ones(4, bool)}  # what an evaluator that computes nothing finds in four windows
 TOKENIZER = GreyTokenizer()  # one for all: an evaluator is compiled for a tokenizer
 
 
@@ -70,8 +72,7 @@ def test_batches_that_are_not_as_they_should_be_are_refused(params, changes, mes
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
     changed = {name: np.full_like(batch[name], value) for name, value in changes.items() if value is not None}
     given = {name: x for name, x in (batch | changed).items() if changes.get(name, 0) is not None}
-    found = {"finite": np.ones(4, bool)}
-    monkeypatch.setattr(module, "make_evaluator", lambda *_: lambda *_: (found, None))
+    monkeypatch.setattr(module, "make_evaluator", lambda *_: lambda *_: (FOUND, None))
     with pytest.raises(ConfigError, match=message):
         evaluate(params, CONFIG, TABLE, TOKENIZER, [given], EVAL)
 
@@ -79,6 +80,17 @@ def test_batches_that_are_not_as_they_should_be_are_refused(params, changes, mes
 def test_parameters_of_another_model_are_not_evaluated(params):
     with pytest.raises(ConfigError, match="these parameters are not those of the model: .* should be"):
         evaluate({}, CONFIG, TABLE, TOKENIZER, [], EVAL)
+
+
+def test_parameters_are_cast_once_not_in_every_pass(params, monkeypatch):
+    """A trial's are those of training, in float32: forty robots' matrices were cast in each pass of a rollout."""
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    given: list[Params] = []
+    monkeypatch.setattr(module, "make_evaluator", lambda *_: lambda weights, *_: given.append(weights) or (FOUND, None))
+    evaluate(params, CONFIG, TABLE, TOKENIZER, [batch], EVAL, execution=ExecutionConfig(dtype="bfloat16"))
+    want = inference_params(declare_model(CONFIG, TABLE), params, "bfloat16")
+    assert jax.tree.map(lambda x: x.dtype, given[0]) == jax.tree.map(lambda x: x.dtype, want)
+    assert given[0]["trunk"]["blocks"]["mlp_in"]["kernel"].dtype == "bfloat16"
 
 
 def test_images_are_compared_as_the_host_would(params):
