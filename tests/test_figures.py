@@ -243,7 +243,12 @@ def test_plans_in_each_model_are_as_their_page_says():
     assert (ROOT / "experiments/results/planning_grown/table.md").read_text().strip() in page.read_text()
     served = planned("planning_grown")
     for label, cells in table(page, "| model | CEM |").items():
-        rows = planned(MODELS[label.split(" ([")[0]])
+        name = MODELS[label.split(" ([")[0]]
+        rows, settings = planned(name), json.loads((ROOT / "experiments/results" / name / "settings.json").read_text())
+        decoding = label.rsplit(", ", 1)[1]  # rows of other decoding are not compared unawares
+        assert decoding in ("greedy", "sampled at 0.7")
+        if "simulator" in settings:
+            assert (settings["simulator"]["decode"]["temperature"] == 0) == (decoding == "greedy")
         assert all(rows[way] == served[way] for way in rows if not way.endswith("in the model"))
         for way, cell in zip(("CEM", "MPPI", "random shooting"), cells, strict=True):
             mean, low, high = (float(rows[f"{way} in the model"][key]) for key in ("mean", "low", "high"))

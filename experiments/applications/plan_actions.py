@@ -42,7 +42,7 @@ from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
 from experiments.applications.planning.goals import goal_image_cost
-from experiments.applications.planning.models import CONTEXT, LearnedModel, Model, TrueModel
+from experiments.applications.planning.models import LearnedModel, Model, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
 from experiments.applications.planning.search import SearchConfig
 from experiments.applications.planning.shooting import plan_shooting
@@ -63,6 +63,7 @@ from hma_jax.config import require
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_decode
 from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
 
 OUT = Path("runs/planning")
 
@@ -90,6 +91,7 @@ class Settings:
     skip: int = 0  # starts of the task before the first that is taken: others than an earlier run's
     execute: int = 2  # frames from one plan to the next
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
+    temperature: float = 0.0  # at which tokens are sampled, whatever the run's decode.json says; 0: greedy decoding
     search: SearchConfig = field(default_factory=SearchConfig)
     steps: int = 2000  # of training of the cloned policies
     batch: int = 32
@@ -143,20 +145,22 @@ def pinned(settings: Settings, stride: int) -> dict[str, Any]:
     return asdict(settings) | more
 
 
-def run_planner(search: Search, model: Model, robot: Robot, settings: Settings, seed: int, size: int) -> dict:
+def run_planner(way: str, simulator: Simulator, robot: Robot, settings: Settings, seed: int) -> dict:
     """One episode, until it is decided: {success, distance then, seconds of a plan}."""
     task, environment = settings.make_task(), Environment(settings.make_task().spec)
     environment.reset(seed)
+    (search, where), size, short = PLANNERS[way], simulator.tokenizer.image_size, seed % 2**32
+    model: Model = TrueModel(task.spec, robot, size)
+    if where == "learned":
+        model = LearnedModel(simulator, robot, short)
     cost = goal_image_cost(goal_image(task, seed, size, robot.stride))
-    planner = Planner(search, settings.search, model, robot, cost, seed % 2**32)
+    planner = Planner(search, settings.search, model, robot, cost, short)
     images, actions, reached, seconds = [fit_image(environment.render(), size)], [], [environment.success()], []
     remaining: list[np.ndarray] = []
     while not decided(reached, task):
         if not remaining:
             began = time.perf_counter()
-            model.observe(
-                images[-CONTEXT:], actions[len(actions) + 1 - min(len(images), CONTEXT) :], environment.get_state()
-            )
+            model.observe(images, actions, environment.get_state())
             remaining = list(planner.plan(settings.execute))
             seconds.append(time.perf_counter() - began)
         actions.append(remaining.pop(0))
@@ -273,17 +277,19 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=SearchConfig.candidates)
     parser.add_argument("--iterations", type=int, default=SearchConfig.iterations)
     parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
+    parser.add_argument(
+        "--temperature", type=float, default=Settings.temperature, help="at which tokens are sampled; 0: greedy"
+    )
     args = vars(parser.parse_args())
     run, out, wanted = args.pop("run"), args.pop("out"), args.pop("ways")
     fewest = SearchConfig.elites  # whom CEM draws around
     require(args["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {args['candidates']}")
     search = SearchConfig(candidates=args.pop("candidates"), iterations=args.pop("iterations"))
     settings = Settings(search=search, **args)
-    decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)
+    decode = replace(find_decode(run), unmask_steps=settings.unmask_steps, temperature=settings.temperature)
     simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = settings.start_seeds()
-    models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
     pin_settings(out, run, simulator, pinned(settings, robot.stride))
     (out / "trials").mkdir(exist_ok=True)
     places = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
@@ -306,9 +312,9 @@ def main() -> None:
         with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
             for k, seed in enumerate(seeds.tolist()):
                 for way in planners:
-                    path, (search_by, where) = places[way][k], PLANNERS[way]
+                    path = places[way][k]
                     if not path.exists():
-                        write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
+                        write_file(path, json.dumps(run_planner(way, simulator, robot, settings, seed)))
                     trials[way].append(json.loads(path.read_text()))
                 update(k + 1, len(seeds), f"starts{eta(k + 1, len(seeds))}")
     write_results({name: trials[name] for name in WAYS if name in trials}, out)

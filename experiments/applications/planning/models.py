@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -13,12 +14,15 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
 from experiments.applications.simulators import START_FRAMES
+from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 CONTEXT = START_FRAMES
 """Frames that a rollout is conditioned on."""
+
+log = logging.getLogger(__name__)
 
 
 class Model(Protocol):
@@ -38,21 +42,41 @@ class Model(Protocol):
 class LearnedModel:
     """A simulator of B episodes, all of them copies of one that has seen the last `CONTEXT` frames.
 
-    All candidates use the same seed (common random numbers), so that they differ by their actions alone. The seed
-    depends on the number of frames alone, so that a plan is a function of what was observed.
+    All candidates use the same random numbers, so that they differ by their actions alone. Where tokens or latents are
+    sampled, these numbers are a function of `seed`, which is the episode's, and of the number of frames observed.
+    Greedy decoding draws only the order in which tokens are unmasked: it is the same in all episodes and searches.
     """
 
-    def __init__(self, simulator: Simulator, robot: Robot):
-        self._simulator, self._robot = simulator, robot
+    def __init__(self, simulator: Simulator, robot: Robot, seed: int = 0):
+        self._simulator, self._robot, self._seed = simulator, robot, seed
+        self._greedy = not simulator.tokenizer.channels and simulator.decode.temperature == 0
         self._present = None
+        self._warned = False
 
     def observe(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State | None) -> None:
+        """As in `Model`. Warns once of actions that lie outside the robot's range; they are used as they are. Raises
+        ConfigError unless there is an action between each two images."""
         del state
+        require(
+            len(images) == len(actions) + 1,
+            f"{len(images)} images with {len(actions)} actions between them: there must be an action between each two "
+            "images, so one fewer than images",
+        )
         seen = np.stack(images[-CONTEXT:])
         chunks = [self._robot.chunk(action) for action in actions[len(actions) + 1 - len(seen) :]]
         between = np.concatenate(chunks) if chunks else np.zeros((0, self._robot.action_dim), np.float32)
-        self._simulator.reset(Start(self._robot.name, seen, between), seeds=[len(images)] * len(self._simulator))
+        self._warn_once(between)
+        drawn = int(np.random.default_rng([self._seed, len(images)]).integers(2**32))
+        seed = len(seen) if self._greedy else drawn
+        self._simulator.reset(Start(self._robot.name, seen, between), seeds=[seed] * len(self._simulator))
         self._present = self._simulator.snapshot()
+
+    def _warn_once(self, observed: np.ndarray) -> None:
+        _, beyond = self._robot.clip_to_range(observed, "clip")
+        if beyond.any() and not self._warned:
+            self._warned = True
+            said = self._robot.describe(beyond, observed)
+            log.warning("%s: observed %s; are these its raw units? (this is said once)", self._robot.name, said)
 
     def imagine(self, actions: np.ndarray) -> np.ndarray:
         self._simulator.restore(self._present)

@@ -81,10 +81,10 @@ def draw(rng: np.random.Generator, mean: np.ndarray, std: np.ndarray, count: int
 
 def warm_start(plan: np.ndarray, config: SearchConfig, frames: int) -> np.ndarray:
     """The warm start of the next search after the first `frames` of `plan` [K, A] were executed: the rest of it, then
-    its last action repeated."""
-    each = np.repeat(plan, config.hold, axis=0)
+    its last action repeated, each action the mean of the frames that it is held for."""
+    each = repeat_knots(plan, config)
     rest = np.concatenate([each[frames:], np.repeat(each[-1:], frames, 0)])[: config.frames]
-    return rest[:: config.hold]
+    return rest.reshape(config.knots, config.hold, -1).mean(1)
 
 
 def repeat_knots(plans: np.ndarray, config: SearchConfig) -> np.ndarray:

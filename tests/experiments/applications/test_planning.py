@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +24,8 @@ from experiments.applications.planning.search import SearchConfig, SearchResult,
 from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.closed_loop import start_seeds
 from experiments.applications.policies.tasks import find_task
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.simulator.folder import DECODE, save_decode
 from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, simulator
@@ -89,6 +92,8 @@ def test_the_next_search_begins_with_what_is_left_of_the_plan():
     plan = np.array([[1.0], [2.0], [3.0]])
     np.testing.assert_array_equal(warm_start(plan, CONFIG, 2), [[2.0], [3.0], [3.0]])
     np.testing.assert_array_equal(warm_start(plan, CONFIG, 6), [[3.0], [3.0], [3.0]])
+    np.testing.assert_array_equal(warm_start(plan, CONFIG, 1), [[1.5], [2.5], [3.0]])  # of 1 2 2 3 3 3
+    np.testing.assert_array_equal(warm_start(plan, CONFIG, 3), [[2.5], [3.0], [3.0]])
     np.testing.assert_array_equal(repeat_knots(plan, CONFIG)[:, 0], [1, 1, 2, 2, 3, 3])
 
 
@@ -187,26 +192,64 @@ def test_the_learned_model_imagines_again_from_the_same_present():
 
 
 class Recorder:
-    """A simulator of two episodes that keeps what it was reset to."""
+    """A simulator of two episodes that keeps what it was reset to, and shows black images."""
+
+    def __init__(self, temperature: float = 0.7):
+        self.decode, self.asked = DecodeConfig(temperature=temperature), []
+        self.tokenizer = SimpleNamespace(channels=0, image_size=32)
 
     def __len__(self) -> int:
         return 2
 
     def reset(self, start, seeds):
-        self.start, self.seeds = start, seeds
+        self.start = start
+        self.asked.append(seeds)
 
     def snapshot(self):
         return None
+
+    def restore(self, snapshot):
+        pass
+
+    def step(self, actions):
+        return np.zeros((len(actions), 32, 32, 3), np.uint8)
 
 
 def test_the_learned_model_begins_with_the_newest_frames_and_the_actions_between_them():
     recorder, robot = Recorder(), Robot("r", 2, (-9.0,), (9.0,), (0.0,))
     images, actions = list(np.arange(5, dtype=np.uint8)[:, None, None, None]), [np.array([float(i)]) for i in range(4)]
     LearnedModel(recorder, robot).observe(images, actions, None)
-    assert recorder.start.images.ravel().tolist() == [2, 3, 4] and recorder.seeds == [5, 5]
+    assert recorder.start.images.ravel().tolist() == [2, 3, 4]
     assert recorder.start.actions.ravel().tolist() == [2, 2, 3, 3]
     LearnedModel(recorder, robot).observe(images[:1], [], None)
     assert recorder.start.images.ravel().tolist() == [0] and recorder.start.actions.shape == (0, 1)
+    for count in (3, 5):  # the last ones would be taken for those between the last images
+        with pytest.raises(ConfigError, match=f"5 images with {count} actions between them: .*one fewer than images"):
+            LearnedModel(recorder, robot).observe(images, [np.zeros(1)] * count, None)
+
+
+def test_observed_actions_outside_the_range_are_said_once(caplog):
+    model, images = (
+        LearnedModel(Recorder(), Robot("r", 1, (-9.0,), (9.0,), (0.0,))),
+        list(np.zeros((2, 1, 1, 3), np.uint8)),
+    )
+    model.observe(images, [np.array([9.0])], None)
+    assert not caplog.text
+    for _ in range(2):
+        model.observe(images, [np.array([99.0])], None)
+    assert caplog.text.count("r: observed action 0 of 99 to 99 is outside the range") == 1
+
+
+@pytest.mark.parametrize("temperature", [0.7, 0.0])
+def test_every_search_and_every_start_samples_with_its_own_numbers(temperature):
+    """A greedy model is one function of frames and actions, the order of unmasking included."""
+    simulator, robot = Recorder(temperature), Robot("pusher_sand", 1, (-8.8, -8.8), (8.8, 8.8), (0.0, 0.0))
+    settings = Settings(frames=11, hold=6, search=SearchConfig(candidates=4, iterations=1))
+    for seed in start_seeds(settings.make_task(), 2).tolist():
+        plan_actions.run_planner("MPPI in the model", simulator, robot, settings, seed)
+    shared = [seeds[0] for seeds in simulator.asked]
+    assert [seeds == seeds[:1] * 2 for seeds in simulator.asked] == [True] * len(shared) and len(shared) >= 4
+    assert len(set(shared)) == (len(shared) if temperature else 2)
 
 
 def test_the_picture_of_the_goal_is_of_an_expert_that_had_the_time_of_two_episodes():
@@ -253,3 +296,18 @@ def test_ways_that_were_tried_before_stay_in_the_table(tmp_path, monkeypatch):
         monkeypatch.setattr(sys, "argv", ["plan_actions", str(run), "--starts", "2", "--out", str(out), "--ways", way])
         plan_actions.main()
     assert set(plan_actions.read_trials(out / "trials.csv")) == set(tried)
+
+
+def test_models_are_planned_in_at_one_temperature_whatever_their_own(tmp_path, monkeypatch):
+    """One sampled and one greedy model stood in one table, and nothing said so."""
+    monkeypatch.setattr(plan_actions, "run_cloned", lambda *_: [{"success": True, "distance": 0.0, "seconds": 0.0}])
+    found = []
+    for name, own, asked in (("a", 0.7, []), ("b", 0.0, []), ("c", 0.0, ["--temperature", "0.5"])):
+        run, out = make_run(tmp_path / name), tmp_path / name / "out"
+        save_decode(DecodeConfig(8, own), run / DECODE)
+        ways = ["--starts", "1", "--ways", "random actions"]
+        monkeypatch.setattr(sys, "argv", ["plan_actions", str(run), "--out", str(out), *ways, *asked])
+        plan_actions.main()
+        said = json.loads((out / "settings.json").read_text())
+        found.append((said["temperature"], said["simulator"]["decode"]["temperature"]))
+    assert found == [(0, 0), (0, 0), (0.5, 0.5)]
