@@ -10,8 +10,9 @@ The 100 trajectories are an expert's, from starts that the world model never saw
 recorded; of the others the actions are kept, and replayed from their own first frame in the learned simulator. Policies
 are trained on what it shows, not on that frame. Control: the same simulator under another trajectory's actions, so that
 pictures and actions do not belong together. With --without-actions RUN there is a second control, what a model
-generates that was trained on the same video without actions (`--set train.masking.setting=passive`). All policies are
-trained alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
+generates that was trained on the same video without actions (`--set train.masking.setting=passive`), decoded as the
+first model. All policies are trained alike (behaviour cloning, as many steps), and judged from the same starts in the
+true simulator.
 
 The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations. With --actions
 DATASET the trajectories are recordings of a robot that no simulator judges (the paper's Language Table): policies are
@@ -82,9 +83,10 @@ from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.setting import use_entries
 from experiments.wrote import wrote
-from hma_jax.config import require
+from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.files import write_file
+from hma_jax.simulator.folder import find_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
@@ -223,7 +225,9 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
     """The source of demonstrations that the arguments name. Raises ConfigError for options of the other kind of
     source."""
     seeds = tuple(range(args.seeds))
-    training = Training(seeds=seeds, steps=args.steps, given=args.given, with_given=args.with_given)
+    training = Training(
+        seeds=seeds, steps=args.steps, given=args.given, with_given=args.with_given, temperature=args.temperature
+    )
     scripted, recorded = (
         {name: value for name in names if (value := getattr(args, name)) is not None}
         for names in (("task", "frames", "starts"), ("split", "held_out", "registry"))
@@ -245,9 +249,9 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
     return RecordedSource(training, driven, trained_on, held_out)
 
 
-def load_passive(run: Path, robot: Robot) -> Simulator:
+def load_passive(run: Path, robot: Robot, decode: DecodeConfig) -> Simulator:
     """The simulator of a model that was trained without actions (passive). Raises ConfigError for another one."""
-    passive = load_simulator(run, own_starts=True, episodes=BATCH, history=1)
+    passive = load_simulator(run, own_starts=True, episodes=BATCH, decode=decode, history=1)
     setting = passive.model.run.train.masking.setting
     require(
         setting == "passive", f"{run} was trained with train.masking.setting={setting}, not without actions (passive)"
@@ -273,11 +277,15 @@ def main() -> None:
     parser.add_argument("--given", type=int, default=Training.given, help="recorded frames that others begin with")
     parser.add_argument("--with-given", action="store_true", help="train on these, too")
     parser.add_argument(
+        "--temperature", type=float, default=Training.temperature, help="at which tokens are sampled; 0: greedy"
+    )
+    parser.add_argument(
         "--without-actions", type=Path, metavar="RUN", help="second control: of the same video, trained without actions"
     )
     args = parser.parse_args()
     run, out = args.run, args.out
-    simulator = load_simulator(run, own_starts=True, episodes=BATCH, history=1)
+    decode = replace(find_decode(run), temperature=args.temperature)
+    simulator = load_simulator(run, own_starts=True, episodes=BATCH, decode=decode, history=1)
     source = make_source(args, simulator)  # a mistyped name claims nothing
     second = out / SECOND
     require(
@@ -285,11 +293,12 @@ def main() -> None:
         f"{second} shows that --out already has policies of a model without actions: give --without-actions again, or "
         "another --out",
     )
-    settings, passive = source.settings, args.without_actions and load_passive(args.without_actions, source.robot)
+    settings, without = source.settings, args.without_actions
+    passive = without and load_passive(without, source.robot, simulator.decode)
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
     pin_settings(out, run, simulator, asdict(settings), may_differ=("seeds",))
     if passive:
-        pin_settings(out, args.without_actions, passive, {}, file=SECOND)
+        pin_settings(out, without, passive, {}, file=SECOND)
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
     data = make_data(source, simulator, out, passive)

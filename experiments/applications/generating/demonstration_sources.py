@@ -30,6 +30,7 @@ class Training:
     learning_rate: float = 2e-3
     given: int = 1  # recorded frames that a generated trajectory begins with
     with_given: bool = False  # policies are trained on these, too
+    temperature: float = 0.0  # at which tokens are sampled, whatever a run's decode.json says; 0: greedy decoding
 
     def __post_init__(self) -> None:
         """Raises ConfigError."""

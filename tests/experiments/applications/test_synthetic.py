@@ -41,8 +41,9 @@ from experiments.applications.policies.tasks import find_task
 from experiments.applications.settings_file import hash_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
-from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
+from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.config.json import from_dict
+from hma_jax.simulator.folder import DECODE, save_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_model
 from tests.experiments.applications.runs import TABLE, make_run
@@ -195,9 +196,9 @@ def test_the_second_control_is_a_model_without_actions_which_shows_the_same_unde
     run = make_run(tmp_path / "study")
     robot = load_simulator(run, history=1).robot("pusher_sand")
     with pytest.raises(ConfigError, match="setting=forward, not without actions"):
-        synthetic.load_passive(run, robot)
+        synthetic.load_passive(run, robot, DecodeConfig())
     passive = make_run(tmp_path / "passive", TrainConfig(masking=MaskingConfig(setting="passive")))
-    blind, rng, ones = synthetic.load_passive(passive, robot), np.random.default_rng(0), np.ones(2, int)
+    blind, rng, ones = synthetic.load_passive(passive, robot, DecodeConfig()), np.random.default_rng(0), np.ones(2, int)
     images, acted = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8), rng.uniform(-1, 1, (2, 4, 2)).astype(np.float32)
     demos = Demonstrations(images, acted, 4 * ones, np.ones((2, 4), bool), ones > 0, ones)
     shown = [
@@ -206,6 +207,24 @@ def test_the_second_control_is_a_model_without_actions_which_shows_the_same_unde
     ]
     np.testing.assert_array_equal(*shown)
     assert (shown[0][:, 1:] != images[:, 1:]).any()
+
+
+def test_the_second_control_is_decoded_as_the_model_that_it_controls(tmp_path, monkeypatch):
+    """A model with actions was sampled, as its decode.json said, and the one without, which had none, was greedy."""
+    run, out = make_run(tmp_path / "study"), tmp_path / "out"
+    passive = make_run(tmp_path / "passive", TrainConfig(masking=MaskingConfig(setting="passive")))
+    for where, decode in ((run, DecodeConfig(8, 0.7)), (passive, DecodeConfig(3, 0.2))):
+        save_decode(decode, where / DECODE)
+    monkeypatch.setattr(synthetic, "BcConfig", partial(BcConfig, encoder=EncoderConfig(size=8, channels=(4, 4, 4))))
+    made = []
+    monkeypatch.setattr(synthetic, "make_data", lambda *given: made.append((given[1].decode, given[3].decode)) or 1 / 0)
+    for asked in ([], ["--temperature", "0.5"]):
+        place = ["--out", str(out / str(len(made)))]
+        monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--without-actions", str(passive), *place, *asked])
+        with pytest.raises(ZeroDivisionError):
+            synthetic.main()
+    assert made == [(DecodeConfig(8, t, sampler=made[0][0].sampler),) * 2 for t in (0.0, 0.5)]
+    assert json.loads((out / "1/settings.json").read_text())["temperature"] == 0.5
 
 
 def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(recordings, tmp_path, monkeypatch):
