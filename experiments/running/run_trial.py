@@ -155,12 +155,13 @@ def validation_batches(
     this process's rows."""
     from data_pipelines.windows.evalset import eval_batches
     from hma_jax.runtime.rows import own_rows
+    from hma_jax.training.step import TRAINING_ARRAYS
 
     batch = trial.train.batch
     own, some = own_rows(execution.mesh, batch), prepared.manifest.subsampled(batch)
     for name in trial.evaluated:  # one without windows has no batch
         for whole in eval_batches(prepared.store, table, some, batch, (name,)):
-            yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
+            yield {key: whole[key][own] for key in (*TRAINING_ARRAYS, "valid") if key in whole}
 
 
 def evaluate_on(

@@ -22,14 +22,13 @@ import numpy as np
 from scipy.special import ndtri, stdtr  # not scipy.stats, which takes most of a second to import
 
 from hma_jax.config import ExecutionConfig, ModelConfig, Setting, require
-from hma_jax.evaluation.metrics import factored_cross_entropy, mean_over_frames
+from hma_jax.evaluation.likelihood import window_loss
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.generation import next_frame_outputs
 from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
-from hma_jax.objective.losses import frame_diffusion_loss
 from hma_jax.objective.masking import hidden_at_inference
 
 Kind = Literal["still", "negated", "scaled", "swapped"]
@@ -180,11 +179,8 @@ def make_loss(
         real_from_1 = None if real is None else real[:, 1 : model.frames]
         hidden = hidden_at_inference(table, setting, batch["embodiment"], model.frames)
         token_outputs = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
-        if model.diffusion:
-            keys = jax.vmap(key_of)(jnp.arange(len(tokens)))  # common noise under all changes
-            return mean_over_frames(frame_diffusion_loss(hma, token_outputs, tokens[:, 1:], keys), real_from_1)
-        return mean_over_frames(
-            factored_cross_entropy(hma.logits(token_outputs, tokens[:, 1:]), tokens[:, 1:]), real_from_1
-        )
+        # Common noise under all changes.
+        key_B = jax.vmap(key_of)(jnp.arange(len(tokens))) if model.diffusion else None
+        return window_loss(hma, token_outputs, tokens[:, 1:], key_B, real_from_1)
 
     return loss

@@ -39,14 +39,14 @@ from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, re
 from hma_jax.config.training import PREDICT_ACTIONS, PREDICT_FRAMES
 from hma_jax.evaluation.controllability import action_metrics, for_each_sequence
 from hma_jax.evaluation.draws import Purpose, random_actions, table_statistics, window_keys
-from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
+from hma_jax.evaluation.likelihood import window_loss
+from hma_jax.evaluation.metrics import last_frames, mean_over_frames
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
 from hma_jax.model.embodiments import ActionUnits, EmbodimentTable, normalise
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
 from hma_jax.model.readout import choose_likeliest
-from hma_jax.objective.losses import frame_diffusion_loss
 from hma_jax.objective.masking import followed, hidden_at_inference
 
 Batch = dict[str, jax.Array]
@@ -253,10 +253,10 @@ def _likelihood(
     accuracy is that of the likeliest ids of the wholly masked frame; the release's is that of the ids after all
     unmasking steps (reference section 6.3)."""
     if model.config.diffusion:
-        loss = mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)
+        loss = window_loss(model, out, truth, key_B, real_BT)
         return {"diffusion_loss": loss, "finite": jnp.isfinite(loss)}
     guess = compose(model.frame_head.decode_factors(out, choose_likeliest)[0], model.config.factor_vocab)
-    loss = mean_over_frames(factored_cross_entropy(model.logits(out, truth), truth), real_BT)
+    loss = window_loss(model, out, truth, None, real_BT)
     accuracy = mean_over_frames((guess == truth).astype(jnp.float32), real_BT)
     return {"cross_entropy": loss, "accuracy": accuracy, "finite": jnp.isfinite(loss)}
 

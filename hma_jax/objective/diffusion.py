@@ -150,8 +150,8 @@ def run_sampler(
     )
     step = sampler_step(network, noise_at, process, sampler, clip)
     x = jnp.asarray(noise_init, jnp.float32) * (sampler.temperature if sampler.scale_initial_noise else 1.0)
-    indices = jnp.arange(process.steps - 1, -1, -1)
-    (x, _), _ = jax.lax.scan(lambda carry, index: (step(carry, index), None), (x, jnp.zeros_like(x)), indices)
+    start, indices = (x, jnp.zeros_like(x)), jnp.arange(process.steps - 1, -1, -1)
+    (x, _), _ = jax.lax.scan(lambda carry, index: (step(carry, index), None), start, indices)
     return x
 
 

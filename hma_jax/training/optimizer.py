@@ -257,15 +257,6 @@ def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active, pl
     return AdamState(first, second, new.count, count_E)
 
 
-def only_per_robot(grads: Params, specs: Params, trained_E: jax.Array) -> Params:
-    """Gradients of the `trained_E` robots' own parameters; zero for everything else."""
-
-    def keep(g: jax.Array, spec: ParamSpec) -> jax.Array:
-        return jnp.zeros_like(g) if spec.embodiment_axis is None else g * spec.along_robots(trained_E).astype(g.dtype)
-
-    return jax.tree.map(keep, grads, specs)
-
-
 def _entry_of(spec: ParamSpec, shared: dict[Use, jax.Array], robots_E: dict[Use, jax.Array]) -> jax.Array:
     """A parameter's entry of two tables by use: of what all robots share, and of each robot's own."""
     return shared[spec.use] if spec.embodiment_axis is None else spec.along_robots(robots_E[spec.use])

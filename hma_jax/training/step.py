@@ -27,18 +27,21 @@ from hma_jax.training.optimizer import (
     clip_by_global_norm,
     learning_rate_multiplier,
     make_schedule,
-    only_per_robot,
     put_adam,
     take_adam,
 )
 from hma_jax.training.state import FINITE, TrainState, all_finite
-from hma_jax.training.train_only import pick_own, places_among, put_own
+from hma_jax.training.train_only import Everything, OwnOnly
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
 embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end; perhaps seed
 uint32 [2], not the number but the `jax.random.key_data` of its key (`key_of`), so that runs of other seeds are one
 program."""
+
+
+TRAINING_ARRAYS = ("tokens", "actions", "embodiment", "real")
+"""Arrays of a batch that training and validation look at."""
 
 
 def make_train_step(
@@ -50,56 +53,13 @@ def make_train_step(
     its hidden actions, whatever the number of micro-batches. Randomness is fold_in(seed, step),
     then the example's row.
     """
-    check_micro_batches(config.batch, accumulate)
-    check_schedule(config.optimizer, config.steps)
-    schedule = make_schedule(config.optimizer, config.steps)
-    masking = config.masking
-    check_objective(model, masking)
-    multipliers = jax.tree.map(lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec)
-    specs = declared.specs
     trained_E = np.array([name in (config.only or table.names) for name in table.names])
-    require(
-        not set(config.only) - set(table.names),
-        f"train.only names {', '.join(config.only)}, but the robots are {', '.join(table.names)}",
-    )
-    learning = [entry for entry, trained in zip(table.entries, trained_E, strict=True) if trained]
-    check_targets(learning, masking)
-    if config.only:
-        check_own(learning, masking)
-    places_E = places_among(trained_E)
-
-    def trained(tree: Params) -> Params:
-        """The entries of what is trained, of which alone there are moments."""
-        return pick_own(tree, specs) if config.only else tree
-
-    def sums(params: Any, batch: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
-        model = declared.merge(params)
-        result = masked_loss(
-            model,
-            batch["masked"],
-            batch["tokens"],
-            batch["actions"],
-            batch["embodiment"],
-            masking,
-            batch["key"],
-            batch["slice"],
-            batch.get("real"),
-        )
-        loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
-        return loss, result
-
-    def accumulated(params: Any, batch: Batch, counts: TargetCounts) -> tuple[Any, LossSums]:
-        gradient = jax.grad(sums, has_aux=True)
-        if accumulate == 1:
-            return gradient(params, batch, counts)
-        micro = micro_batches(batch, accumulate)
-        zero = jax.tree.map(jnp.zeros_like, params)
-
-        def body(carry: tuple[Any, LossSums], one: Batch) -> tuple[tuple[Any, LossSums], None]:
-            return jax.tree.map(jnp.add, carry, gradient(params, one, counts)), None
-
-        (grads, total), _ = jax.lax.scan(body, (zero, LossSums(*[jnp.zeros(())] * 3)), micro)
-        return grads, total
+    check_step(table, trained_E, model, config, accumulate)
+    masking, specs = config.masking, declared.specs
+    trained = OwnOnly(specs, trained_E) if config.only else Everything(specs, trained_E)
+    schedule = make_schedule(config.optimizer, config.steps)
+    multipliers = jax.tree.map(lambda spec: learning_rate_multiplier(spec, model), trained.specs, is_leaf=is_spec)
+    gradient = make_gradient(declared, masking, accumulate)
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, jax.Array]]:
         batch = dict(batch)
@@ -112,21 +72,20 @@ def make_train_step(
         active = active_robots.choose(batch["embodiment"], table.size)
         own = active_robots.take(state.params, specs, active.places_G)
         rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.robot_row_B}
-        grads, total = accumulated(own, rows, counts)
-        if config.only:
-            grads = only_per_robot(grads, specs, jnp.asarray(trained_E)[active.robots_G])
-        grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
+        grads, total = gradient(own, rows, counts)
+        grads, norm = clip_by_global_norm(trained.mask(grads, active), config.optimizer.clip_norm)
         rate = schedule(state.step)
-        leak = masking.action_leak
-        presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT, leak)
+        presence = find_presence(
+            masked, batch["embodiment"], trained_E, model, trained.shared, real_BT, masking.action_leak
+        )
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
-        moments_G = jnp.asarray(places_E)[active.robots_G] if config.only else active.places_G
+        places_G = trained.moment_places(active)
         new, adam = apply_update(
-            trained(grads), take_adam(state.opt_state, trained(specs), active, moments_G), trained(own),
-            trained(specs), trained(multipliers), here, rate, config.optimizer, declared.min_shard_size,
+            trained.pick(grads), take_adam(state.opt_state, trained.specs, active, places_G), trained.pick(own),
+            trained.specs, multipliers, here, rate, config.optimizer, declared.min_shard_size,
         )  # fmt: skip
-        opt_state = put_adam(state.opt_state, adam, trained(specs), active, moments_G)
-        new = put_own(own, new) if config.only else new
+        opt_state = put_adam(state.opt_state, adam, trained.specs, active, places_G)
+        new = trained.put(own, new)
         params = active_robots.put(state.params, new, specs, active.places_G)
         ema = update_average(state.ema, params, config.ema_decay, state.step) if config.ema_decay else None
         metrics = loss_metrics(total, counts, masking, discrete=not model.diffusion)
@@ -135,6 +94,61 @@ def make_train_step(
         return TrainState(state.step + 1, params, opt_state, ema), metrics
 
     return step
+
+
+def make_gradient(
+    declared: Declared[HMA], masking: MaskingConfig, accumulate: int
+) -> Callable[[Params, Batch, TargetCounts], tuple[Params, LossSums]]:
+    """gradient(params, rows, counts) -> (gradient of the loss, loss sums) over rows in so many micro-batches; `counts`
+    are the targets of all rows, which are a batch with `masked`, `key` and `slice` as `masked_loss` takes them."""
+
+    def sums(params: Params, rows: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
+        result = masked_loss(
+            declared.merge(params),
+            rows["masked"],
+            rows["tokens"],
+            rows["actions"],
+            rows["embodiment"],
+            masking,
+            rows["key"],
+            rows["slice"],
+            rows.get("real"),
+        )
+        loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
+        return loss, result
+
+    one_pass = jax.grad(sums, has_aux=True)
+
+    def gradient(params: Params, rows: Batch, counts: TargetCounts) -> tuple[Params, LossSums]:
+        if accumulate == 1:
+            return one_pass(params, rows, counts)
+        micro = micro_batches(rows, accumulate)
+        zero = jax.tree.map(jnp.zeros_like, params)
+
+        def body(carry: tuple[Params, LossSums], one: Batch) -> tuple[tuple[Params, LossSums], None]:
+            return jax.tree.map(jnp.add, carry, one_pass(params, one, counts)), None
+
+        (grads, total), _ = jax.lax.scan(body, (zero, LossSums(*[jnp.zeros(())] * 3)), micro)
+        return grads, total
+
+    return gradient
+
+
+def check_step(
+    table: EmbodimentTable, trained_E: np.ndarray, model: ModelConfig, config: TrainConfig, accumulate: int
+) -> None:
+    """Raises ConfigError for what cannot be trained, or would learn nothing."""
+    check_micro_batches(config.batch, accumulate)
+    check_schedule(config.optimizer, config.steps)
+    check_objective(model, config.masking)
+    require(
+        not set(config.only) - set(table.names),
+        f"train.only names {', '.join(config.only)}, but the robots are {', '.join(table.names)}",
+    )
+    learning = [entry for entry, trained in zip(table.entries, trained_E, strict=True) if trained]
+    check_targets(learning, config.masking)
+    if config.only:
+        check_own(learning, config.masking)
 
 
 def micro_batches(batch: Any, accumulate: int) -> Any:

@@ -9,9 +9,66 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.model.params import Params, ParamSpec, is_spec
+from hma_jax.training.active_robots import Active
+
+
+class Everything:
+    """A run that trains all parameters: there are moments of all of them."""
+
+    shared = True  # whether parameters that all robots share are trained
+
+    def __init__(self, specs: Params, trained_E: np.ndarray):
+        self.specs = specs  # of the parameters that there are moments of
+        self.trained_E = trained_E
+
+    def pick(self, tree: Params) -> Params:
+        """The entries that are trained of parameters, or of a tree like them."""
+        return tree
+
+    def put(self, tree: Params, trained: Params) -> Params:
+        """`tree` with what `pick` picks from such a tree replaced by `trained`."""
+        return trained
+
+    def mask(self, grads: Params, active: Active) -> Params:
+        """Gradients of a step's robots, zero for what is not trained."""
+        return grads
+
+    def moment_places(self, active: Active) -> jax.Array | None:
+        """Where the moments of a step's robots are; None: those of all robots, in their order."""
+        return active.places_G
+
+
+class OwnOnly(Everything):
+    """A run that trains the own parameters of the `trained_E` robots alone."""
+
+    shared = False
+
+    def __init__(self, specs: Params, trained_E: np.ndarray):
+        super().__init__(pick_own(specs, specs), trained_E)
+        self._all_specs = specs
+        self._places_E = places_among(trained_E)
+
+    def pick(self, tree: Params) -> Params:
+        return pick_own(tree, self._all_specs)
+
+    def put(self, tree: Params, trained: Params) -> Params:
+        return put_own(tree, trained)
+
+    def mask(self, grads: Params, active: Active) -> Params:
+        trained_G = jnp.asarray(self.trained_E)[active.robots_G]
+
+        def keep(g: jax.Array, spec: ParamSpec) -> jax.Array:
+            own = spec.embodiment_axis is not None
+            return g * spec.along_robots(trained_G).astype(g.dtype) if own else jnp.zeros_like(g)
+
+        return jax.tree.map(keep, grads, self._all_specs)
+
+    def moment_places(self, active: Active) -> jax.Array:
+        return jnp.asarray(self._places_E)[active.robots_G]
 
 
 def places_among(trained_E: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from hma_jax.runtime.processes import compiled_by_all
 from hma_jax.runtime.sharding import replicated
 from hma_jax.training.loop import ValidationHook
 from hma_jax.training.state import TrainState
-from hma_jax.training.step import micro_batches
+from hma_jax.training.step import TRAINING_ARRAYS, micro_batches
 
 SEED = 0
 """Seed of masks and noise, the same for every run, so that runs with the same masking can be compared."""
@@ -103,7 +103,7 @@ def make_sums(
         valid_B, real_BT = batch["valid"], batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         masked = masked.without_padding(jnp.broadcast_to(valid_B[:, None], masked.action_hidden_T.shape))
-        rows = {name: batch[name] for name in ("tokens", "actions", "embodiment", "real") if name in batch}
+        rows = {name: batch[name] for name in TRAINING_ARRAYS if name in batch}
         rows |= {"masked": masked, "key": noise_keys(key, len(valid_B))}
 
         def of_rows(one: Mapping[str, Any]) -> LossSums:
@@ -123,6 +123,6 @@ def make_sums(
 
 
 def _with_valid(batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    names = [name for name in ("tokens", "actions", "embodiment", "real") if name in batch]
+    names = [name for name in TRAINING_ARRAYS if name in batch]
     everything = np.ones(len(batch["tokens"]), bool)
     return {name: batch[name] for name in names} | {"valid": batch.get("valid", everything)}
