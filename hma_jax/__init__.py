@@ -10,6 +10,11 @@ throughout, in signatures, parameter axes and tensor names:
     U padded action width (stride x native dim)
     Q vocabulary factors                       V entries per factor
     C latent channels   P tokens per frame in the trunk (S + K)
+    R action sequences that a rollout continues the same prompt with
+    O action sequences of other episodes, in evaluation
+    G robots of a training step (`training.active_robots`)
+
+Small letters are axes of one function alone.
 """
 
 from importlib import import_module

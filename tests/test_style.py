@@ -86,6 +86,33 @@ def test_docstrings_name_what_they_are_of():
     assert not found, f"begin these docstrings with what they are of: {', '.join(found)}"
 
 
+LETTERS = re.compile(r"[a-z][a-z0-9_]*_([A-Za-z]{1,6})")
+
+
+def dimension_letters(tree: ast.Module) -> set[tuple[str, str]]:
+    """(name, capital) of names of arrays: `actions_BTU` has B, T and U."""
+    names = {getattr(n, kind, None) for n in ast.walk(tree) for kind in ("id", "arg", "attr")}
+    suffixes = {name: match[1] for name in names if isinstance(name, str) and (match := LETTERS.fullmatch(name))}
+    return {(name, letter) for name, suffix in suffixes.items() for letter in suffix if letter.isupper()}
+
+
+def test_dimension_letters_are_those_of_the_glossary():
+    """It is in the docstring of `hma_jax`."""
+    assert dimension_letters(ast.parse("x_BnC[y_rT], zero_one")) == {("x_BnC", "B"), ("x_BnC", "C"), ("y_rT", "T")}
+    core = ROOT / "hma_jax"
+    glossary = ast.get_docstring(ast.parse((core / "__init__.py").read_text(encoding="utf-8")), clean=False)
+    known = {
+        letter for line in glossary.split("\n") if line.startswith("    ") for letter in re.findall(r"\b[A-Z]\b", line)
+    }
+    unknown = [
+        f"{path.relative_to(ROOT)}: {name}: the glossary has no {letter}"
+        for path in sorted(core.rglob("*.py"))
+        for name, letter in sorted(dimension_letters(ast.parse(path.read_text(encoding="utf-8"))))
+        if letter not in known
+    ]
+    assert not unknown, "\n".join(unknown)
+
+
 def texts(tree: ast.AST) -> list[tuple[int, str]]:
     """(line, text) of every text of a program but docstrings; what an f-string inserts is left out."""
     docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}

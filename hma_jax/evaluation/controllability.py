@@ -40,20 +40,20 @@ predict."""
 
 
 def for_each_sequence(
-    evaluate: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BNTU: jax.Array
+    evaluate: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BOTU: jax.Array
 ) -> dict[str, jax.Array]:
     """`evaluate`, which maps actions [B, T, U] to metrics of each window [B], applied to the true sequence and to each
-    of the others, in turn: [1 + N, B]."""
-    sequences = jnp.concatenate([actions_BTU[:, None], others_BNTU], axis=1)
+    of the others, in turn: [1 + O, B]."""
+    sequences = jnp.concatenate([actions_BTU[:, None], others_BOTU], axis=1)
     return jax.lax.map(evaluate, jnp.moveaxis(sequences, 1, 0))
 
 
-def action_metrics(loss_NB: jax.Array, valid_BN: jax.Array) -> dict[str, jax.Array]:
+def action_metrics(loss_OB: jax.Array, valid_BO: jax.Array) -> dict[str, jax.Array]:
     """Action-nats and retrieval, [B] each, nan where no other sequence is valid.
 
-    `loss_NB` [1 + N, B]: under the true actions, then under the others, of which those marked in `valid_BN` count.
+    `loss_OB` [1 + O, B]: under the true actions, then under the others, of which those marked in `valid_BO` count.
     """
-    truth, others, valid = loss_NB[0], loss_NB[1:], valid_BN.T
+    truth, others, valid = loss_OB[0], loss_OB[1:], valid_BO.T
     count = jnp.sum(valid, axis=0)
     some = count > 0
     lost = jnp.sum(jnp.where(valid, others - truth, 0), axis=0) / jnp.maximum(count, 1)

@@ -62,8 +62,8 @@ Optional:
     real            bool [B, T]: False for padding frames at the end of a short window, which are ignored
     action_mean     float32 [B, U]: of all recorded actions, for random ones and errors; default: the table's
     action_std      float32 [B, U]: likewise
-    other_actions   float32 [B, N, T, U]: of other episodes of the same robot
-    other_valid     bool [B, N]: which of them exist
+    other_actions   float32 [B, O, T, U]: of other episodes of the same robot
+    other_valid     bool [B, O]: which of them exist
     other_images    uint8 [B, T, H, W, 3]: true frames under the first of them, from the prompt on
     other_seen      bool [B]: whether these are known
 """

@@ -49,7 +49,7 @@ contract.defvjp(_contract_forward, _contract_backward)
 
 
 def _product_over_rows(x: jax.Array, dy: jax.Array) -> jax.Array:
-    """x [R, in], dy [R, out] -> [in, out], summed over rows."""
+    """x [rows, in], dy [rows, out] -> [in, out], summed over rows."""
 
     def transposed(x: jax.Array, dy: jax.Array) -> jax.Array:
         if x.shape[1] <= dy.shape[1]:
@@ -98,8 +98,8 @@ def per_robot(x: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layou
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _per_robot(x_BRi: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
-    return jnp.einsum("bri,bio->bro", x_BRi, _to_examples(w, robot_row_B, layouts))
+def _per_robot(x_Bni: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+    return jnp.einsum("bri,bio->bro", x_Bni, _to_examples(w, robot_row_B, layouts))
 
 
 def _per_robot_backward(

@@ -30,19 +30,19 @@ def displace_patches(past: jax.Array, share: float, key_B: jax.Array) -> jax.Arr
 
     def sources(key: jax.Array) -> jax.Array:
         """int [T - 1, S]: the place that each token is taken from."""
-        # Each [P, 1], for P rectangles: beside it stand frames T, or places S.
+        # Each [r, 1], for r rectangles: beside it stand frames T, or places S.
         chosen, first, last, high, wide, top, left, down, right = jax.random.uniform(key, (9, PATCHES, 1), jnp.float32)
         begin = jnp.floor(first * frames)
         end = begin + 1 + jnp.floor(last * (frames - begin))
         frame_T = jnp.arange(frames).astype(begin.dtype)
-        within_PT = (chosen < share) & (frame_T >= begin) & (frame_T < end)
-        within_PS = _within(y_S, side, high, top) & _within(x_S, side, wide, left)
-        y_PS = (y_S + jnp.floor(down * side).astype(int)) % side
-        x_PS = (x_S + jnp.floor(right * side).astype(int)) % side
-        within_PTS = within_PT[:, :, None] & within_PS[:, None]
+        within_rT = (chosen < share) & (frame_T >= begin) & (frame_T < end)
+        within_rS = _within(y_S, side, high, top) & _within(x_S, side, wide, left)
+        y_rS = (y_S + jnp.floor(down * side).astype(int)) % side
+        x_rS = (x_S + jnp.floor(right * side).astype(int)) % side
+        within_rTS = within_rT[:, :, None] & within_rS[:, None]
         own = jnp.broadcast_to(jnp.arange(tokens), (frames, tokens))
         # Where rectangles overlap, the first one is seen.
-        return jnp.select(list(within_PTS), list(jnp.expand_dims(y_PS * side + x_PS, 1)), own)
+        return jnp.select(list(within_rTS), list(jnp.expand_dims(y_rS * side + x_rS, 1)), own)
 
     source_BTS = jax.vmap(sources)(key_B)
     return jnp.take_along_axis(past, source_BTS.reshape(*source_BTS.shape, *(1,) * (past.ndim - 3)), axis=2)

@@ -195,9 +195,9 @@ def frame_diffusion_loss(
         return mse + vb
 
     # The trunk's work is shared by all noised copies of a token.
-    keys_RB = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]
+    keys = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]
     x0 = tokens_BTSC.astype(jnp.float32)
-    return jnp.stack([jax.vmap(one)(key, z_BTSD, x0) for key in keys_RB]).mean(axis=0)
+    return jnp.stack([jax.vmap(one)(key, z_BTSD, x0) for key in keys]).mean(axis=0)
 
 
 def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float = 1.0) -> tuple[jax.Array, jax.Array]:
