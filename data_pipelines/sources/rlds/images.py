@@ -11,7 +11,9 @@ from PIL import Image, UnidentifiedImageError
 
 from hma_jax.runtime.cores import usable_cores
 
-JPEG_MAGIC, PNG_MAGIC = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+JPEG_MAGIC = b"\xff\xd8\xff"
+BY_PILLOW = {"PNG": b"\x89PNG\r\n\x1a\n", "WebP": b"RIFF", "BMP": b"BM"}
+"""Formats that Pillow decodes, and the bytes that they begin with."""
 
 MAX_PIXELS = 2**25
 """Pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can claim billions."""
@@ -27,7 +29,7 @@ def decoding_threads() -> int:
 
 
 def decode_image(data: bytes) -> np.ndarray:
-    """uint8 [H, W, 3] from JPEG or PNG bytes (grey images become RGB, alpha is dropped).
+    """uint8 [H, W, 3] from JPEG, PNG, WebP or BMP bytes (grey images become RGB, alpha is dropped).
 
     The fast DCT is the default of TensorFlow's decoder, so pixels equal those of RLDS pipelines built on
     TensorFlow. Every image is decoded at its own size: libjpeg could shrink one at half the cost, but by another filter
@@ -38,13 +40,14 @@ def decode_image(data: bytes) -> np.ndarray:
         _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
         return simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=True)
     try:
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        with Image.open(io.BytesIO(data), formats=[*map(str.upper, BY_PILLOW)]) as image:
             _check_pixels(data, *image.size)
             if image.mode.startswith("I"):  # made RGB, nearly all of them would be white
                 raise ValueError(f"{len(data)} bytes of 16-bit grey values, such as depths, which are not an image")
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
-        what = "of a damaged PNG image" if data.startswith(PNG_MAGIC) else "that are neither JPEG nor PNG"
+        format = next((name for name, magic in BY_PILLOW.items() if data.startswith(magic)), None)
+        what = f"of a damaged {format} image" if format else "that are no JPEG, PNG, WebP or BMP image"
         raise ValueError(f"{len(data)} bytes {what}") from error
     except Image.DecompressionBombError as error:
         raise ValueError(f"{len(data)} bytes of an image that is too large for a frame ({error})") from error

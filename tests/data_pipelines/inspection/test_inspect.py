@@ -139,7 +139,7 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
     file = "toy-train.tfrecord-00000-of-00001"
     assert first.startswith(f"{file}, episode 1: its fields differ in length") and "action 4" in first
     assert second.startswith(
-        f"{file}, episode 2: step 0 of observation/image cannot be decoded: 8 bytes that are neither JPEG nor PNG"
+        f"{file}, episode 2: step 0 of observation/image cannot be decoded: 8 bytes that are no JPEG, PNG, WebP or BMP image"
     )
 
 

@@ -29,6 +29,15 @@ def test_png_is_lossless_and_grey_becomes_rgb():
     assert np.array_equal(grey, np.repeat(image[..., :1], 3, axis=2))
 
 
+@pytest.mark.parametrize("kind", ["WebP", "BMP"])
+def test_formats_that_are_rare_in_records_are_decoded(kind):
+    image, data = np.random.default_rng(0).integers(0, 255, (5, 7, 3)).astype(np.uint8), io.BytesIO()
+    Image.fromarray(image).save(data, kind, lossless=True)
+    assert np.array_equal(decode_image(data.getvalue()), image)
+    with pytest.raises(ValueError, match=f"of a damaged {kind} image"):
+        decode_image(data.getvalue()[:30])
+
+
 def test_depths_of_16_bits_are_no_picture():
     with pytest.raises(ValueError, match="16-bit grey values, such as depths, which are not an image"):
         decode_image(png(np.arange(0, 6400, 100, np.uint16).reshape(8, 8)))
@@ -42,7 +51,7 @@ def test_bytes_that_are_no_image_are_refused(data):
 
 @pytest.mark.parametrize("end", [20, -30])
 def test_a_png_that_was_cut_off_is_one(end):
-    """It was called neither JPEG nor PNG."""
+    """It was called no image."""
     data = png(np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8))
     with pytest.raises(ValueError, match="bytes of a damaged PNG image"):
         decode_image(data[:end])
@@ -79,7 +88,7 @@ def test_jpeg_that_claims_billions_of_pixels_is_refused():
 def test_other_formats_are_not_tried():
     data = io.BytesIO()
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(data, "TIFF")
-    with pytest.raises(ValueError, match="neither JPEG nor PNG"):
+    with pytest.raises(ValueError, match="that are no JPEG, PNG, WebP or BMP image"):
         decode_image(data.getvalue())
 
 
