@@ -253,7 +253,14 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
 
 def _demonstrations(path: Path, file: Any, filter_key: str | None) -> dict[str, str]:
     """Names in the order of their numbers, each with the one of the masks `filter_key` that names it, or ""."""
-    names = [name for name in file["data"] if re.fullmatch(r"demo_\d+", name)]
+    numbered = re.compile(r"demo_\d+").fullmatch
+    names = [name for name in file["data"] if numbered(name)]
+    others = [] if filter_key else [name for name in file["data"] if not numbered(name)]
+    if unread := next((name for name in others if "actions" in file["data"][name]), None):
+        raise DataError(
+            f"{path}: data/{quote(unread)} has actions, but is not called demo_<number>, so it would not be read. Rename it "
+            "in a copy of the file (h5py: move(OLD, NEW)), or choose demonstrations by a mask."
+        )
     if not names:
         raise DataError(f"{path}: no demonstration 'data/demo_*' in it.")
     wanted = [] if filter_key is None else filter_key.split("+")

@@ -44,6 +44,18 @@ def test_a_mask_a_camera_a_rate_and_a_size_can_be_chosen(tmp_path):
         RobomimicSource(tmp_path / "image.hdf5", RobomimicSettings(("side",)))
 
 
+def test_a_demonstration_without_a_number_is_not_left_out_in_silence(tmp_path):
+    def rename(file):
+        file["data"].move("demo_11", "demo_a")
+        file["data"].create_group("notes")
+        file["mask/train"][:] = [b"demo_9", b"demo_10"]
+
+    path = write_robomimic(tmp_path / "image.hdf5", change=rename)
+    with pytest.raises(DataError, match="data/'demo_a' has actions, but is not called demo_<number>.*Rename it"):
+        RobomimicSource(path)
+    assert RobomimicSource(path, RobomimicSettings(filter_key="train")).units == ["demo_9", "demo_10"]
+
+
 def test_low_dimensional_files_are_refused_with_the_remedy(tmp_path):
     path = write_robomimic(tmp_path / "low_dim.hdf5", images=False)
     with pytest.raises(DataError, match=r"demo_9/obs has no \*_image .*dataset_states_to_obs"):
