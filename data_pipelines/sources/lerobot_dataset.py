@@ -213,8 +213,14 @@ class _Frames(Sequence[SourceFrame]):
 
 
 def dataset_name(root: Path) -> str:
-    """The directory's name as the name of a dataset. Raises DataError if no valid character is left of it."""
-    name = re.sub(r"[^a-z0-9_]+", "_", root.absolute().name.lower()).strip("_")
+    """The directory's name as the name of a dataset. Raises DataError if no valid character is left of it.
+
+    In the cache of the Hugging Face hub, `datasets--ORG--NAME/snapshots/REVISION`, it is NAME, whatever the revision.
+    """
+    repository, folder, own = ("", "", "", *root.absolute().parts)[-3:]
+    if folder == "snapshots" and repository.startswith("datasets--"):
+        own = repository.rpartition("--")[2]
+    name = re.sub(r"[^a-z0-9_]+", "_", own.lower()).strip("_")
     if not name:
         raise DataError(
             f"{root}: a LeRobot dataset gets the name of its folder, but this name contains none of a to z and 0 to "

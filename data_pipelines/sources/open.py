@@ -59,6 +59,8 @@ def _meant(place: Path) -> str:
             close = difflib.get_close_matches(place.name, [p.name for p in place.parent.iterdir()], n=1)
             return f" Closest: {place.parent / close[0]}" if close else ""
         inside = sorted(place.iterdir())
+        if place / "snapshots" in inside:  # the Hugging Face hub's cache of a dataset: the newest revision
+            inside = sorted((place / "snapshots").iterdir(), key=lambda p: p.stat().st_mtime)[-1:]
         datasets = [str(p) for p in inside if _is_dataset(p)]
     except OSError:  # a missing parent, or one that may not be read
         return ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import json
+import os
 import pickle
 import re
 import shutil
@@ -75,6 +76,18 @@ def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
             match="机器人: a LeRobot dataset gets the name of its folder, but this name contains none of a to z",
         ):
             read(tmp_path / "机器人")
+
+
+def test_in_the_cache_of_the_hub_a_dataset_has_the_name_of_its_repository(tmp_path):
+    """By the revision, every one would be another robot with other held-out episodes."""
+    repository = tmp_path / "datasets--lerobot--Toy-Arm"
+    for time, revision in enumerate(("f" * 40, "a" * 40), 1):
+        root = write_lerobot(repository / "snapshots" / revision, "v2.1", camera="image")
+        os.utime(root, (time, time))
+        (repository / "blobs").mkdir(exist_ok=True)
+        assert source_name(root) == open_source(root).name == "toy_arm"
+    with pytest.raises(DataError, match=f"Datasets in it: {root}$"):
+        open_source(repository)
 
 
 def test_frames_of_a_record_are_decoded_from_a_video_that_is_opened_once(tmp_path, monkeypatch):
