@@ -77,6 +77,10 @@ class TrueSimulator(ABC, Generic[W]):
     def close_world(self, world: W) -> None:
         """It is not used again: another robot's takes its place."""
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> TrueSimulator:
+        """Itself, as a learned simulator."""
+        return self
+
     def __len__(self) -> int:
         return len(self._worlds)
 

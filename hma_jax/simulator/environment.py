@@ -101,6 +101,10 @@ class _Task:
         rate = self.robot.hz / self.robot.stride
         return metadata | ({"render_fps": int(rate) if rate.is_integer() else rate} if rate else {})
 
+    def clipped(self) -> np.ndarray:
+        """bool [B, A]: which action values of the last step lay outside the range."""
+        return np.array([[name in names for name in self.robot.dimensions] for names in self.simulator.clipped])
+
     def begin(
         self, rngs: Sequence[np.random.Generator], episodes: Sequence[int], options: dict[str, Any] | None
     ) -> np.ndarray:
@@ -124,7 +128,7 @@ class RobotEnv(gymnasium.Env):
     is Gymnasium's `TimeLimit`, which `gymnasium.make` puts around it.
 
     `reset(options={"start": i})` begins at that start, otherwise at a drawn one. Rewards and ends are the `judge`'s.
-    `info["clipped"]` names action dimensions whose value lay outside the range.
+    `info["clipped"]`, bool [A], says which action values lay outside the range; `robot.dimensions` names them.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
@@ -142,8 +146,9 @@ class RobotEnv(gymnasium.Env):
     ):
         """`options` are those of `Simulator.load`. Raises ConfigError."""
         self._task = _Task(1, run, robot, simulator, starts, judge, options)
+        self.robot = self._task.robot
         self.render_mode, self.metadata = render_mode, self._task.at_its_rate(self.metadata)
-        self.action_space = action_space(self._task.robot)
+        self.action_space = action_space(self.robot)
         self.observation_space = observation_space(self._task.simulator)
 
     def reset(
@@ -156,7 +161,7 @@ class RobotEnv(gymnasium.Env):
         simulator = self._task.simulator
         image = simulator.step([action])[0].copy()
         rewards, done = self._task.judge(simulator)
-        return image, float(rewards[0]), bool(done[0]), False, {"clipped": simulator.clipped[0]}
+        return image, float(rewards[0]), bool(done[0]), False, {"clipped": self._task.clipped()[0]}
 
     def render(self) -> np.ndarray | None:
         return self._task.simulator.images[0].copy() if self.render_mode == "rgb_array" else None
@@ -168,6 +173,7 @@ class RobotVectorEnv(VectorEnv):
 
     `reset(seed=[...])` seeds each episode by itself: it is then as in `RobotEnv` with that seed. None leaves one as it
     is seeded. `reset(options={"reset_mask": mask})` begins anew those alone that a bool array [num_envs] marks.
+    `info["clipped"]`, bool [num_envs, A], is that of `RobotEnv`; `info["_clipped"]` marks the episodes that stepped.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4, "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -188,9 +194,10 @@ class RobotVectorEnv(VectorEnv):
         """As `RobotEnv`; episodes are truncated after `max_episode_steps`."""
         require(max_episode_steps >= 1, f"an episode has at least 1 step, got max_episode_steps={max_episode_steps}")
         self._task = _Task(num_envs, run, robot, simulator, starts, judge, options)
+        self.robot = self._task.robot
         self.num_envs, self.render_mode, self._longest = num_envs, render_mode, max_episode_steps
         self.metadata = self._task.at_its_rate(self.metadata)
-        self.single_action_space = action_space(self._task.robot)
+        self.single_action_space = action_space(self.robot)
         self.single_observation_space = observation_space(self._task.simulator)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -233,7 +240,7 @@ class RobotVectorEnv(VectorEnv):
         simulator, again = self._task.simulator, self._over.copy()
         which = np.flatnonzero(again).tolist()
         simulator.step([None if b in which else action for b, action in enumerate(actions)])
-        clipped = np.array([bool(names) for names in simulator.clipped])
+        info = {"clipped": self._task.clipped(), "_clipped": ~again}
         rewards, done = self._task.judge(simulator)  # before others begin: a start does not count, as after `reset`
         if which:
             self._task.begin([self._rngs[b] for b in which], which, None)
@@ -241,7 +248,7 @@ class RobotVectorEnv(VectorEnv):
         terminated = done & ~again
         truncated = ~again & (self._steps >= self._longest)
         self._over = terminated | truncated
-        return simulator.images.copy(), np.where(again, 0.0, rewards), terminated, truncated, {"clipped": clipped}
+        return simulator.images.copy(), np.where(again, 0.0, rewards), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         return tuple(self._task.simulator.images.copy()) if self.render_mode == "rgb_array" else None

@@ -114,6 +114,11 @@ class Simulator:
         found["robots"] = (*find_robots(run, model.table), *given.get("robots", ()))  # of one name the last counts
         return cls(model, find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None), **found)
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Simulator:
+        """Itself: Gymnasium copies what an environment was made of, model included, whenever it is asked for its
+        `spec`. Copies of the episodes are `snapshot` and `branch`."""
+        return self
+
     # --- What there is -----------------------------------------------------------------------------
 
     def __len__(self) -> int:

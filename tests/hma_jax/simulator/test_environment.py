@@ -1,5 +1,6 @@
 """Gymnasium's view of a simulator."""
 
+import copy
 import os
 import warnings
 from dataclasses import replace
@@ -10,7 +11,9 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra `simulator`")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.wrappers.vector import DictInfoToList  # noqa: E402
 
+from data_pipelines.suite.simulator import SuiteSimulator, suite_robot  # noqa: E402
 from hma_jax.config import ConfigError  # noqa: E402
 from hma_jax.simulator import environment  # noqa: E402
 from hma_jax.simulator.environment import ID, MAX_STEPS, RobotEnv, RobotVectorEnv  # noqa: E402
@@ -124,11 +127,28 @@ def test_a_judge_is_told_of_episodes_that_begin():
     np.testing.assert_array_equal(judge.begun[1][1][0], images[0])
 
 
-def test_a_clipped_action_is_said():
+def test_a_clipped_action_is_said_alike_alone_and_in_a_vector():
     env = RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
+    several = DictInfoToList(vector(2, max_episode_steps=1))
     env.reset(seed=0)
-    *_, info = env.step(env.action_space.high + 1)
-    assert info["clipped"] == ROBOTS[1].dimensions
+    several.reset(seed=0)
+    action = env.action_space.high.copy()
+    action[1] += 1
+    *_, info = env.step(action)
+    named = np.array(env.get_wrapper_attr("robot").dimensions)[info["clipped"]]
+    assert info["clipped"].dtype == bool and named.tolist() == [ROBOTS[1].dimensions[1]]
+    *_, infos = several.step(np.stack([action, env.action_space.high]))
+    assert infos[0].keys() == info.keys() and infos[1]["clipped"].tolist() == [False] * len(action)
+    np.testing.assert_array_equal(infos[0]["clipped"], info["clipped"])
+    *_, infos = several.step(np.stack([action] * 2))  # both begin anew, and their actions are ignored
+    assert infos == [{}, {}]
+
+
+def test_a_spec_does_not_copy_the_simulator():
+    """A copy of the model was made, and kept, by every wrapper."""
+    sim, true = simulator(), SuiteSimulator([suite_robot("pusher_sand", (-1.0,) * 2, (1.0,) * 2, (0.0,) * 2, 1)])
+    assert gymnasium.make(NAME, simulator=sim, starts=STARTS, robot="arm").spec.kwargs["simulator"] is sim
+    assert copy.deepcopy(true) is true
 
 
 def test_the_vector_environment_begins_episodes_anew_when_they_end():
