@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from experiments.boundary import guarded
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
+from experiments.cli.branch import branch
 from experiments.cli.check import check
 from experiments.cli.command_line import Commands
 from experiments.cli.compare import compare
@@ -23,7 +24,19 @@ from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 
-BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "convert", "bench", "plan", "coord-check", "play", "check")
+BEGIN_ANEW = (
+    "evaluate",
+    "compare",
+    "report",
+    "fit",
+    "convert",
+    "bench",
+    "plan",
+    "coord-check",
+    "play",
+    "check",
+    "branch",
+)
 """Commands that keep nothing of what they had begun when they are stopped."""
 
 app = Commands()
@@ -32,6 +45,7 @@ app.command(name="sweep")(study.sweep)
 app.command(name="tokenize")(tokenize)
 app.command(name="train")(train)
 app.command(name="adapt")(adapt)
+app.command(name="branch")(branch)
 app.command(name="evaluate")(evaluate)
 app.command(name="compare")(compare)
 app.command(name="report")(study.report)

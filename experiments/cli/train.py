@@ -391,9 +391,10 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
     from experiments.done import newest_step
     from experiments.running.run_trial import open_prepared_data, train_trial
+    from experiments.running.shared_runs import common_steps
     from hma_jax.runtime.processes import is_writer
 
-    prepared = open_prepared_data(setting.workspace)
+    prepared, optimizer = open_prepared_data(setting.workspace), trial.train.optimizer
     say_data(trial, prepared)
     say(f"logs: {short(run)} (tensorboard --logdir {shlex.quote(short(run))})")
     steps, made = trial.train.steps, newest_step(run)
@@ -406,6 +407,8 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
             run,
             execution=setting.study.execution,
             options=options,
+            # From before its decay a run can be extended.
+            keep=(common_steps(optimizer, steps, 2 * steps),) if optimizer.schedule == "wsd" else (),
             progress=lambda phase, done, total: update(done, total, phase),
             **start,
         )

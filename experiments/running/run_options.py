@@ -33,6 +33,9 @@ class RunOptions:
     """Minutes between checkpoints, in addition to those by steps; 0: no checkpoints by time."""
     keep_checkpoints: Annotated[int, arg(name="keep-checkpoints", metavar="N")] = 2
     """Number of newest checkpoints that are kept."""
+    keep_every: Annotated[int, arg(name="keep-every", metavar="STEPS")] = 0
+    """Also save and keep the checkpoints of every so many steps; 0: none.
+    With schedule wsd the last one before the decay is kept anyway."""
     skip_damaged: Annotated[FlagCreatePairsOff[bool], arg(name="skip-damaged"), UNSET] = False
     """Continue from the newest undamaged checkpoint.
     Damaged checkpoints after it are moved to RUN/damaged."""
@@ -48,7 +51,12 @@ class RunOptions:
     def check(self) -> None:
         """Raises ConfigError, in the words of the command line."""
         hint = "; 0 saves at the end and when interrupted"
-        for name, more in (("checkpoint_every", hint), ("checkpoint_minutes", hint), ("validate_every", "")):
+        for name, more in (
+            ("checkpoint_every", hint),
+            ("checkpoint_minutes", hint),
+            ("validate_every", ""),
+            ("keep_every", ""),
+        ):
             value, flag = getattr(self, name), "--" + name.replace("_", "-")
             require(value is None or value >= 0, f"{flag} must not be negative, got {value}{more}")
         for flag, value in (("--keep-checkpoints", self.keep_checkpoints), ("--trace", self.trace)):

@@ -138,6 +138,7 @@ def train_trial(
             checkpoint_minutes=options.checkpoint_minutes,
             keep_checkpoints=options.keep_checkpoints,
             keep_steps=keep,
+            keep_every=options.keep_every,
             skip_damaged=options.skip_damaged,
             trace_steps=options.trace or 0,
         ),

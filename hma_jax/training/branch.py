@@ -1,22 +1,45 @@
-"""A run that starts from a checkpoint of another: the steps that both have in common are trained once.
+"""A run that starts from a checkpoint of another.
 
-With the schedule wsd, runs that differ in their number of steps alone are the same until the earlier one decays
-(`optimizer.steps_in_common`). A run that continues from there leaves the same bytes as one that was trained from its
-first step, for an optimiser step depends on the state and the step's number and on nothing else.
+A run that was branched (`branch`) may go on with another optimiser, other masks, another order of data or another
+number of steps: after a spike of the loss, or to extend a run from before its learning rate decayed. Its checkpoints
+remember where it was branched and how it was trained until then.
+
+Trials share the steps that they have in common (`begin_from`). With the schedule wsd, runs that differ in their
+number of steps alone are the same until the earlier one decays (`optimizer.steps_in_common`). A run that continues
+from there leaves the same bytes as one that was trained from its first step, for an optimiser step depends on the
+state and the step's number and on nothing else.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
-from hma_jax.runtime.files import sync, sync_tree
-from hma_jax.training.reading import list_steps
-from hma_jax.training.run_lock import CHECKPOINTS
+from hma_jax.config import ConfigError, MaskingConfig, OptimizerConfig, require
+from hma_jax.runtime.files import sync, sync_tree, write_file
+from hma_jax.training.reading import list_steps, read_description
+from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 
 LOGS = ("metrics.jsonl", "validation.jsonl", "timing.jsonl")
 """Cut after the step from which a run goes on when it starts (`log.RunLog`)."""
+
+FILE = "branch.json"
+"""In a run that was branched: a list of the branchings that led to it, {"step", "train"} each."""
+
+MAY_CHANGE = (
+    "train.steps",
+    "train.seed",
+    "provenance.loader.seed",  # with the seed: another order of data
+    "provenance.branched",
+    # What the state holds for each parameter depends on `matrices`.
+    *(f"train.optimizer.{field.name}" for field in fields(OptimizerConfig) if field.name != "matrices"),
+    *(f"train.masking.{field.name}" for field in fields(MaskingConfig) if field.name != "setting"),
+)
+"""Fields of a run's description that may differ when a branch begins to train."""
 
 
 def last_step(run_dir: Path, latest: int) -> int:
@@ -53,3 +76,43 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
     os.replace(aside, place)
     sync(place.parent)
     return step
+
+
+def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
+    """Makes `run_dir` a run that has the checkpoint of `step` (None: the newest) of `source`, and that may go on from
+    there with other settings (MAY_CHANGE). Returns the step.
+
+    Raises ConfigError if `source` has no such checkpoint or `run_dir` has one; OSError, CheckpointError.
+    """
+    steps = list_steps(source / CHECKPOINTS)
+    require(bool(steps), f"{source} has no checkpoint; give the directory of a training run that has saved one")
+    step = max(steps) if step is None else step
+    require(
+        step in steps,
+        f"{source} has no checkpoint of step {step:,}; it has those of {', '.join(f'{n:,}' for n in steps)}. "
+        "`hma train --keep-every STEPS` keeps more of them",
+    )
+    described = read_description(source / CHECKPOINTS / str(step))
+    require("train" in described, f"{source} is not a run of a model; give the directory of a training run")
+    earlier = described["provenance"].get("branched", [])
+    with locked_run(run_dir):
+        require(not has_checkpoint(run_dir), f"{run_dir} is a run already; give the branch a directory of its own")
+        write_file(run_dir / FILE, json.dumps([*earlier, {"step": step, "train": described["train"]}], indent=1))
+        begin_from(source, run_dir, step)
+    return step
+
+
+def read_branchings(run_dir: Path) -> list[dict[str, Any]]:
+    """The branchings that led to a run, the last one last; empty for a run that was not branched. Raises ConfigError
+    for a damaged file."""
+    path = run_dir / FILE
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        require(
+            isinstance(found, list) and all(isinstance(one["step"], int) for one in found), "it is no list of steps"
+        )
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except (ValueError, TypeError, KeyError) as error:
+        raise ConfigError(f"{path} is damaged ({error}); remove the run and branch it again") from error
+    return found

@@ -62,9 +62,10 @@ class Checkpoints:
         keep: int = 2,
         modernise: Callable[[Description], Description] = lambda described: described,
         keep_steps: tuple[int, ...] = (),
+        keep_every: int = 0,
     ):
-        """The newest `keep` checkpoints stay, and those of `keep_steps`. `modernise` brings a description that an
-        earlier version wrote to the form of `meta`.
+        """The newest `keep` checkpoints stay, those of `keep_steps`, and of every `keep_every` steps (0: none).
+        `modernise` brings a description that an earlier version wrote to the form of `meta`.
 
         Raises CheckpointError if `directory` cannot be written, ConfigError if what is written there cannot be read, or
         for a description that is not JSON.
@@ -75,7 +76,8 @@ class Checkpoints:
         except (TypeError, ValueError) as error:
             raise ConfigError(f"the description of a run, including its provenance, must be JSON: {error}") from error
         self.directory = Path(directory).absolute()
-        self.meta, self.keep, self.modernise, self.keep_steps = meta, keep, modernise, keep_steps
+        self.meta, self.keep, self.modernise = meta, keep, modernise
+        self.keep_steps, self.keep_every = keep_steps, keep_every
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -149,6 +151,7 @@ class Checkpoints:
                 self.directory,
                 preservation_policy=policies.AnyPreservationPolicy(
                     [policies.LatestN(self.keep), policies.CustomSteps(self.keep_steps)]
+                    + [policies.EveryNSteps(self.keep_every)] * (self.keep_every > 0)
                 ),
                 # A save that was killed leaves a temporary directory; remove it.
                 cleanup_tmp_directories=True,
@@ -228,7 +231,8 @@ class Checkpoints:
         if changes:
             raise CheckpointError(
                 f"the checkpoint at {self.directory} (step {step}) was made with another configuration; use a new "
-                "output directory or restore these fields:\n  " + "\n  ".join(changes)
+                "output directory, go on in a branch (`hma branch`: other optimiser, masks, seed or steps), or restore "
+                "these fields:\n  " + "\n  ".join(changes)
             )
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
         return step, type(shapes)(**load(checkpoint, wanted))

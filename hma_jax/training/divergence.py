@@ -47,8 +47,8 @@ def require_finite(step: int, values: Mapping[str, float], run_dir: Path | None,
         more = f" and {len(batch) - MAX_LISTED} more, listed in {FILE} of the run" if len(batch) > MAX_LISTED else ""
         few = f"its batch was {'; '.join(batch[:MAX_LISTED])}{more}; if these windows are correct, "
     raise DivergedError(
-        f"{what}; {few}lower the learning rate or lengthen the warm-up, and train in a new output directory (the last "
-        "checkpoint of this run is kept)"
+        f"{what}; {few}lower the learning rate or lengthen the warm-up, and train in a new output directory. To go on "
+        "from the last checkpoint with a lower rate or another order of data: `hma branch`"
     )
 
 

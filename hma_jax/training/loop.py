@@ -63,6 +63,7 @@ class LoopOptions:
     checkpoint_minutes: float = 10.0  # since the last save: what a kill loses at most
     keep_checkpoints: int = 2  # the newest ones
     keep_steps: tuple[int, ...] = ()  # saved after these too, and kept: others go on from there
+    keep_every: int = 0  # steps: saved after every so many too, and kept
     skip_damaged: bool = False  # go on from the newest checkpoint that is whole
     log_every: int = 10  # steps between lines of timing.jsonl
     trace_steps: int = 0  # so many steps after a start are profiled
@@ -139,7 +140,12 @@ def fit(
     with (
         locked_run(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
-            run_dir / CHECKPOINTS, info.description, options.keep_checkpoints, info.modernise, options.keep_steps
+            run_dir / CHECKPOINTS,
+            info.description,
+            options.keep_checkpoints,
+            info.modernise,
+            options.keep_steps,
+            options.keep_every,
         ) as checkpoints,
         _stop_requests() as stop,
     ):
@@ -263,7 +269,8 @@ STOP, SAVE = 2, 1
 
 def _is_due(step: int, options: LoopOptions) -> bool:
     """Whether `step` is one to save after."""
-    return step in options.keep_steps or options.checkpoint_every > 0 and step % options.checkpoint_every == 0
+    every = [n for n in (options.checkpoint_every, options.keep_every) if n > 0]
+    return step in options.keep_steps or any(step % n == 0 for n in every)
 
 
 def _is_late(seconds: float, options: LoopOptions) -> bool:

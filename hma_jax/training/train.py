@@ -26,6 +26,7 @@ from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.mesh import check_mesh, make_mesh
 from hma_jax.runtime.rows import own_rows
 from hma_jax.runtime.sharding import put_batch, replicated
+from hma_jax.training import branch
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, RunInfo, fit
 from hma_jax.training.old_checkpoints import load_trained
@@ -88,13 +89,24 @@ def train_model(
         today = modernise(described)
         return today | {"provenance": modernise_provenance(today["provenance"])}
 
+    branched = branch.read_branchings(Path(run_dir))
+    if branched:
+        require(
+            branch.has_checkpoint(Path(run_dir)),
+            f"{run_dir} was branched from another run, but its copy of a checkpoint is not complete or was removed; "
+            "remove the directory, and branch again",
+        )
+        provenance = provenance | {"branched": branched}
+
     with jax.set_mesh(device_mesh):
         step = _jitted_step(make_train_step, model, program_table, replace(config, seed=0), execution, device_mesh)
         seed = jax.device_put(jax.random.key_data(key_of(config.seed)), replicated(device_mesh))
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
             """A run may be resumed with more or fewer steps from a step at which the learning rate did not depend on
-            their number, unless it has taken more already."""
+            their number, unless it has taken more already; a branch, at the step of its branching, with much else."""
+            if branched and step == branched[-1]["step"] <= config.steps:
+                return branch.MAY_CHANGE
             same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
             return ("train.steps",) if step <= min(same, config.steps) else ()
 

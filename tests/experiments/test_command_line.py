@@ -56,6 +56,8 @@ def broken(lines: list[str], width: int) -> list[tuple[str, str]]:
         same = re.match(r"│? *", before)[0] == re.match(r"│? *", after)[0]
         if not (same and end and start) or start[0] in "-─•{" or end[-1] in ".)─╮╯" or before.startswith("usage"):
             continue
+        if "," in end and " " not in end:  # names of commands, in a usage
+            continue
         room = width - 2 * before.startswith("│") - len(before.rstrip("│ "))
         if len(start.split()[0]) + 1 <= room:
             found.append((before, after))

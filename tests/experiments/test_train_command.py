@@ -203,6 +203,30 @@ def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, s
     assert train.phases[-1] == (f"training, held-out loss {lines[0]['loss']:.4f}" if steps else "training")
 
 
+def test_a_run_branches_at_a_step_that_was_kept_and_goes_on_at_another_rate(train, where, tmp_path, capsys):
+    run, new = tmp_path / "run", tmp_path / "new"
+    train("--set", "train.steps=5", "--keep-every", "2")
+    assert list_steps(run / "checkpoints") == [2, 4, 5]
+    assert main(["branch", str(run), str(new), "--step", "2"]) == 0
+    assert f"has the checkpoint of step 2 of {run}" in capsys.readouterr().out.replace("\n", " ")
+    slower = ("--set", "train.optimizer.learning_rate=1e-5", "--set", "seeds=7", "--set", "train.steps=4")
+    assert main(["train", *where, "--run", str(run), *slower]) == 2, "the run itself goes on as it began"
+    assert "`hma branch`" in capsys.readouterr().err
+    assert main(["train", *where, "--run", str(new), *slower]) == 0
+    first, second = (
+        [json.loads(line)["loss"] for line in (place / "metrics.jsonl").read_text().splitlines()]
+        for place in (run, new)
+    )
+    assert second[:2] == first[:2] and len(second) == 4
+    assert main(["branch", str(run), str(new)]) == 2
+
+
+def test_the_checkpoint_before_the_decay_stays(train, tmp_path):
+    wsd = ("--set", "train.optimizer.schedule=wsd", "--set", "train.optimizer.warmup_steps=1")
+    train(*wsd, "--set", "train.steps=10", "--set", "train.optimizer.decay_fraction=0.5", "--checkpoint-every", "0")
+    assert list_steps(tmp_path / "run" / "checkpoints") == [5, 10]
+
+
 def test_steps_are_profiled_as_asked_for_and_which_and_where_is_said(train, tmp_path):
     said, _, _ = train("--set", "train.steps=3", "--trace", "2")
     profile = tmp_path / "run" / "profile"

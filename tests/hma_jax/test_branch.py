@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hma_jax.config import OptimizerConfig, TrainConfig
-from hma_jax.training.branch import CHECKPOINTS, begin_from, last_step
+from hma_jax.config import ConfigError, OptimizerConfig, TrainConfig
+from hma_jax.training.branch import CHECKPOINTS, FILE, begin_from, branch, last_step
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.optimizer import make_schedule, steps_in_common
 from hma_jax.training.reading import list_steps
+from hma_jax.training.runs import load_run
 from hma_jax.training.train import train_model
 from tests.hma_jax.test_training import equal_trees
 from tests.tiny import SMALLER, TABLE, batches, model_config, train_config
@@ -23,10 +25,10 @@ WSD = OptimizerConfig(learning_rate=1e-2, warmup_steps=1, schedule="wsd", decay_
 MODEL = model_config(**SMALLER)
 
 
-def train(run_dir: Path, steps: int, optimizer: OptimizerConfig = WSD, **options):
+def train(run_dir: Path, steps: int, optimizer: OptimizerConfig = WSD, model=MODEL, **options):
     config: TrainConfig = replace(train_config(optimizer=optimizer), steps=steps)
     return train_model(
-        MODEL, TABLE, config, batches(MODEL), run_dir=run_dir, provenance={"data": "random"},
+        model, TABLE, config, batches(model), run_dir=run_dir, provenance={"data": "random"},
         options=LoopOptions(log_every=1, **options),
     )  # fmt: skip
 
@@ -76,3 +78,45 @@ def test_a_run_does_not_go_on_from_where_another_had_begun_to_decay(tmp_path: Pa
     assert begin_from(tmp_path / "short", tmp_path / "branch", 6) == 6
     with pytest.raises(CheckpointError, match="train.steps: 6 -> 12"):
         train(tmp_path / "branch", 12)
+
+
+def test_a_branch_goes_on_with_another_optimiser_and_order_of_data_and_remembers_it(tmp_path: Path):
+    source, new, slower = tmp_path / "source", tmp_path / "new", replace(WSD, learning_rate=1e-3, schedule="constant")
+    train(source, 6, keep_every=2)
+    assert branch(source, new, 2) == 2 and list_steps(new / CHECKPOINTS) == [2]
+    with pytest.raises(CheckpointError, match="model.width"):
+        train(new, 12, slower, model=replace(MODEL, width=2 * MODEL.width))
+    first = train(new, 4, slower)
+    assert first.resumed_from == 2 and list_steps(new / CHECKPOINTS) == [2, 4]
+    logs = [(tmp_path / name / "metrics.jsonl").read_text().split("\n") for name in ("source", "new")]
+    assert logs[1][:2] == logs[0][:2] and logs[1][2] != logs[0][2]
+    (was,) = load_run(new).provenance["branched"]
+    assert was["step"] == 2 and was["train"]["optimizer"]["learning_rate"] == WSD.learning_rate
+    assert train(new, 8, slower).resumed_from == 4, "from its own checkpoint, which knows of the branching"
+    with pytest.raises(CheckpointError, match="train.optimizer.learning_rate"):
+        train(new, 8)
+    branch(new, tmp_path / "again", 8)
+    assert train(tmp_path / "again", 9).resumed_from == 8
+    assert [b["step"] for b in load_run(tmp_path / "again").provenance["branched"]] == [2, 8]
+
+
+def test_what_cannot_be_branched(tmp_path: Path):
+    source, new = tmp_path / "source", tmp_path / "new"
+    with pytest.raises(ConfigError, match="has no checkpoint; give"):
+        branch(source, new)
+    train(source, 4, keep_every=3)
+    with pytest.raises(ConfigError, match="no checkpoint of step 2; it has those of 3, 4. .*keep-every"):
+        branch(source, new, 2)
+    assert not new.exists()
+    assert branch(source, new) == 4
+    with pytest.raises(ConfigError, match="is a run already"):
+        branch(source, new)
+    shutil.rmtree(new / CHECKPOINTS)
+    with pytest.raises(ConfigError, match="branch again"):
+        train(new, 6)
+    assert (new / FILE).exists() and branch(source, new, 3) == 3, "one that was cut short is made again"
+
+
+def test_checkpoints_of_every_so_many_steps_stay(tmp_path: Path):
+    train(tmp_path, 10, checkpoint_every=1, keep_every=5)
+    assert list_steps(tmp_path / CHECKPOINTS) == [5, 9, 10]
