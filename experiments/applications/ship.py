@@ -63,7 +63,7 @@ ZOOM, COLOURS = 2, 128  # of the clip
 
 
 class Shipped(NamedTuple):
-    """What a checkpoint for inference holds."""
+    """What a checkpoint for inference holds: the average where `train.ema_decay` is not 0, as `load_run` takes it."""
 
     params: Params
 

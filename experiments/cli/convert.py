@@ -259,8 +259,9 @@ def _describe(run: Run) -> None:
     variant = "continuous" if run.model.diffusion else "discrete"
     count = declare_model(run.model, run.table).count()
     say(
-        f"{variant} model, width {run.model.width}, {run.model.layers} layers, {count:,} parameters, robots: "
-        + ", ".join(run.table.names)
+        f"{variant} model, width {run.model.width}, {run.model.layers} layers, {count:,} parameters, "
+        + (f"{'average' if run.weights == 'ema' else 'last'} weights of step {run.step:,}, " if run.step else "")
+        + f"robots: {', '.join(run.table.names)}"
     )
 
 

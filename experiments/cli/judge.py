@@ -108,7 +108,7 @@ def judge(
     defaults = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
     if recordings is None:
         if robot not in ROBOTS:
-            require_robot(robot, load_run(run).table.names)
+            require_robot(robot, load_run(run, "auto").table.names)
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
         defaults[2:] = 0, 0  # recordings have no expert to clone

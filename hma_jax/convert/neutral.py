@@ -1,8 +1,8 @@
 """A model for other frameworks: arrays under our paths, and a JSON description that explains them.
 
 model.safetensors   every parameter, float32
-model.json          configurations, robots and provenance; of every array its shape, axes (the
-                    dimension letters; null where an axis has none) and muP role
+model.json          step, which weights (last or ema), configurations, robots and provenance; of every array its
+                    shape, axes (the dimension letters; null where an axis has none) and muP role
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
+from hma_jax.config.base import require_choice
 from hma_jax.config.json import from_dict, to_plain_json
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.table import check_names, flat, nested
-from hma_jax.convert.tensors import read_finite, read_safetensors, write_safetensors
+from hma_jax.convert.tensors import FLOATS, read_finite, read_safetensors, write_safetensors
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec
-from hma_jax.training.runs import Run, describe_run
+from hma_jax.training.runs import Run, describe_run, modernise
 
 FORMAT, VERSION = "hma-jax", 1
 DESCRIPTION, WEIGHTS = "model.json", "model.safetensors"
@@ -41,6 +42,7 @@ def write_neutral(run: Run, directory: Path) -> None:
         "format": FORMAT,
         "version": VERSION,
         "step": run.step,
+        "weights": run.weights,
         **describe_run(run.model, run.train, run.table, run.provenance),
         "tensors": describe_tensors(declare_model(run.model, run.table).leaves()),
     }
@@ -59,10 +61,10 @@ def read_neutral(directory: Path) -> Run:
         raise ConfigError(f"no {path} ({error.strerror}); give a directory with {DESCRIPTION} and {WEIGHTS}") from error
     except ValueError as error:
         raise ConfigError(f"{path} is not JSON: {error}") from error
-    fields = {"format", "version", "step", "model", "train", "table", "provenance", "tensors"}
+    fields = {"format", "version", "step", "weights", "model", "train", "table", "provenance", "tensors"}
     found = set(description) if isinstance(description, dict) else set()
     require(
-        found == fields and description["format"] == FORMAT,
+        found | {"weights"} == fields and description["format"] == FORMAT,
         f"{path}: not a model description of this project: its fields are {', '.join(sorted(found)) or 'none'}, but "
         f"{', '.join(sorted(fields))} were expected",
     )
@@ -73,11 +75,15 @@ def read_neutral(directory: Path) -> Run:
     )
     step = description["step"]
     require(type(step) is int and step >= 0, f"{path}: step must be a number of steps, got {step!r}")
-    for name in ("tensors", "provenance"):
+    for name in ("model", "train", "table", "tensors", "provenance"):
         kind = type(description[name]).__name__
         require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
-    model = from_dict(ModelConfig, description["model"], f"{path}: model")
-    table = from_dict(EmbodimentTable, description["table"], f"{path}: table")
+    description = modernise(description, str(path))
+    model, train = from_dict(ModelConfig, description["model"]), from_dict(TrainConfig, description["train"])
+    table = from_dict(EmbodimentTable, description["table"])
+    # Earlier versions did not say which; by default they wrote the average where there was one.
+    which = description.get("weights", "ema" if train.ema_decay else "last")
+    require_choice(which, ("last", "ema"), f"{path}: weights")
     leaves = declare_model(model, table).leaves()
     want = describe_tensors(leaves)
     wrong = [
@@ -93,13 +99,15 @@ def read_neutral(directory: Path) -> Run:
     tensors = read_safetensors(directory / WEIGHTS)
     shapes = {name: spec.shape for name, spec in leaves.items()}
     check_names(shapes, {name: tensor.shape for name, tensor in tensors.items()}, str(directory / WEIGHTS))
-    foreign = [name for name, tensor in tensors.items() if tensor.dtype != np.float32]
-    require(not foreign, f"{directory / WEIGHTS}: not of type float32: {', '.join(foreign[:10])}")
+    foreign = [name for name, tensor in tensors.items() if tensor.dtype.name not in FLOATS]
+    require(not foreign, f"{directory / WEIGHTS}: not of type {', '.join(FLOATS)}: {', '.join(foreign[:10])}")
+    arrays = {name: read_finite(tensors, name, str(directory / WEIGHTS)) for name in tensors}
     return Run(
         model,
-        from_dict(TrainConfig, description["train"], f"{path}: train"),
+        train,
         table,
-        nested({name: read_finite(tensors, name, str(directory / WEIGHTS)) for name in tensors}),
+        nested({name: values.astype(np.float32, copy=False) for name, values in arrays.items()}),
         step,
         description["provenance"],
+        which,
     )

@@ -34,7 +34,7 @@ from hma_jax.convert.official_config import (
 )
 from hma_jax.convert.release_limits import ATTENTION_SCALE, loads_in_release, released_form, require_official
 from hma_jax.convert.table import check_names, flat, from_official, nested, official_parts, to_official
-from hma_jax.convert.tensors import Stored, read_safetensors, write_safetensors
+from hma_jax.convert.tensors import FLOATS, Stored, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
@@ -43,7 +43,6 @@ from hma_jax.training.runs import Run
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")
-FLOATS = ("float32", "float16", "bfloat16")
 ACTIONS_IN = ("stem/into/kernel", "action_head/robots/into/kernel")
 """Parameters [E, U, ...] that multiply actions, given or noised."""
 

@@ -20,7 +20,7 @@ from hma_jax.config import Dtype, ImageSize, Magvit2Config, require
 from hma_jax.config.json import from_dict
 from hma_jax.convert.official import CONFIG, read_config
 from hma_jax.convert.table import check_names, nested
-from hma_jax.convert.tensors import Stored, read_finite, read_safetensors
+from hma_jax.convert.tensors import FLOATS, Stored, read_finite, read_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.params import Declared, Params, ParamSpec
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
@@ -39,8 +39,6 @@ FILES = (
     "magvit2.ckpt",
 )
 """Where weights lie in a directory; the first that is there is read."""
-
-FLOATS = ("float32", "float16", "bfloat16", "float64")
 
 
 @dataclass(frozen=True)
@@ -123,8 +121,9 @@ def tokenizer_params(source: Source, declared: Declared, tensors: Mapping[str, S
     """Our parameters, float32. Raises ConfigError naming tensors that are missing, too many, of another
     shape, no floats or not finite."""
     check_names(tokenizer_shapes(source, declared), {n: t.shape for n, t in tensors.items()}, where)
-    foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
-    require(not foreign, f"{where}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
+    floats = (*FLOATS, "float64")
+    foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in floats}
+    require(not foreign, f"{where}: tensors that are not of type {', '.join(floats)}: {foreign}")
 
     def read(path: str, spec: ParamSpec) -> jnp.ndarray:
         values = read_finite(tensors, source.official_name(path), where).astype(np.float32)

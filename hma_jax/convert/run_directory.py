@@ -19,11 +19,13 @@ from hma_jax.training.state import TrainState, state_shapes
 
 def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None) -> None:
     """Writes a checkpoint of step 0 with a fresh optimiser state, and `texts`, files by name, into the run directory.
+    Where the weights were trained, `converted` in its provenance says at which step they were and which ones.
 
     Raises ConfigError if `directory` exists.
     """
     with atomic_directory(directory) as temporary:
-        meta = describe_run(run.model, run.train, run.table, run.provenance)
+        converted = {"converted": {"step": run.step, "weights": run.weights}} if run.step else {}
+        meta = describe_run(run.model, run.train, run.table, run.provenance | converted)
         with Checkpoints(temporary / CHECKPOINTS, meta) as checkpoints:
             checkpoints.save(0, fresh_state(run))
         for name, text in (texts or {}).items():

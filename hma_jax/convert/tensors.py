@@ -28,6 +28,9 @@ DTYPES = {
 }
 """What safetensors calls the element types that a checkpoint may have."""
 
+FLOATS = ("float32", "float16", "bfloat16")
+"""Element types of weights: all of their values are also values of float32."""
+
 
 @dataclass(frozen=True)
 class Stored:

@@ -136,8 +136,8 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     The parameters lie in memory of the host, as arrays of NumPy: one device may be too small for them. Of a run that
     is being trained, and removes the checkpoint while it is read, a newer one is taken. With several processes all
     call this, and read the same one. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign,
-    ReadError if it cannot be read now, and ConfigError for an average that the run does not keep, and for weights
-    called otherwise.
+    ReadError if it cannot be read now, and ConfigError for weights that the run does not keep, or that are called
+    otherwise. A shipped model keeps one item of weights: their average if `train.ema_decay` is not 0.
     """
     require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)
@@ -168,10 +168,15 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
     averaged = bool(broadcast_from_writer("average", "kept" if averaged else ""))  # all read the same item
     described = modernise(described, str(run_dir))
     model = from_dict(ModelConfig, described["model"])
+    train = from_dict(TrainConfig, described["train"])
     table = from_dict(EmbodimentTable, described["table"])
+    alone = train.ema_decay > 0 and not averaged  # shipped: `params` are the average
     require(
-        averaged or weights != "ema",
+        averaged or alone or weights != "ema",
         f"{run_dir} keeps no average of its weights (train.ema_decay is 0); use the last weights",
+    )
+    require(
+        not alone or weights != "last", f"{run_dir} keeps only the average of its weights, not the last ones; use ema"
     )
     item = "ema" if averaged and weights != "last" else "params"
     declared = declare_model(model, table)
@@ -180,12 +185,12 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
     require_params(declared, params, f"{checkpoint} is not of the model that it describes")
     return Run(
         model,
-        from_dict(TrainConfig, described["train"]),
+        train,
         table,
         params,
         int(checkpoint.name),
         described["provenance"],
-        "ema" if item == "ema" else "last",
+        "ema" if item == "ema" or alone else "last",
     )
 
 

@@ -84,12 +84,12 @@ def test_what_is_kept_is_drawn_again(name, tmp_path):
 
 
 def test_the_model_that_two_cores_train_was_trained_as_its_preset_says():
-    run = load_run(RESULTS / "simulator_weighed")
-    assert (run.model, run.train) == (PRESETS["play"].model, PRESETS["play"].train)
+    run = load_run(RESULTS / "simulator_weighed", "auto")
+    assert run.weights == "ema" and (run.model, run.train) == (PRESETS["play"].model, PRESETS["play"].train)
 
 
 def test_the_model_that_is_driven_was_trained_as_docs_say():
-    run, preset = load_run(RESULTS.parents[1] / DRIVEN), PRESETS["play-gpu"]
+    run, preset = load_run(RESULTS.parents[1] / DRIVEN, "auto"), PRESETS["play-gpu"]
     masking = replace(preset.train.masking, own_past=1.0, own_past_rounds=3)
     optimizer = replace(preset.train.optimizer, learning_rate=2e-3, decay_fraction=0.5)
     assert run.model == preset.model

@@ -119,15 +119,20 @@ def test_the_average_of_the_weights_is_what_is_converted_unless_told_otherwise(a
     state = fresh_state(run)._replace(ema=jax.tree.map(lambda x: np.asarray(x) + 1, plain.params))
     about = describe_run(run.model, run.train, run.table, run.provenance)
     with Checkpoints(tmp_path / "run" / "checkpoints", about) as checkpoints:
-        checkpoints.save(0, state)
+        checkpoints.save(7, state)
     weights = ["--weights", asked] if asked else []
 
     def convert(command: str, start: str, out: str, *options: str) -> int:
         return main(["convert", command, str(tmp_path / start), "--out", str(tmp_path / out), *options])
 
     assert convert("to-safetensors", "run", "neutral", *weights) == 0
+    which = {"ema": "average", "params": "last"}[taken]
+    assert f"{which} weights of step 7, robots: " in " ".join(capsys.readouterr().out.split())
     assert convert("from-safetensors", "neutral", "again") == 0
-    got, want = load_run(tmp_path / "again").params, getattr(state, taken)
+    again = load_run(tmp_path / "again")
+    converted = {"step": 7, "weights": {"ema": "ema", "params": "last"}[taken]}
+    assert (again.step, again.provenance) == (0, run.provenance | {"converted": converted})
+    got, want = again.params, getattr(state, taken)
     for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
         np.testing.assert_array_equal(x, y)
     assert convert("to-safetensors", "plain", "none", "--weights", "ema") == 2

@@ -19,11 +19,13 @@ import numpy as np
 import pytest
 
 import hma_jax
+from experiments.applications.ship import Shipped
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import inference_params
 from hma_jax.training import reading, runs
+from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import ReadError
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
@@ -220,6 +222,19 @@ def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Pat
         load_run(old_run, "ema")
     with pytest.raises(ConfigError, match="weights: 'newest' is not allowed; choose one of auto, last, ema"):
         load_run(run_dir, "newest")  # gave the average
+
+
+def test_a_run_that_was_shipped_with_its_average_alone_says_so(averaged, tmp_path: Path):
+    """As `ship` leaves it: the average is its `params`. It was called the last weights."""
+    saved = tmp_path / "run" / "checkpoints"
+    about = describe_run(MODEL, AVERAGED, TABLE, {})
+    with Checkpoints(saved, about) as checkpoints:
+        checkpoints.save(2, Shipped(averaged[1].ema))
+    for weights in ("auto", "ema"):
+        run = load_run(tmp_path / "run", weights)
+        assert run.weights == "ema" and equal(run.params, averaged[1].ema)
+    with pytest.raises(ConfigError, match="keeps only the average of its weights, not the last ones; use ema"):
+        load_run(tmp_path / "run", "last")
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

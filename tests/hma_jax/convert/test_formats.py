@@ -26,7 +26,7 @@ from hma_jax.convert import (
     write_stablehlo,
 )
 from hma_jax.convert.stablehlo import generate_function
-from hma_jax.convert.table import flat
+from hma_jax.convert.table import flat, nested
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.generation import rollout
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
@@ -91,6 +91,33 @@ def test_safetensors_bring_everything_back(changes, tmp_path):
     assert described["stem/into/kernel"] == {"shape": [3, 14, 32], "axes": ["E", "U", "D"], "role": "input"}
 
 
+def test_what_an_earlier_version_described_is_read_back(tmp_path):
+    """As `load_run` reads its runs: without fields that came later, with those that are gone."""
+    run = small_run()
+    run = replace(run, train=replace(run.train, ema_decay=0.5), weights="ema")
+    write_neutral(run, tmp_path / "out")
+    path = tmp_path / "out" / "model.json"
+    earlier = json.loads(path.read_text())
+    del earlier["weights"], earlier["model"]["recall"]
+    earlier["model"]["compute_dtype"], earlier["train"]["accumulate"] = "float32", 1
+    path.write_text(json.dumps(earlier))
+    same(read_neutral(tmp_path / "out"), run)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_weights_in_half_precision_are_read_back_widened(dtype, tmp_path):
+    run = small_run()
+    write_neutral(run, tmp_path / "out")
+    narrow = {name: x.astype(jnp.dtype(dtype)) for name, x in flat(run.params).items()}
+    write_safetensors(tmp_path / "out" / "model.safetensors", narrow)
+    same(
+        read_neutral(tmp_path / "out"), replace(run, params=nested({n: x.astype("float32") for n, x in narrow.items()}))
+    )
+    write_safetensors(tmp_path / "out" / "model.safetensors", {n: x.astype("int32") for n, x in narrow.items()})
+    with pytest.raises(ConfigError, match="not of type float32, float16, bfloat16: "):
+        read_neutral(tmp_path / "out")
+
+
 def test_settings_that_are_infinite_are_written_as_json_has_it_and_read_back(tmp_path):
     run = small_run(diffusion=replace(DIFFUSION, clip=math.inf))
     run = replace(run, train=replace(run.train, optimizer=replace(run.train.optimizer, clip_norm=math.inf)))
@@ -115,6 +142,8 @@ def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
     refused("not a model description of this project", format="other")
     refused("model.width", model=good["model"] | {"width": "wide"})
     refused("step must be a number of steps, got 2.5", step=2.5)
+    refused("weights: 'auto' is not allowed; choose one of last, ema", weights="auto")
+    refused("model: expected named fields, got int", model=3)
     refused("tensors: expected named fields, got NoneType", tensors=None)
     refused("provenance: expected named fields, got list", provenance=[])
     refused("embed/tables", model=good["model"] | {"factor_vocab": 16})
