@@ -173,31 +173,14 @@ def fit(
             began = clock()
             compiled = step_fn.lower(state, batch).compile()
             compile_seconds = clock() - began
-            agreement = AgreedMaximum()
+            between = _BetweenSteps(steps, run_dir, options, info.records, validation, log, checkpoints, lock, stop)
             barrier("compiled")
 
-            began = saved = clock()
-            seconds_aside = 0.0
-            log.start_clock(start)
-            pending: tuple[int, dict[str, jax.Array]] | None = None
-
-            @contextmanager
-            def aside() -> Iterator[None]:
-                """What is done within is not counted as training."""
-                nonlocal seconds_aside
-                before = clock()
-                yield
-                took = clock() - before
-                log.discount(took)
-                seconds_aside += took
-
-            def request() -> int:
-                return STOP if stop.is_set() else SAVE if _is_late(clock() - saved, options) else 0
-
+            between.start_clock(start)
             for step in range(start + 1, steps + 1):
                 if step == trace.first:
                     jax.block_until_ready(state)
-                    with aside():
+                    with between.aside():
                         trace.start()
                 with jax.profiler.StepTraceAnnotation("train", step_num=step):
                     state, metrics = compiled(state, batch)
@@ -205,37 +188,98 @@ def fit(
                         batch = put_batch(_next(batches, step, steps))
                 if step == trace.last:
                     jax.block_until_ready(state)
-                    with aside():
+                    with between.aside():
                         trace.stop()
-                if pending is not None:
-                    _report(log, *pending, info.records)
-                pending = (step, metrics)
-                checkpoints.raise_failure()
-                wanted = agreement.result(request)
-                last, stopping = step == steps, wanted == STOP
-                to_validate = validation is not None and (last or step % validation.every == 0)
-                to_save = last or wanted or _is_due(step, options)
-                if to_validate or to_save:
-                    _report(log, *pending, info.records)  # a diverged step is neither validated nor saved
-                    pending = None
-                if to_validate:
-                    with aside():
-                        log.write_validation(step, validation.measure(state))
-                if to_save:
-                    log.flush()
-                    _require_held(lock, run_dir, step)
-                    checkpoints.save(step, state)
-                    saved = clock()
-                agreement.submit(request)
-                if stopping and not last:
-                    checkpoints.wait()
-                    raise Interrupted(
-                        f"stopped at step {step} of {steps}; the same command resumes from {run_dir}", stop.exit
-                    )
+                between.act(step, state, metrics)
             jax.block_until_ready(state)
-            seconds = clock() - began - seconds_aside
+            seconds = between.seconds()
             checkpoints.wait()
     return FitResult(state, log.losses, seconds, compile_seconds, start)
+
+
+class _BetweenSteps:
+    """What is done between two steps: metrics are written, the state is validated and saved, the run is stopped."""
+
+    def __init__(
+        self,
+        steps: int,
+        run_dir: Path,
+        options: LoopOptions,
+        records: Records,
+        validation: ValidationHook | None,
+        log: RunLog | SilentLog,
+        checkpoints: Checkpoints,
+        lock: Lock | None,
+        stop: _Stop,
+    ):
+        self._steps, self._run_dir, self._options = steps, run_dir, options
+        self._records, self._validation = records, validation
+        self._log, self._checkpoints, self._lock, self._stop = log, checkpoints, lock, stop
+        self._agreement = AgreedMaximum()
+        self._pending: tuple[int, dict[str, jax.Array]] | None = None  # a step whose metrics are not written yet
+        self._began = self._saved = self._seconds_aside = 0.0  # see `start_clock`
+
+    def start_clock(self, start: int) -> None:
+        """Training begins now, after `start` steps."""
+        self._began = self._saved = self._options.clock()
+        self._log.start_clock(start)
+
+    def seconds(self) -> float:
+        """Spent in training since `start_clock`."""
+        return self._options.clock() - self._began - self._seconds_aside
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """What is done within is not counted as training."""
+        before = self._options.clock()
+        yield
+        took = self._options.clock() - before
+        self._log.discount(took)
+        self._seconds_aside += took
+
+    def act(self, step: int, state: Any, metrics: dict[str, jax.Array]) -> None:
+        """After `step` was dispatched. Raises as `fit`."""
+        self._report()
+        self._pending = step, metrics
+        self._checkpoints.raise_failure()
+        wanted = self._agreement.result(self._request)
+        last, stopping = step == self._steps, wanted == STOP
+        to_validate = self._validation is not None and (last or step % self._validation.every == 0)
+        to_save = last or wanted or _is_due(step, self._options)
+        if to_validate or to_save:
+            self._report()  # a diverged step is neither validated nor saved
+        if to_validate:
+            with self.aside():
+                self._log.write_validation(step, self._validation.measure(state))
+        if to_save:
+            self._log.flush()
+            _require_held(self._lock, self._run_dir, step)
+            self._checkpoints.save(step, state)
+            self._saved = self._options.clock()
+        self._agreement.submit(self._request)
+        if stopping and not last:
+            self._checkpoints.wait()
+            raise Interrupted(
+                f"stopped at step {step} of {self._steps}; the same command resumes from {self._run_dir}",
+                self._stop.exit,
+            )
+
+    def _report(self) -> None:
+        """Writes the metrics of a step that waits for it. Raises DivergedError, and writes nothing, if they are not
+        finite."""
+        if self._pending is None:
+            return
+        step, metrics = self._pending
+        # With as many digits as single precision has: half the bytes of a log, and nothing is lost.
+        values = {name: float(str(np.float32(value))) for name, value in jax.device_get(metrics).items()}
+        require_finite(step, values, self._log.run_dir, self._records)
+        self._log.write(step, {name: value for name, value in values.items() if not name.startswith(FINITE)})
+        self._pending = None
+
+    def _request(self) -> int:
+        if self._stop.is_set():
+            return STOP
+        return SAVE if _is_late(self._options.clock() - self._saved, self._options) else 0
 
 
 def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
@@ -244,14 +288,6 @@ def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
         return next(batches)
     except StopIteration:
         raise ConfigError(f"there are batches for only {done} of {steps} steps; give one for every step") from None
-
-
-def _report(log: RunLog | SilentLog, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
-    """Writes a step's metrics. Raises DivergedError, and writes nothing, if they are not finite."""
-    # With as many digits as single precision has: half the bytes of a log, and nothing is lost.
-    values = {name: float(str(np.float32(value))) for name, value in jax.device_get(metrics).items()}
-    require_finite(step, values, log.run_dir, records)
-    log.write(step, {name: value for name, value in values.items() if not name.startswith(FINITE)})
 
 
 def _require_held(lock: Lock | None, run_dir: Path, step: int) -> None:
