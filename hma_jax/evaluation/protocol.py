@@ -69,6 +69,14 @@ Optional:
 """
 
 
+class Recorded(NamedTuple):
+    """Frames and chunks that fit the model's window."""
+
+    tokens: jax.Array  # [B, T, S (, C)]
+    actions_BTU: jax.Array
+    embodiment_B: jax.Array
+
+
 class Predicted(NamedTuple):
     """Tokens of the frames that are compared, from `EvalConfig.first_predicted` on."""
 
@@ -91,14 +99,18 @@ def predicts_frames(setting: Setting) -> bool:
 def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) -> tuple[jax.Array, jax.Array]:
     """(chunks [B, 1 + draws, T, U], keys of decoding [B]): the recorded actions, then the random ones,
     which differ from them from the first chunk that leads to a predicted frame."""
-    actions, window = batch["actions"], (batch["embodiment"], batch["episode"], batch["start"])
-    frames, first_free = actions.shape[1], config.first_predicted - 1
-    key_B = window_keys(config.seed, "actions", table, *window)
+    actions, frames, first_free = batch["actions"], batch["actions"].shape[1], config.first_predicted - 1
+    key_B = keys_of(batch, "actions", table, config)
     statistics = action_statistics(batch, table)
     other = random_actions(key_B, batch["embodiment"], table, config.random_actions, frames, statistics)
     other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
-    decoding_B = window_keys(config.seed, "decoding", table, *window)
+    decoding_B = keys_of(batch, "decoding", table, config)
     return jnp.concatenate([actions[:, None], other], axis=1), decoding_B
+
+
+def keys_of(batch: Batch, purpose: Purpose, table: EmbodimentTable, config: EvalConfig) -> jax.Array:
+    """A key for each window of a batch, [B]."""
+    return window_keys(config.seed, purpose, table, batch["embodiment"], batch["episode"], batch["start"])
 
 
 def action_statistics(batch: Batch, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
@@ -141,18 +153,23 @@ def make_predictor(
         params: Params, batch: Batch, units: ActionUnits = table.scale()
     ) -> tuple[dict[str, jax.Array], Predicted | None]:
         hma, real = declared.merge(params).with_action_units(units), batch.get("real")
-        window = batch["tokens"][:, : model.frames], batch["actions"][:, : model.frames], batch["embodiment"]
+        window = Recorded(batch["tokens"][:, : model.frames], batch["actions"][:, : model.frames], batch["embodiment"])
         real_window = None if real is None else real[:, : model.frames]
 
-        def keys(purpose: Purpose) -> jax.Array:
-            return window_keys(config.seed, purpose, table, window[2], batch["episode"], batch["start"])
-
-        metrics, predicted = {"finite": jnp.ones(len(window[0]), bool)}, None
+        metrics, predicted = {"finite": jnp.ones(len(window.tokens), bool)}, None
         if predicts_frames(setting):
-            metrics, predicted = _frame_metrics(hma, window, batch, table, config, setting, keys("likelihood"))
+            metrics, predicted = _frame_metrics(hma, window, batch, table, config, setting)
         if predicts_actions(model, setting):
-            causally, statistics = setting != "inverse", action_statistics(batch, table)
-            errors = _policy_errors(hma, *window, keys("policy"), config, causally, statistics, real_window)
+            statistics = action_statistics(batch, table)
+            errors = _policy_errors(
+                hma,
+                window,
+                keys_of(batch, "policy", table, config),
+                config,
+                causally=setting != "inverse",
+                statistics=statistics,
+                real_BT=real_window,
+            )
             metrics |= errors | {"finite": metrics["finite"] & errors["finite"]}
         return metrics, predicted
 
@@ -161,15 +178,14 @@ def make_predictor(
 
 def _frame_metrics(
     hma: HMA,
-    window: tuple[jax.Array, jax.Array, jax.Array],
+    window: Recorded,
     batch: Batch,
     table: EmbodimentTable,
     config: EvalConfig,
     setting: Setting,
-    key_B: jax.Array,
 ) -> tuple[dict[str, jax.Array], Predicted]:
     """(metrics of tokens, Predicted) of a model that was trained for frames; `window` is what of a batch fits it."""
-    model = hma.config
+    model, key_B = hma.config, keys_of(batch, "likelihood", table, config)
     tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
     hidden = hidden_at_inference(table, setting, robots, actions.shape[1])
     sequences, decoding = evaluation_inputs(batch, table, config)
@@ -178,10 +194,10 @@ def _frame_metrics(
     real_from_1 = None if real is None else real[:, 1 : model.frames]
 
     def likelihood(out: jax.Array) -> dict[str, jax.Array]:
-        return _likelihood(hma, out, window[0][:, 1:], key_B, real_from_1)
+        return _likelihood(hma, out, window.tokens[:, 1:], key_B, real_from_1)
 
     def likelihood_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
-        return likelihood(next_frame_outputs(hma, window[0], actions_BTU, robots, hidden_window))
+        return likelihood(next_frame_outputs(hma, window.tokens, actions_BTU, robots, hidden_window))
 
     if config.context == "recorded":
         require(
@@ -201,17 +217,17 @@ def _frame_metrics(
         last = last_frames(random, ahead, axis=2)
         predicted = Predicted(made[:, 0], last, random[:, 0], made[:, -1] if counterfactual else None)
     if "other_actions" in batch:
-        found = for_each_sequence(likelihood_under, window[1], batch["other_actions"][:, :, : model.frames])
+        found = for_each_sequence(likelihood_under, window.actions_BTU, batch["other_actions"][:, :, : model.frames])
         loss, finite = found["diffusion_loss" if model.diffusion else "cross_entropy"], found["finite"]
         metrics = {name: x[0] for name, x in found.items()} | action_metrics(loss, batch["other_valid"])
         metrics["finite"] &= (finite[1:] | ~batch["other_valid"].T).all(0)
         return metrics, predicted
-    return likelihood_under(window[1]) if config.context == "generated" else likelihood(out), predicted
+    return likelihood_under(window.actions_BTU) if config.context == "generated" else likelihood(out), predicted
 
 
 def _after_recorded(
     model: HMA,
-    window: tuple[jax.Array, jax.Array, jax.Array],
+    window: Recorded,
     sequences: jax.Array,
     key_B: jax.Array,
     config: EvalConfig,
@@ -263,11 +279,10 @@ def _likelihood(
 
 def _policy_errors(
     model: HMA,
-    tokens: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
+    window: Recorded,
     key_B: jax.Array,
     config: EvalConfig,
+    *,
     causally: bool,
     statistics: tuple[jax.Array, jax.Array],
     real_BT: jax.Array | None,
@@ -275,6 +290,7 @@ def _policy_errors(
     """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live action value, of the
     model and of always giving the mean; nan where no value is live, as of a robot without actions, and where the window
     ends before the prompt does. `finite` says whether the error is a number wherever there is one."""
+    tokens, actions_BTU, embodiment_B = window
     decode, first, judged_BT = config.decode, config.prompt_frames - 1, real_BT
     if causally:
         predicted = predict_next_actions(model, tokens, actions_BTU, embodiment_B, key_B, decode)

@@ -201,10 +201,11 @@ def test_robots_without_actions_have_no_error_of_predicted_ones(monkeypatch):
     """They do not count as predicted without error in the mean over robots."""
     (batch,) = make_batches(CONFIG, each=2)
     monkeypatch.setattr(protocol, "predict_actions", lambda model, tokens, actions, *_, **__: actions + 1)
-    arguments = (CONFIG, batch["tokens"], batch["actions"], batch["embodiment"], None, EVAL, False)
+    window = protocol.Recorded(batch["tokens"], batch["actions"], batch["embodiment"])
     mean, std = (np.asarray(x)[batch["embodiment"]] for x in TABLE.statistics())
     film = np.asarray(batch["dataset"]) == "arm"
-    found = protocol._policy_errors(*arguments, (mean, np.where(film[:, None], 0, std)), None)
+    statistics = (mean, np.where(film[:, None], 0, std))
+    found = protocol._policy_errors(CONFIG, window, None, EVAL, causally=False, statistics=statistics, real_BT=None)
     names, frames = np.asarray(batch["dataset"]), np.full(len(film), CONFIG.frames)
     windows = WindowTable(names, batch["episode"], batch["start"], frames, {k: np.asarray(x) for k, x in found.items()})
     summary = summarise(windows, 1)
@@ -218,10 +219,11 @@ def test_a_window_that_ends_before_the_prompt_has_no_error_of_predicted_actions(
     (batch,) = make_batches(CONFIG, each=2)
     monkeypatch.setattr(protocol, "predict_next_actions", lambda model, tokens, actions, *_: actions + 1)
     config = replace(EVAL, context="recorded", prompt_frames=3)
-    inputs = (batch["tokens"], batch["actions"], batch["embodiment"])
+    window = protocol.Recorded(batch["tokens"], batch["actions"], batch["embodiment"])
     mean, std = (np.asarray(x)[batch["embodiment"]] for x in TABLE.statistics())
     real = np.arange(CONFIG.frames) < np.array([2, 3, 4, CONFIG.frames])[:, None]
-    found = protocol._policy_errors(CONFIG, *inputs, None, config, True, (mean, std), real)["action_error"]
+    found = protocol._policy_errors(CONFIG, window, None, config, causally=True, statistics=(mean, std), real_BT=real)
+    found = found["action_error"]
     np.testing.assert_array_equal(np.isnan(found), [True, False, False, False])
     np.testing.assert_allclose(found[1:3], [np.mean(own[own > 0] ** -2.0) for own in std[1:3]], rtol=1e-3)
     with pytest.raises(ConfigError, match="eval.prompt_frames 9 leaves no action to evaluate in a window of"):
@@ -235,10 +237,11 @@ def test_inverse_dynamics_is_not_judged_by_what_follows_the_last_frame(short, mo
     lengths = np.array([2, 3, 4, 6]) if short else np.full(4, CONFIG.frames)
     wrong = np.arange(CONFIG.frames) >= lengths[:, None] - 1
     monkeypatch.setattr(protocol, "predict_actions", lambda _, __, actions, *_a, **_k: actions + wrong[..., None])
-    inputs = (CONFIG, batch["tokens"], batch["actions"], batch["embodiment"], None, EVAL, False)
+    window = protocol.Recorded(batch["tokens"], batch["actions"], batch["embodiment"])
     statistics = [np.asarray(x)[batch["embodiment"]] for x in TABLE.statistics()]
     real = np.arange(CONFIG.frames) < lengths[:, None]
-    found = protocol._policy_errors(*inputs, statistics, real if short else None)
+    real = real if short else None
+    found = protocol._policy_errors(CONFIG, window, None, EVAL, causally=False, statistics=statistics, real_BT=real)
     np.testing.assert_array_equal(found["action_error"], [np.nan if short else 0, 0, 0, 0])
     assert found["finite"].all() and found["action_error_of_mean"][1:].all()
     settings = replace(EVAL, prompt_frames=CONFIG.frames)
