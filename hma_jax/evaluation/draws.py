@@ -93,5 +93,5 @@ def _normal(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Arr
 
 
 def _hash_of(name: str) -> np.uint32:
-    """The same on every machine and in every version: results depend on it."""
+    """A hash that is the same on every machine and in every version: results depend on it."""
     return np.frombuffer(hashlib.sha256(name.encode()).digest()[:4], "<u4")[0]

@@ -85,7 +85,8 @@ class Difference:
 
     @property
     def errors(self) -> float:
-        """In standard errors, of a normal distribution: as unlikely as it is by Student's t with few episodes."""
+        """The difference in standard errors: those of a normal distribution that is as unlikely as Student's t makes it
+        with few episodes."""
         if self.mean == 0:
             return 0.0
         if not self.sem > 0:
@@ -106,7 +107,7 @@ class Effect:
 
     @property
     def ignored(self) -> bool:
-        """Whether holding the dimension still costs nothing that counts."""
+        """Whether holding the dimension at its mean costs nothing beyond the error."""
         return self.worth.errors < MIN_LOSS_ERRORS
 
 
@@ -115,7 +116,7 @@ LossFn = Callable[[np.ndarray], np.ndarray]
 
 
 def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode: Sequence[int]) -> list[Effect]:
-    """One per dimension of `actions` [n, T, stride, A], whose windows are of `episode` [n].
+    """The effect of each dimension of `actions` [n, T, stride, A]; `episode` [n] says which episode each window is of.
 
     Greedy: the change that helps most is applied first, then the rest is evaluated again, since a wrong dimension makes
     others look wrong.

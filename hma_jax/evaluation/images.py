@@ -99,7 +99,7 @@ def image_metrics(
 
 
 def _finite(tokens: jax.Array, real_BT: jax.Array | None) -> jax.Array:
-    """bool [B]: whether all of them are numbers, in real frames."""
+    """bool [B]: whether all tokens of real frames are finite."""
     finite = jnp.isfinite(tokens).all(tuple(range(2, tokens.ndim)))
     return (finite if real_BT is None else finite | ~real_BT).all(1)
 

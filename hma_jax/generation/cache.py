@@ -29,7 +29,7 @@ class FrameCache(NamedTuple):
         return self.valid.shape[0]
 
     def write(self, layers: TemporalCache, slot: int | jax.Array) -> FrameCache:
-        """With the frames of `layers` in the slots from `slot` on."""
+        """The cache with the frames of `layers` written into the slots from `slot` on."""
 
         def put(old: jax.Array, new: jax.Array) -> jax.Array:
             return jax.lax.dynamic_update_slice_in_dim(old, new, slot, axis=2)
@@ -51,7 +51,7 @@ class Window(NamedTuple):
     def over(
         cls, model: HMA, chunks_BTU: jax.Array, action_hidden_BT: jax.Array | None, embodiment_B: jax.Array
     ) -> Window:
-        """From recorded chunks and which of them the model is not shown (None: it sees all)."""
+        """A window of recorded chunks. Those that `action_hidden_BT` marks (None: none) are not shown to the model."""
         shape = chunks_BTU.shape[:2]
         return cls(model, model.align(chunks_BTU), model.align_hidden(action_hidden_BT, shape), embodiment_B)
 

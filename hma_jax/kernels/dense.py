@@ -1,8 +1,8 @@
 """Products with a weight, with one weight per robot, and look-ups in tables; gradients are written out.
 
-On CPU the narrower factor of a weight gradient is transposed into a copy first: XLA's products of transposed factors
-are slow. A robot's gradient is summed over its
-examples by a product with their one-hot assignment: no scatter, and the same sum on every run.
+On CPU the narrower factor of a weight gradient is first transposed into a copy, because XLA's products of transposed
+factors are slow. A robot's gradient is summed over its examples by a product with their one-hot assignment: there is no
+scatter, and the sum is the same on every run.
 """
 
 from __future__ import annotations

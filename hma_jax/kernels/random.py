@@ -17,7 +17,7 @@ from jax.extend import random as generators
 
 
 def _partitionable(draw: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
-    """`draw` as it is by JAX's default, whatever JAX_THREEFRY_PARTITIONABLE says."""
+    """`draw` with partitionable threefry, JAX's default, whatever JAX_THREEFRY_PARTITIONABLE says."""
 
     @functools.wraps(draw)
     def drawn(*args: Any) -> jax.Array:

@@ -26,7 +26,7 @@ class Past(NamedTuple):
 
 
 def attention_scale(config: ModelConfig) -> float:
-    """What multiplies q.k.
+    """The factor on q.k.
 
     Under muP attention_scale / head width: 8 / I as released, so that logits stay of order one
     as heads widen; otherwise 1 / sqrt(I).

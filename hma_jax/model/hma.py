@@ -43,7 +43,7 @@ class Outputs(NamedTuple):
 
 
 class HMA(nnx.Module):
-    """Both variants, under every conditioning."""
+    """The world model, of ids or of latents, with every kind of conditioning on actions."""
 
     def __init__(self, config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig):
         self.config, self.table, self.dtype = config, table, jnp.dtype(execution.dtype)

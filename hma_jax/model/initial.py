@@ -15,19 +15,19 @@ def hidden_init(config: ModelConfig, fan_in: int, fan_out: int, gain: float) -> 
 
 
 def trunk_init(config: ModelConfig, fan_in: int, fan_out: int) -> Initializer:
-    """A hidden matrix of the trunk.
+    """The initialiser of a hidden matrix of the trunk.
 
-    DIFFERS: the release's continuous variant draws them from N(0, 0.02) at every width, which for
+    DIFFERS: the release's continuous variant draws these from N(0, 0.02) at every width, which for
     square matrices of width 256 is `trunk_gain` 0.32.
     """
     return hidden_init(config, fan_in, fan_out, config.trunk_gain)
 
 
 def input_fan_out(config: ModelConfig) -> float:
-    """The width that Xavier counts as fan-out of matrices from a fixed size.
+    """The fan-out that Xavier counts for a matrix whose input has a fixed size.
 
-    DIFFERS: always the base width, so that what they hold stays as large as biases and embeddings,
-    which learn at the same rate. The release counts the true one: features shrink as 1 / sqrt(D).
+    DIFFERS: it is the base width at every width, so that entries stay as large as those of biases and embeddings,
+    which learn at the same rate. The release counts the true width: features shrink as 1 / sqrt(D).
     """
     return config.width / config.mup_multiplier("init")
 

@@ -150,7 +150,7 @@ def stack(make: Callable[[], M], count: int, axis: str = LAYER_AXIS) -> M:
 
 
 def used(use: Use, module: M) -> M:
-    """`module`, its parameters declared to be of `use`."""
+    """`module`, all of whose parameters now have this `use`."""
     for variable in _params(module):
         variable.set_metadata(use=use)
     return module

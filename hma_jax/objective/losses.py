@@ -212,7 +212,7 @@ def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float 
 
 def action_loss_per_step(
     model: HMA,
-    pooled_BTD: jax.Array,
+    features_BTD: jax.Array,
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     robot_row_B: jax.Array,
@@ -230,12 +230,12 @@ def action_loss_per_step(
         time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion.steps))(keys)
 
         def network(x: jax.Array, t: jax.Array) -> jax.Array:
-            return model.action_head(x, t, pooled_BTD, robot_row_B)
+            return model.action_head(x, t, features_BTD, robot_row_B)
 
         noise = jnp.where(alive_BTU, noise, 0)
         process = make_process(model.config.diffusion.steps)
         some_BTU = alive_BTU | ~alive_BTU.any(axis=-1, keepdims=True)  # a mean over nothing is no number
         return sum(diffusion_loss(network, target, time, noise, process, valid=some_BTU))
-    error = jnp.square(model.action_head(pooled_BTD, robot_row_B) - target)
+    error = jnp.square(model.action_head(features_BTD, robot_row_B) - target)
     alive_BTU = alive_BTU.astype(error.dtype)
     return jnp.sum(error * alive_BTU, axis=-1) / jnp.maximum(jnp.sum(alive_BTU, axis=-1), 1)

@@ -34,7 +34,7 @@ def draw_own_past(
     """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `share` u, u uniform in [0, 1)
     of each example, by ids drawn from the model's own distribution at temperature 1, in so many `rounds`.
 
-    Needs the chunks that lead to them alone; for the meaning of the others see `objective.losses.masked_loss`.
+    The other arguments are as in `objective.losses.masked_loss`.
     """
     masked, head = jnp.ones(before.shape, bool), model.frame_head
 

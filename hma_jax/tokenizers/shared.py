@@ -164,7 +164,7 @@ class BaseTokenizer(abc.ABC):
         return in_pieces(lambda piece: self._decode(self._device_params, piece), tokens, self.at_once)
 
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
-        """Pure: what `decode` does to tokens that are known to be some."""
+        """Pure: `decode` without its checks of the tokens."""
         # DIFFERS: the release truncates, which darkens every image by half a grey level.
         return jnp.round(self.decode_fn(params, tokens)).astype(jnp.uint8)
 

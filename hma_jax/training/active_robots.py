@@ -42,8 +42,9 @@ def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
 
 
 def take(tree: Params, specs: Params, places_G: jax.Array | None) -> Params:
-    """Parameters, or anything with an array per parameter, with robots' slices at these places of the embodiment axis
-    only; None: with all of them. What stands beyond the end of the axis is no number that counts."""
+    """Parameters, or any tree with an array per parameter, reduced to the robots' slices at these places of the
+    embodiment axis; None keeps all slices. A slice beyond the end of the axis has arbitrary values, which nothing
+    reads."""
     if places_G is None:
         return tree
 

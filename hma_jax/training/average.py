@@ -15,12 +15,12 @@ def warmup_decay(updates: int | jax.Array) -> float | jax.Array:
 
 
 def update_average(ema: Params, params: Params, decay: float, updates: jax.Array) -> Params:
-    """d * ema + (1 - d) * params, for all robots, those without an example too, whose parameters stand still.
+    """d * ema + (1 - d) * params, for the parameters of all robots, also of those without an example in the step.
 
-    The average starts as a copy of the initial parameters. So that it is soon free of them, d rises to `decay` with the
-    number of `updates` before this one, int [] (`warmup_decay`): by `decay` alone the average of a
-    short run would be in large part of weights that nothing has trained. All of it is of the same steps: were a robot's
-    only of those that had examples of it, a rare robot's would be of weights from before the learning rate fell.
+    The average starts as a copy of the initial parameters. d rises to `decay` with the number of `updates` before this
+    one, int [] (`warmup_decay`), because with `decay` alone the average of a short run would consist largely of
+    untrained weights. All entries average over the same steps. If a robot's were averaged only in steps with examples
+    of it, the average of a rare robot would hold weights from before the learning rate fell.
     """
     decay = jnp.minimum(decay, warmup_decay(updates))
 

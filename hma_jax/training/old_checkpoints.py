@@ -16,8 +16,11 @@ from hma_jax.training.train_only import own_specs
 
 
 def load_trained(checkpoint: Path, shapes: Mapping[str, Any], declared: Declared, trained_E: np.ndarray) -> Any:
-    """`load_items` of a state with moments of the `trained_E` robots' own parameters alone, also from a checkpoint with
-    moments of everything, of which all robots' own are read into memory of the host."""
+    """Loads a state (`load_items`) whose moments are those of the per-robot parameters of the `trained_E` robots alone.
+
+    The checkpoint may have moments of all parameters: then those of all robots' own parameters are read into memory of
+    the host, and the trained ones are taken.
+    """
     wanted = shapes["opt_state"]
     if saved_shapes(checkpoint, "opt_state", "first") == jax.tree.map(lambda x: tuple(x.shape), wanted.first):
         return load_items(checkpoint, shapes)

@@ -72,7 +72,7 @@ def decay_steps(config: OptimizerConfig, steps: int) -> int:
 
 
 def decay_fits(config: OptimizerConfig, steps: int) -> bool:
-    """Whether the decay, of a schedule that has one, begins after the warm-up and comes to its end."""
+    """Whether the schedule's decay, if it has one, begins after the warm-up and ends within `steps`."""
     if config.schedule == "constant":
         return True
     return config.warmup_steps + (decay_steps(config, steps) if config.schedule == "wsd" else 1) <= steps
@@ -94,9 +94,9 @@ def check_schedule(config: OptimizerConfig, steps: int) -> None:
 
 
 def steps_in_common(config: OptimizerConfig, steps: int, others: int) -> float:
-    """Up to which step a run of `steps` and one of `others` are the same: the rate does not depend on how many are to
-    come. All of them where it is constant, those before the earlier decay of wsd, none of cosine, and none where one
-    of them is shorter than the warm-up."""
+    """The last step up to which a run of `steps` steps and one of `others` have the same learning rates: infinite for
+    a constant rate, the step before the earlier decay for wsd, 0 for cosine, and 0 if one of the runs is shorter than
+    the warm-up."""
     if config.schedule == "cosine" or min(steps, others) < config.warmup_steps:  # the ramp is over by the last step
         return 0
     if config.schedule == "constant":

@@ -1,6 +1,7 @@
-"""Runs that train some robots' own parameters alone (`train.only`): only of these there are moments.
+"""Runs with `train.only`: they train nothing but the per-robot parameters of some robots.
 
-Of what is frozen, most of a model to which a robot is added, they would be two thirds of a state.
+The optimiser keeps moments of these parameters alone. Where a robot is added to a model, nearly all other parameters
+are frozen; their moments would be two thirds of the state.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Everything:
 
 
 class OwnOnly(Everything):
-    """A run that trains the own parameters of the `trained_E` robots alone."""
+    """A run that trains the per-robot parameters of the `trained_E` robots alone."""
 
     shared = False
 
@@ -72,13 +73,14 @@ class OwnOnly(Everything):
 
 
 def places_among(trained_E: np.ndarray) -> np.ndarray:
-    """int32 [E]: each trained robot's place among them; each other robot has a place of its own beyond their end."""
+    """int32 [E]: the index of each trained robot among the trained ones. Every other robot has an index of its own
+    beyond their end."""
     others = trained_E.sum() + np.cumsum(~trained_E) - 1
     return np.where(trained_E, np.cumsum(trained_E) - 1, others).astype(np.int32)
 
 
 def pick_own(tree: Params, specs: Params) -> Params:
-    """The robots' own parameters, or entries of these, without what all robots share."""
+    """The entries of `tree` that belong to per-robot parameters, without those that all robots share."""
     if is_spec(specs):
         return tree
 
@@ -89,14 +91,14 @@ def pick_own(tree: Params, specs: Params) -> Params:
 
 
 def put_own(tree: Params, own: Params) -> Params:
-    """`tree` with what `pick_own` picked from such a tree in its places."""
+    """`tree` with the entries that `pick_own` picks replaced by `own`."""
     if not isinstance(tree, dict):
         return own
     return {name: put_own(part, own[name]) if name in own else part for name, part in tree.items()}
 
 
 def own_specs(specs: Params, robots: int) -> Params:
-    """The specs of the robots' own parameters in a model that has so many."""
+    """The specs of the per-robot parameters in a model of so many `robots`."""
 
     def of(spec: ParamSpec) -> ParamSpec:
         shape = [robots if i == spec.embodiment_axis else size for i, size in enumerate(spec.shape)]
