@@ -20,9 +20,11 @@ STAMP = "evaluation.made_from.json"
 
 
 def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedData, config: EvalConfig) -> MadeFrom:
-    """The stamp of an evaluation on the windows of the datasets `names`. The step is recorded only: of a run that
-    trains on, later results replace earlier ones. So is the seed, for `hma compare`; it is part of the model's hash as
-    well."""
+    """The stamp of an evaluation on the windows of the datasets `names`.
+
+    The step is recorded only: of a run that trains on, later results replace earlier ones. So are, for `hma compare`,
+    the steps that its training was to have, and the seed, which is part of the model's hash as well.
+    """
     train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
     chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {
@@ -43,8 +45,10 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
         "datasets": sorted(names),
         "data": data,
     }
-    trained_here = "loader" in trained.provenance  # a converted model does not know its seed
-    return MadeFrom(inputs, {"step": trained.step} | ({"seed": trained.train.seed} if trained_here else {}))
+    recorded = {"step": trained.step}
+    if "loader" in trained.provenance:  # a converted model does not know them
+        recorded |= {"steps": trained.train.steps, "seed": trained.train.seed}
+    return MadeFrom(inputs, recorded)
 
 
 def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:

@@ -31,6 +31,8 @@ class Side:
     tokenizer: str  # "": unknown
     says_seed: bool = True  # False: its seed is unknown, and the key of `seeds` stands in
     of_study: bool = False  # whether `seeds` are those of a study's reference that are finished
+    step: int = 0  # of its training at which it was evaluated; 0: unknown
+    steps: int = 0  # that its training was to have; 0: unknown
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from experiments.analysis.compare import Side
 from experiments.evaluated import STAMP
@@ -78,24 +79,29 @@ def read_side(path: Path) -> Side:
                 f"{path}: no reference trial of this study ({', '.join(ids.values())}) is finished here; run "
                 f"`{record.command}`, or name two trials"
             )
-        return Side(path.name, seeds, record.provenance.tokenizer, of_study=True)
+        steps = reference_trial(record.study, record.study.seeds[0]).train.steps
+        return Side(path.name, seeds, record.provenance.tokenizer, of_study=True, step=steps, steps=steps)
     if (path / RESULT).exists():
         judged = read_trial(path)
-        return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer)
+        steps = judged.trial.train.steps
+        return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer, step=steps, steps=steps)
     if (path / FILE).exists():
-        tokenizer, seed = _said_of(path)
-        return Side(path.name, {seed or 0: WindowTable.load(path / FILE)}, tokenizer, says_seed=seed is not None)
+        tokenizer, recorded = _said_of(path)
+        seed, step, steps = (recorded.get(name) for name in ("seed", "step", "steps"))
+        windows = {seed or 0: WindowTable.load(path / FILE)}
+        return Side(path.name, windows, tokenizer, says_seed=seed is not None, step=step or 0, steps=steps or 0)
     raise ConfigError(f"{path}: neither a study, nor a finished trial, nor an evaluated model (no {FILE})")
 
 
-def _said_of(run: Path) -> tuple[str, int | None]:
-    """The identity of the tokenizer on whose tokens a model was evaluated, and the seed of its training, by the
-    stamp of `hma evaluate`, else by the run's latest checkpoint; "" and None where neither says it."""
+def _said_of(run: Path) -> tuple[str, dict[str, Any]]:
+    """The identity of the tokenizer on whose tokens a model was evaluated, and of its training the seed, the step and
+    all steps, by the stamp of `hma evaluate`, else the seed by the run's latest checkpoint; "" and nothing where
+    neither says it."""
     from hma_jax.training.reading import list_steps, read_description
 
     if (stamp := read_stamp(run, STAMP)) is not None:
-        return stamp.inputs.get("tokenizer", ""), stamp.recorded.get("seed")
+        return stamp.inputs.get("tokenizer", ""), stamp.recorded
     steps = list_steps(run / CHECKPOINTS)
     described = read_description(run / CHECKPOINTS / str(steps[-1])) if steps else {}
     provenance = described.get("provenance", {})
-    return provenance.get("tokenizer", ""), described["train"]["seed"] if "loader" in provenance else None
+    return provenance.get("tokenizer", ""), {"seed": described["train"]["seed"]} if "loader" in provenance else {}

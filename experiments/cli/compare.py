@@ -84,7 +84,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
 
 
 def _caption(rows: list[Difference], a: Side, b: Side) -> str:
-    """What the errors count, and which seeds, robots and metrics were not compared."""
+    """What the errors count, whose training differs, and which seeds, robots and metrics were not compared."""
     from experiments.analysis.compare import NOT_OF_MODELS
     from experiments.analysis.paired import OF_TOKENS
 
@@ -107,6 +107,10 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
     if len(a.seeds) == len(b.seeds) == 1 and a.says_seed and b.says_seed and a.seeds.keys() != b.seeds.keys():
         of_a, of_b = (f"{escape(side.name)} is of seed {next(iter(side.seeds))}" for side in (a, b))
         caption += f" {of_a}, {of_b}: differences are also those of seeds, which no error counts."
+    known = [side for side in (a, b) if side.step]
+    if len({(side.step, side.steps) for side in known}) > 1 or any(side.step < side.steps for side in known):
+        made = [f"{escape(one.name)} {one.step:,}" + (f" of {one.steps:,}" if one.steps else "") for one in known]
+        caption += f" Steps of training when they were evaluated: {', '.join(made)}."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         caption += f" No error of {few(alone)}: one held-out episode."
     explained = {row.metric for row in rows} | set(NOT_OF_MODELS)

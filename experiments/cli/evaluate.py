@@ -138,7 +138,8 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
         return
     summary = evaluation.summary
     which = ", averaged weights" if trained.weights == "ema" else ""
-    when = f", step {trained.step:,}" if trained.step else ""  # a run that was converted has made no step here
+    of = "" if trained.finished else f" of {trained.train.steps:,}"
+    when = f", step {trained.step:,}{of}" if trained.step else ""  # a run that was converted has made no step here
     console.print(table_of(summary, f"{short(run)}{when}{which}"))
     for name in (STAMP, MEANS):  # if this is killed now, none must stand beside numbers of others
         (place / name).unlink(missing_ok=True)

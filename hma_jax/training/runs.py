@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,7 +21,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params, inference_params, path_name, require_params
 from hma_jax.runtime.devices import default_device
-from hma_jax.runtime.processes import broadcast_from_writer
+from hma_jax.runtime.processes import broadcast_from_writer, is_writer
 from hma_jax.training.hashes import ReadError
 from hma_jax.training.reading import (
     CheckpointError,
@@ -32,6 +33,8 @@ from hma_jax.training.reading import (
     read_description,
 )
 from hma_jax.training.run_lock import CHECKPOINTS
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,11 @@ class Run:
     step: int
     provenance: dict[str, Any]
     weights: Weights = "last"  # which of the run's weights `params` are: last or ema
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps of its training were made. A converted model has step 0 and is taken as it is."""
+        return not 0 < self.step < self.train.steps
 
 
 @dataclass(frozen=True, eq=False)  # compared by identity: it has a hash, which a tree of arrays has not
@@ -138,6 +146,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     call this, and read the same one. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign,
     ReadError if it cannot be read now, and ConfigError for weights that the run does not keep, or that are called
     otherwise. A shipped model keeps one item of weights: their average if `train.ema_decay` is not 0.
+    Logs a warning, once per run and step, for a model whose training is not finished.
     """
     require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)
@@ -148,11 +157,22 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
         raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved a checkpoint")
     while True:
         try:
-            return _read_run(run_dir, directory / str(step), weights)
+            run = _read_run(run_dir, directory / str(step), weights)
+            if not run.finished and is_writer():
+                _warn_of_unfinished(str(run_dir), run.step, run.train.steps)
+            return run
         except (CheckpointError, ReadError):  # of what another host removed, NFS says that it cannot be read
             read, step = step, agree_on_latest(directory)
             if step in (None, read):
                 raise
+
+
+@cache
+def _warn_of_unfinished(run_dir: str, step: int, steps: int) -> None:
+    log.warning(
+        "%s is at step %s of %s: its training is not finished. Run the command that trains it again to continue",
+        run_dir, f"{step:,}", f"{steps:,}",
+    )  # fmt: skip
 
 
 def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:

@@ -70,10 +70,10 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("provenance", "recorded"), [({"loader": {}}, {"step": 3, "seed": 7}), ({"official": 1}, {"step": 3})]
+    ("provenance", "recorded"), [({"loader": {}}, {"step": 3, "steps": 9, "seed": 7}), ({"official": 1}, {"step": 3})]
 )
-def test_the_seed_of_the_training_is_recorded_where_the_run_knows_it(provenance, recorded):
-    of = {"model": {}, "train": TrainConfig(seed=7), "provenance": provenance, "weights": "last", "step": 3}
+def test_the_seed_and_the_steps_of_the_training_are_recorded_where_the_run_knows_them(provenance, recorded):
+    of = {"model": {}, "train": TrainConfig(seed=7, steps=9), "provenance": provenance, "weights": "last", "step": 3}
     prepared = SimpleNamespace(
         manifest=SimpleNamespace(datasets=(), frames=4, rate=2.0), tokenizer=SimpleNamespace(identity="t")
     )

@@ -194,6 +194,17 @@ def test_a_field_that_came_later_takes_its_default_and_an_unknown_one_is_named()
 # --- Reading a model -------------------------------------------------------------------------
 
 
+def test_a_model_whose_training_is_not_finished_is_read_with_one_warning(averaged, tmp_path: Path, caplog):
+    """It passed for a finished one, in `hma evaluate`, `hma play`, `hma generate` and all others."""
+    run_dir = shutil.copytree(averaged[0], tmp_path / "run")
+    load_run(run_dir)
+    assert "not finished" not in caplog.text
+    (run_dir / "checkpoints" / "2").rename(run_dir / "checkpoints" / "1")
+    for _ in range(2):
+        assert not load_run(run_dir).finished
+    assert caplog.text.count(f"{run_dir} is at step 1 of 2: its training is not finished") == 1
+
+
 def test_loading_a_model_does_not_read_the_moments(averaged, tmp_path: Path):
     run_dir = shutil.copytree(averaged[0], tmp_path / "run")
     shutil.rmtree(run_dir / "checkpoints" / "2" / "opt_state")

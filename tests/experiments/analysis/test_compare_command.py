@@ -177,10 +177,10 @@ def test_nats_of_two_tokenizers_are_left_out_and_it_is_said(table, tmp_path, cap
     assert "Nats are not compared: the tokenizers differ (70c3, other)" in " ".join(capsys.readouterr().out.split())
 
 
-def write_evaluated(directory, windows, seed=None):
+def write_evaluated(directory, windows, seed=None, **recorded):
     directory.mkdir(parents=True)
     windows.save(directory / FILE, directory.name)
-    recorded = {"step": 3} | ({} if seed is None else {"seed": seed})
+    recorded = {"step": 3} | recorded | ({} if seed is None else {"seed": seed})
     MadeFrom({"tokenizer": PROVENANCE.tokenizer}, recorded).save(directory, STAMP)
     return directory
 
@@ -203,6 +203,27 @@ def test_an_evaluated_model_is_compared_with_a_study_of_its_seed(seed, kept, tab
     assert f"Of the seeds of study (0, 1) only {kept}" in " ".join(capsys.readouterr().out.split())
     found = float(rows_of(tmp_path / "c.csv")[OVERALL, "cross_entropy"]["mean"])
     assert found == pytest.approx(0.1 if seed is None else 0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("of_a", "of_b", "made"),
+    [
+        ({"step": 1, "steps": 3}, {"steps": 3}, "a/model 1 of 3, b/model 3 of 3."),
+        ({"step": 1, "steps": 3}, {"step": 1, "steps": 3}, "a/model 1 of 3, b/model 1 of 3."),
+        ({"step": 1, "steps": 3}, {"step": 0}, "a/model 1 of 3."),  # b is a converted model
+        ({"step": 1}, {"steps": 3}, "a/model 1, b/model 3 of 3."),  # a was evaluated by an earlier version
+        ({"steps": 3}, {"steps": 3}, ""),
+    ],
+)
+def test_models_whose_training_differs_or_is_not_finished_are_compared_and_it_is_said(
+    of_a, of_b, made, table, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    for name, recorded in (("a", of_a), ("b", of_b)):
+        write_evaluated(tmp_path / name / "model", table, 0, **recorded)
+    assert main(["compare", "a/model", "b/model"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"Steps of training when they were evaluated: {made}" in said if made else "Steps of training" not in said
 
 
 def test_a_comparison_stays_where_no_place_is_named_for_another(table, tmp_path, monkeypatch, capsys):
