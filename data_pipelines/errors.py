@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from hma_jax.config import ConfigError
+
 MAX_LISTED = 6
 """Cases that a message lists one by one; of the others it gives the number. Of a dataset that was fetched in part,
 every shard may be damaged."""
@@ -29,6 +31,10 @@ def without_advice(text: str) -> str:
 
 class DataError(Exception):
     """Data that cannot be used."""
+
+
+class NoDatasetError(DataError, ConfigError):
+    """A location that was given and is no dataset: most often the path is misspelt."""
 
 
 class UnreachableError(DataError):

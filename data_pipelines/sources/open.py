@@ -27,7 +27,7 @@ HDF5 = (".hdf5", ".h5")
 def find_format(location: str | Location) -> str:
     """'rlds', 'lerobot' or 'robomimic', by the files at `location`; 'rlds' for every other URL.
 
-    Raises DataError for a path on a disk that is no dataset, and says what may have been meant.
+    Raises as `resolve_version` for a path on a disk that is no dataset, and says what may have been meant.
     """
     place = locate(location)
     found = _signs(place)
@@ -37,7 +37,7 @@ def find_format(location: str | Location) -> str:
         except UnreachableError:
             raise
         except DataError as error:
-            raise DataError(f"{error}{_meant(place)}") from error
+            raise type(error)(f"{error}{_meant(place)}") from error
     require(
         found == "rlds" or not is_remote(place),
         f"{place}: {found} can be read only from a disk. Copy the dataset to a disk.",
@@ -47,7 +47,7 @@ def find_format(location: str | Location) -> str:
 
 def _signs(place: Location) -> str:
     """The format that the files at `place` have signs of, 'rlds' if there are none."""
-    if place.suffix in HDF5 and not place.is_dir():
+    if place.suffix in HDF5 and (is_remote(place) or place.is_file()):
         return "robomimic"
     return "lerobot" if (place / "meta" / "info.json").is_file() else "rlds"
 
@@ -56,7 +56,8 @@ def _meant(place: Path) -> str:
     """The end of a message about a path that is no dataset: what to give instead, or what is missing there."""
     try:
         if not place.is_dir():
-            close = difflib.get_close_matches(place.name, [p.name for p in place.parent.iterdir()], n=1)
+            others = [p.name for p in place.parent.iterdir() if p.name != place.name]
+            close = difflib.get_close_matches(place.name, others, n=1)
             return f" Closest: {place.parent / close[0]}" if close else ""
         inside = sorted(place.iterdir())
         if place / "snapshots" in inside:  # the Hugging Face hub's cache of a dataset: the newest revision

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 from experiments.boundary import guarded
 from experiments.cli import convert, study, tokenizer
@@ -23,6 +25,7 @@ from experiments.cli.play import play
 from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
+from hma_jax.config import ConfigError
 
 BEGIN_ANEW = (
     "evaluate",
@@ -74,6 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments.remove("--debug")
 
     def work() -> None:
+        _require_utf8(arguments)
         app.run(
             PROGRAM,
             arguments or ["--help"],
@@ -82,3 +86,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     resumes = not set(arguments[:1]) & set(BEGIN_ANEW)
     return guarded(work, debug, own_process, resumes=resumes, skipping="--set store.corrupt=skip")
+
+
+def _require_utf8(arguments: Sequence[str]) -> None:
+    """Raises ConfigError for a path that is not UTF-8, also of the working directory: checkpoints cannot lie there."""
+    here = ""
+    with suppress(OSError):  # the working directory was removed
+        here = os.getcwd()
+    for text in (*arguments, here):
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            shown = os.fsencode(text).decode(errors="backslashreplace")
+            raise ConfigError(
+                f"{shown} is not UTF-8, and checkpoints cannot be written or read under such a name; rename the "
+                "directory, or give another one"
+            ) from error

@@ -7,6 +7,7 @@ learns anything: what a step computes is tested elsewhere.
 
 import gc
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -610,7 +611,7 @@ def hma(*arguments: object) -> tuple[int, str]:
 
 def test_the_process_says_the_same(tmp_path):
     code, said = hma("tokenize", *SMOKE, "--out", tmp_path / "out", "--data", tmp_path / "none")
-    assert code == 1
+    assert code == 2
     assert said == f"error: {tmp_path / 'none'}: no such directory. Give {DATASETS}.\n"
 
 
@@ -634,3 +635,14 @@ def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch):
     monkeypatch.setattr(registry_commands, "use_entries", broken)
     with pytest.raises(KeyError, match="oops"):
         main(["data", "list"])
+
+
+def test_a_path_that_is_not_utf8_is_refused_at_the_start(tmp_path, monkeypatch, capsys):
+    """Its suite was simulated first, and then there was a traceback."""
+    latin = tmp_path / os.fsdecode(b"caf\xe9")
+    latin.mkdir()
+    assert main(["study", *SMOKE, "--out", str(latin)]) == 2
+    assert "caf\\xe9 is not UTF-8" in capsys.readouterr().err and not any(latin.iterdir())
+    monkeypatch.chdir(latin)
+    assert main(["study", *SMOKE, "--out", "out"]) == 2
+    assert "caf\\xe9 is not UTF-8" in capsys.readouterr().err and not any(latin.iterdir())

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from data_pipelines.errors import DataError, UnreachableError
+from data_pipelines.errors import DataError, NoDatasetError, UnreachableError
 from data_pipelines.json_file import read_object
 from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
@@ -96,11 +96,16 @@ class SplitMetadata:
 
 
 def resolve_version(directory: str | Location) -> Location:
-    """The version directory: `directory` itself or its newest version."""
+    """The version directory: `directory` itself or its newest version.
+
+    Raises NoDatasetError for a location that is no dataset; another DataError where its disk may only not be mounted:
+    its parent is missing, or it is empty.
+    """
     directory = locate(directory)
     if not exists(directory, "directory"):
         what = "it is a file, not a directory" if exists(directory, "file") else "no such directory"
-        raise DataError(f"{directory}: {what}. Give {DATASETS}.")
+        kind = NoDatasetError if exists(directory.parent, "directory") else DataError
+        raise kind(f"{directory}: {what}. Give {DATASETS}.")
     if _has_info(directory):
         return directory
     inside = retry(directory, lambda: list(directory.iterdir()))
@@ -108,7 +113,7 @@ def resolve_version(directory: str | Location) -> Location:
     if versions:
         return max(versions, key=lambda d: tuple(map(int, d.name.split("."))))
     entries = sorted(p.name for p in inside)
-    raise DataError(
+    raise (NoDatasetError if entries else DataError)(
         f"{directory} is no dataset: neither it nor a version directory in it, such as 1.0.0, has a dataset_info.json, "
         f"and it has no meta/info.json (it holds {listing(entries[:6]) or 'nothing'}). Give {DATASETS}."
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, NoDatasetError, UnreachableError
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
@@ -488,10 +488,13 @@ def test_what_is_no_dataset_is_told_with_what_to_give_instead(tmp_path):
     (arm / "meta" / "info.json").unlink()
     with pytest.raises(DataError, match=f"/toy-arm is no dataset.* copy {arm}/meta/info.json too$"):
         open_source(arm)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="it is a file, not a directory.*robomimic .hdf5 file.$"):  # not: Closest: file
+        open_source(tmp_path / "file")
 
 
 def test_what_is_no_dataset_is_named(tmp_path):
-    with pytest.raises(DataError, match="no such directory"):
+    with pytest.raises(NoDatasetError, match="no such directory"):
         open_source(tmp_path / "absent")
     (tmp_path / "x.hdf5").write_bytes(b"no file of this kind")
     with pytest.raises(DataError, match="x.hdf5: not a readable HDF5 file"):
