@@ -34,14 +34,22 @@ from hma_jax.training.state import FINITE, TrainState, all_finite
 from hma_jax.training.train_only import Everything, OwnOnly
 
 Batch = dict[str, jax.Array]
-"""tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
-embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end; perhaps seed
-uint32 [2], not the number but the `jax.random.key_data` of its key (`key_of`), so that runs of other seeds are one
-program."""
+"""Arrays by name:
+
+    tokens          int32 [B, T, S], or latents float32 [B, T, S, C]
+    actions         float32 [B, T, U], raw, zero-padded
+    embodiment      int32 [B], index into the table
+
+Optional:
+
+    real            bool [B, T]: False for padding frames at the end of a short window
+    seed            uint32 [2]: `jax.random.key_data` of the seed's key (`key_of`); with it, runs of different seeds
+                    share one compiled step
+"""
 
 
 TRAINING_ARRAYS = ("tokens", "actions", "embodiment", "real")
-"""Arrays of a batch that training and validation look at."""
+"""Arrays that training and validation take from the batches of the host."""
 
 
 def make_train_step(
