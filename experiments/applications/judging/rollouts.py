@@ -31,7 +31,8 @@ class Rollout:
     """M episodes of L frames, the first of them the last of the start.
 
     images uint8 [M, L, H, W, 3]; reached bool [M, L] by state, all False where there is no state; seconds: of the steps
-    alone, without the policy; actions float32 [M, L - 1, A].
+    alone, without the policy; actions float32 [M, L - 1, A], of a policy that gives whole chunks
+    [M, L - 1, stride, A].
     """
 
     images: np.ndarray

@@ -54,19 +54,20 @@ class CheckedPolicy:
 
     def act(self, images: np.ndarray) -> np.ndarray:
         """Raises ConfigError for actions of another shape or type, and for such that are not finite."""
-        shape, given = (len(images), self.robot.action_dim), self.policy.act(images.copy())
+        (count, robot), given = (len(images), self.robot), self.policy.act(images.copy())
+        shape, chunks = (count, robot.action_dim), (count, robot.stride, robot.action_dim)
         wanted = (
-            f"{self.where}: act(images) must return float32 {list(shape)}, an unnormalised action of "
-            f"{self.robot.name} for each image"
+            f"{self.where}: act(images) must return float32 {list(shape)}, an unnormalised action of {robot.name} for "
+            f"each image, or {list(chunks)}, the whole chunk until the next image"
         )
         try:
             actions = np.asarray(given)
         except ValueError as error:  # lists of different lengths
             raise ConfigError(f"{wanted}; it returned something that is not an array ({error})") from error
-        good = actions.shape == shape and np.issubdtype(actions.dtype, np.floating)
+        good = actions.shape in (shape, chunks) and np.issubdtype(actions.dtype, np.floating)
         require(good, f"{wanted}; it returned {actions.dtype} {list(actions.shape)}")
         actions = np.array(actions, np.float32)
-        for b in np.flatnonzero(~np.isfinite(actions).all(1))[:1]:
+        for b in np.flatnonzero(~np.isfinite(actions).reshape(count, -1).all(1))[:1]:
             raise ConfigError(
                 f"{wanted}; the action that it returned for image {b} is not finite: {actions[b].tolist()}"
             )

@@ -55,8 +55,8 @@ def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, s
             break
         images = render_frames(task.spec, looks, world.goals, world.q, world.objects, np.arange(len(seeds)))
         actions = policy.act(fit_images(images, image_size)).astype(np.float64)
-        for _ in range(stride):
-            world.step(actions)
+        for i in range(stride):
+            world.step(actions[:, i] if actions.ndim == 3 else actions)
     return Outcome(held(np.stack(reached, 1), task.hold).any(1), goal_distance(world))
 
 

@@ -22,7 +22,7 @@ from hma_jax.training.runs import Model
 
 
 class OwnHeadPolicy:
-    """Acts by the action head of a model. Of a chunk, which is native actions, the mean is done for the whole frame."""
+    """Acts by the action head of a model: gives whole chunks, as the head predicts them, within the robot's range."""
 
     def __init__(self, model: Model, tokenizer: BaseTokenizer, robot: Robot, decode: DecodeConfig | None = None):
         """Raises ConfigError for a model that predicts no actions."""
@@ -74,11 +74,8 @@ class OwnHeadPolicy:
         out = np.asarray(self._predict(self._params, frames, actions_BTU, which, seeds))
         newest = out[np.arange(count), [len(seen) - 1 for seen in self._tokens]]
         stride, dim = self.robot.stride, self.robot.action_dim
-        actions = newest[:, : stride * dim].reshape(count, stride, dim).mean(1)
         low, high = np.array(self.robot.low, np.float32), np.array(self.robot.high, np.float32)
-        actions = np.clip(actions, low, high)
-        for b, action in enumerate(actions):
-            chunk = np.zeros(self.width, np.float32)
-            chunk[: stride * dim] = np.tile(action, stride)
-            self._chunks[b].append(chunk)
-        return actions.astype(np.float32)
+        chunks = np.clip(newest[:, : stride * dim].reshape(count, stride, dim), low, high).astype(np.float32)
+        for done, chunk in zip(self._chunks, chunks, strict=True):
+            done.append(np.pad(chunk.ravel(), (0, self.width - chunk.size)))
+        return chunks

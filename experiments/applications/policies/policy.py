@@ -21,8 +21,8 @@ class Policy(Protocol):
         ...
 
     def act(self, images: np.ndarray) -> np.ndarray:
-        """Actions float32 [B, A] in the robot's raw units, after images uint8 [B, H, W, 3]: one for each frame of the
-        model, held for it."""
+        """Actions float32 in the robot's raw units, after images uint8 [B, H, W, 3]: for each frame of the model one
+        [B, A], held for it, or its whole chunk [B, stride, A]."""
         ...
 
 

@@ -153,11 +153,13 @@ class Gives:
     [
         (np.zeros((2, 4), np.float32), r"it returned float32 \[2, 4\]"),
         (np.zeros(3, np.float32), r"it returned float32 \[3\]"),
+        (np.zeros((2, 3, 3), np.float32), r"or \[2, 2, 3\], the whole chunk .*; it returned float32 \[2, 3, 3\]"),
         (np.zeros((2, 3), int), r"it returned int64 \[2, 3\]"),
         (None, r"it returned object \[\]"),
         ([[0.0], [0.0, 1.0]], "it returned something that is not an array"),
         (np.array([[0, 0, 0], [0, np.nan, 0]]), r"for image 1 is not finite: \[0.0, nan, 0.0\]"),
         (np.full((2, 3), 1e300), "for image 0 is not finite"),
+        (np.where(np.arange(12).reshape(2, 2, 3) == 9, np.inf, 0), "for image 1 is not finite"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:overflow")
@@ -168,6 +170,12 @@ def test_actions_that_are_none_are_refused_by_policy_and_shape(actions, message)
     assert "mine.py: policy 'net': act(images) must return float32 [2, 3], an unnormalised action of arm" in str(
         error.value
     )
+
+
+def test_a_policy_may_give_whole_chunks():
+    chunks = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    acted = CheckedPolicy(Gives(chunks), ROBOT, "net").act(np.zeros((2, 8, 8, 3), np.uint8))
+    np.testing.assert_array_equal(acted, chunks)
 
 
 def test_a_policy_may_write_into_images_and_into_what_it_gave():

@@ -17,8 +17,10 @@ def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
     policy = OwnHeadPolicy(model, tokenizer, ROBOTS[1])
     acted = np.stack([policy.act(images) for images in frames])
     low, high = np.array(ROBOTS[1].low, np.float32), np.array(ROBOTS[1].high, np.float32)
-    assert acted.shape == (7, 2, 7) and ((acted >= low) & (acted <= high)).all()
-    assert not np.array_equal(acted[0, 0], acted[0, 1])
+    assert acted.shape == (7, 2, 2, 7) and ((acted >= low) & (acted <= high)).all()  # whole chunks of two actions
+    assert not np.array_equal(acted[0, 0], acted[0, 1]) and not np.array_equal(acted[:, :, 0], acted[:, :, 1])
+    for b in range(2):  # and they are what it remembers
+        np.testing.assert_array_equal(policy._chunks[b][-1][:14], acted[6, b].ravel())
 
     # An episode begun at frame 0 of other images, with what it saw and did in its last window put in its place.
     other = OwnHeadPolicy(model, tokenizer, ROBOTS[1])

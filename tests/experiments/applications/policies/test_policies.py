@@ -1,5 +1,6 @@
 """Recorded demonstrations, and policies that are trained on them."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.simulator import SuiteSimulator, suite_robot
+from data_pipelines.suite.world import World
 from experiments.applications.judging.rollouts import run
 from experiments.applications.policies import RandomPolicy, diffusion, find_task, load_policy, record, save_policy
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
+from experiments.applications.policies.closed_loop import goal_distance, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import load_demonstrations, save_demonstrations
 from experiments.applications.policies.diffusion import (
     DiffusionConfig,
@@ -95,6 +98,32 @@ def test_a_rollout_is_what_its_actions_do_and_the_control_executes_those_of_anot
     np.testing.assert_array_equal(good.reached[:, :-1], demos.reached)
     np.testing.assert_array_equal(elsewhere.actions, np.roll(demos.actions, 1, axis=0))
     assert good.reached.any(1).mean() > 0.6 > 0.4 > elsewhere.reached.any(1).mean()
+
+
+def test_whole_chunks_of_a_policy_are_executed_action_by_action():
+    """The same in a simulator's rollouts and in the true world of a task; a chunk of equal actions is a held one."""
+    seeds, task = start_seeds(TASK, 2), replace(TASK, frames=4)
+    low, high = (np.array(x, np.float32) for x in (ROBOT.low, ROBOT.high))
+    chunks = np.random.default_rng(0).uniform(low, high, (2, 4, 2, 4)).astype(np.float32)
+    world = World(TASK.spec, seeds)
+    for t in range(3):
+        for i in range(2):
+            world.step(chunks[:, t, i].astype(np.float64))
+    outcome = run_policy(task, Replayed(chunks), seeds, 32, stride=2)
+    np.testing.assert_array_equal(outcome.distance, goal_distance(world))
+
+    simulator, nothing = SuiteSimulator([replace(ROBOT, stride=2)], episodes=2, image_size=8), np.zeros((0, 4))
+    starts = [Start("gripper_wood", simulator.images[:1], nothing.astype(np.float32), int(seed)) for seed in seeds]
+    made = run(simulator, Replayed(chunks), starts, range(2), task)
+    np.testing.assert_array_equal(made.actions, chunks)
+    simulator.reset(starts)
+    for t in range(4):
+        np.testing.assert_array_equal(made.images[:, t + 1], simulator.step(list(chunks[:, t])))
+    held, repeated = (
+        run(simulator, Replayed(a), starts, range(2), task) for a in (chunks[:, :, 0], chunks[:, :, [0, 0]])
+    )
+    np.testing.assert_array_equal(held.images, repeated.images)
+    assert held.actions.shape == (2, 4, 4) and (held.images != made.images).any()
 
 
 def test_cloning_learns_and_is_a_function_of_its_seed(demos):
