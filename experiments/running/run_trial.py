@@ -162,7 +162,8 @@ def validation_batches(
     own, some = own_rows(execution.mesh, batch), prepared.manifest.subsampled(batch)
     for name in trial.evaluated:  # one without windows has no batch
         for whole in eval_batches(prepared.store, table, some, batch, (name,)):
-            yield {key: whole[key][own] for key in (*TRAINING_ARRAYS, "valid") if key in whole}
+            arrays = {key: whole[key][own] for key in (*TRAINING_ARRAYS, "valid") if key in whole}
+            yield arrays | {"dataset": name}
 
 
 def evaluate_on(

@@ -49,7 +49,7 @@ class SilentLog:
     def nothing(self, *_: Any) -> None:
         """In place of everything that only the writer does."""
 
-    start_clock = discount = write_start = write_validation = flush = close = nothing
+    start_clock = discount = waited = write_start = write_validation = flush = close = nothing
 
 
 class RunLog:
@@ -82,6 +82,7 @@ class RunLog:
         self._cut("validation.jsonl", start)
         self.validation: dict[str, float] = {}
         self.mark, self.flushed = (clock(), start), clock()
+        self.waiting = 0.0  # seconds since the mark
         self.files: dict[str, TextIO] = {}
         with self._writing("tensorboard"):
             self.tensorboard = TensorBoardWriter(run_dir / "tensorboard", start + 1)
@@ -107,6 +108,10 @@ class RunLog:
         """Takes `seconds` that just passed out of the timing."""
         self.mark = (self.mark[0] + seconds, self.mark[1])
 
+    def waited(self, seconds: float) -> None:
+        """Counts `seconds` in which a step waited for its batch."""
+        self.waiting += seconds
+
     def write_start(self, record: Mapping[str, Any]) -> None:
         """A line of execution.jsonl: every start of the run, never cut."""
         self._append("execution.jsonl", record)
@@ -130,9 +135,10 @@ class RunLog:
 
     def _write_timing(self, step: int) -> None:
         now = self.clock()
-        per_step = max(now - self.mark[0], 1e-9) / (step - self.mark[1])
-        self.mark = (now, step)
-        record = {"seconds_per_step": per_step}
+        steps = step - self.mark[1]
+        per_step = max(now - self.mark[0], 1e-9) / steps
+        record = {"seconds_per_step": per_step, "seconds_waiting": self.waiting / steps}
+        self.mark, self.waiting = (now, step), 0.0
         if self.flops_per_step:
             record["flops_per_second"] = self.flops_per_step / per_step
             if self.peak_flops:

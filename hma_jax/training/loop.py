@@ -6,8 +6,8 @@ before it reads the metrics of step n, so the device never waits for the log.
 Files of a run directory:
     metrics.jsonl     one line per step, deterministic fields only: a run that was killed and
                       resumed leaves the same bytes as one that was not
-    validation.jsonl  held-out loss, every so many steps; deterministic too
-    timing.jsonl      seconds, throughput, utilisation: whatever depends on the machine
+    validation.jsonl  held-out loss, also of each dataset, every so many steps; deterministic too
+    timing.jsonl      seconds per step, of these waiting for a batch, FLOP/s, MFU: whatever depends on the machine
     execution.jsonl   one line per start of the run: from which step, how and on what it is computed
     tensorboard/      the same for TensorBoard
     profile/          what devices and host did in some steps, where that was asked for, see `step_trace`
@@ -185,7 +185,10 @@ def fit(
                 with jax.profiler.StepTraceAnnotation("train", step_num=step):
                     state, metrics = compiled(state, batch)
                     if step < steps:
-                        batch = put_batch(_next(batches, step, steps))
+                        asked = clock()
+                        batch = _next(batches, step, steps)
+                        log.waited(clock() - asked)
+                        batch = put_batch(batch)
                 if step == trace.last:
                     jax.block_until_ready(state)
                     with between.aside():

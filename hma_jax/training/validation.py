@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -34,12 +34,12 @@ class Validation:
     """What a run is validated on.
 
     `batches()` yields this process's rows of a few global batches, as large as in training, perhaps with `valid`
-    bool [B] (False: a padding row) and `real` bool [B, T] (False: a padding frame). It is read once; the
-    windows stay in memory of the host.
+    bool [B] (False: a padding row) and `real` bool [B, T] (False: a padding frame). A batch that is all of one dataset
+    may name it as `dataset`. It is read once; the windows stay in memory of the host.
     """
 
     every: int  # steps
-    batches: Callable[[], Iterable[Mapping[str, np.ndarray]]]
+    batches: Callable[[], Iterable[Mapping[str, Any]]]
 
     def __post_init__(self):
         require(self.every >= 1, f"the number of steps between validations must be at least 1, got {self.every}")
@@ -53,20 +53,30 @@ def make_validation_hook(
     execution: ExecutionConfig,
     put_batch: Callable[[Any], Any],
 ) -> ValidationHook:
-    """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one."""
+    """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one; where
+    batches name several datasets, also the loss of each as `loss/NAME`."""
     compute = _jitted_sums(model, table, masking, execution, jax.sharding.get_mesh())
     held: list[dict[str, np.ndarray]] = []
+    datasets: list[str] = []  # of each batch; "" where it does not name one
 
     def mean(params: Params) -> dict[str, float]:
-        rows = [compute(params, put_batch(batch), np.int32(n)) for n, batch in enumerate(held)]
-        sums, counts = jax.tree.map(lambda *x: float(sum(x)), *jax.device_get(rows))
-        counts = TargetCounts(*(max(n, 1) for n in counts))
-        return loss_metrics(sums, counts, masking, discrete=not model.diffusion)
+        rows = jax.device_get([compute(params, put_batch(batch), np.int32(n)) for n, batch in enumerate(held)])
+
+        def over(chosen: Sequence[Any]) -> dict[str, float]:
+            sums, counts = jax.tree.map(lambda *x: float(sum(x)), *chosen)
+            counts = TargetCounts(*(max(n, 1) for n in counts))
+            return loss_metrics(sums, counts, masking, discrete=not model.diffusion)
+
+        names = [name for name in dict.fromkeys(datasets) if name]
+        each = {name: [row for row, of in zip(rows, datasets, strict=True) if of == name] for name in names}
+        return over(rows) | {f"loss/{name}": over(each[name])["loss"] for name in names if len(names) > 1}
 
     def measure(state: TrainState) -> dict[str, float]:
         nonlocal compute
         if not held:
-            held.extend(_with_valid(batch) for batch in validation.batches())
+            for batch in validation.batches():
+                held.append(_with_valid(batch))
+                datasets.append(batch.get("dataset", ""))
             require(bool(held), "there is no window to validate on; switch off validation")
             compute = compiled_by_all("validation", compute, state.params, put_batch(held[0]), np.int32(0))
         values = mean(state.params)

@@ -182,6 +182,7 @@ def test_timing_and_utilisation_are_of_steps_alone(tmp_path: Path):
     assert result.compile_seconds == 1000 and result.seconds == 4 * 2.0
     timing = lines(tmp_path / "timing.jsonl")
     assert sum(line["seconds_per_step"] for line in timing) == pytest.approx(4 * 2.0)
+    assert sum(line["seconds_waiting"] for line in timing) == 4 * 2.0, "all of it for batches"
     for line in timing:
         assert line["flops_per_second"] == pytest.approx(6 / line["seconds_per_step"])
         assert line["mfu"] == pytest.approx(line["flops_per_second"] / 4)

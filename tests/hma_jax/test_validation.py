@@ -58,6 +58,22 @@ def test_validation_changes_nothing_of_the_run_and_is_no_part_of_it(tmp_path: Pa
     assert again.resumed_from == 6
 
 
+def test_datasets_that_batches_name_have_a_loss_each(tmp_path: Path):
+    """With one number over all, a robot that gets worse among forty is not seen."""
+    one, other, more = (random_batch(1000 + n, MODEL, 4) for n in range(3))
+    named = [one | {"dataset": "arm"}, other | {"dataset": "base"}, more | {"dataset": "arm"}]
+
+    def last_line(name: str, batches: list) -> dict[str, float]:
+        run(tmp_path / name, Validation(6, lambda: batches))
+        return json.loads((tmp_path / name / "validation.jsonl").read_text().splitlines()[-1])
+
+    losses, unnamed = last_line("named", named), last_line("unnamed", [one, other, more])
+    assert losses.keys() - unnamed.keys() == {f"{of}loss/{name}" for of in ("", "ema_") for name in ("arm", "base")}
+    assert unnamed.items() <= losses.items()
+    assert "loss/arm" not in last_line("one", [one | {"dataset": "arm"}]), "it is the loss"
+    assert min(losses["loss/arm"], losses["loss/base"]) < losses["loss"] < max(losses["loss/arm"], losses["loss/base"])
+
+
 def test_the_next_run_of_a_process_is_watched_by_the_same_program(tmp_path: Path):
     """Runs of a sweep over seeds, and a run that goes on, do not compile the held-out loss again."""
     run(tmp_path / "one", Validation(3, held_out))
