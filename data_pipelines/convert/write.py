@@ -57,7 +57,7 @@ class _Shard:
 def suggest_spec(source: ConvertibleSource, name: str) -> DatasetSpec:
     """The registry entry of a converted dataset: its first camera and its action."""
     layout = source.layout
-    actions = {key: size for key, size in layout.vectors.items() if key.partition("/")[0] == "action"}
+    actions = {key: size for key, size in layout.vectors.items() if key.partition("/")[0] in ("action", "actions")}
     return DatasetSpec(
         name,
         image_key=next(iter(layout.images)),

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 MAX_ACTION_WIDTH = 256
 """Values of a field that is taken for an action by its name; wider ones are usually embeddings or flattened images. The
-field `action` itself may be wider: it may hold the actions of several steps."""
+fields `action` and `actions` themselves may be wider: it may hold the actions of several steps."""
 
 NOT_READ = "no camera"
 """What pictures are called that are not read as such: LeRobot's depths and grey ones, robomimic's of other names."""
@@ -263,7 +263,7 @@ class _SampleLog:
         self._source, self._max_examples, self._frames = source, max_examples, frames
         self.cameras = {f.key: _CameraLog(f.key) for f in fields if f.per_step and f.kind == "image"}
         sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
-        taken = {"action", *(field_slice(key)[0] for key in action_keys)}
+        taken = {"action", "actions", *(field_slice(key)[0] for key in action_keys)}
         self._numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= MAX_ACTION_WIDTH)]
         self.actions: dict[str, list[np.ndarray]] = {key: [] for key in self._numbers}  # field -> [N, A] per episode
         self.steps: list[int] = []

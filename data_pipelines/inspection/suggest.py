@@ -162,12 +162,11 @@ def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, s
 
 def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str]:
     by_key = {a.key: a for a in facts.actions}
-    if "action" in by_key:
-        keys = ["action"]
-    else:
+    keys = [key for key in ("action", "actions") if key in by_key][:1]  # the second in other programs' LeRobot datasets
+    if not keys:
         keys = [k for k in by_key if k.startswith("action/") and not NO_ACTION.search(k)]
     if not keys:
-        parts = [f for f in facts.fields if f.key.partition("/")[0] == "action"]
+        parts = [f for f in facts.fields if f.key.partition("/")[0] in ("action", "actions")]
         kept = ", ".join(f.key for f in parts if f.kind == "bytes")
         lists = ", ".join(f.key for f in parts if f.kind == "list")
         others = ", ".join(k for k in by_key if not NO_ACTION.search(k))

@@ -2,14 +2,14 @@
 
 Row t of an episode was recorded at t / fps seconds; its camera frame is the one that the video
 shows at the row's timestamp (plus, in 3.0, the time at which the episode begins in its file).
-Cameras become `observation/<name>`, other numeric features vectors under `observation/` and
-`action`; texts follow `task_index`. Success is the last `next.success`, where there is one.
+Cameras become `observation/<name>`, other numeric features vectors: `observation/<name>`, `action`
+or whatever they are called; texts follow `task_index`. Success is the last `next.success`, where there is one.
 Depth and grey cameras are not read; `unsupported_images` lists them with their shapes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,14 @@ from data_pipelines.sources.convertible import Episode, Layout, Skipped, UnitErr
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_meta, read_meta
 from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retry
-from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.rlds.writer import STEP_FIELDS, encode_jpeg, image_field
 from data_pipelines.sources.settings import LeRobotSettings
 from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
 PICTURES = ("video", "image")
+NO_VECTORS = {"index", "episode_index", "frame_index", "task_index", "timestamp", *STEP_FIELDS}
+"""Features that count rows, and names that steps have for something else."""
+
 EPISODE, TIME, TASK, SUCCESS, REWARD = "episode_index", "timestamp", "task_index", "next.success", "next.reward"
 
 
@@ -62,11 +65,6 @@ class LeRobotSource:
         self.cameras = {f"observation/{name}": available[name] for name in names}
         self.unsupported_images = {f"observation/{_short(key)}": shape for key, shape in others.items()}
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
-        if "action" not in {key.partition("/")[0] for key in self.vectors}:
-            raise DataError(
-                f"{self.root / 'meta' / 'info.json'}: it has no numeric feature 'action', but {', '.join(features)}. "
-                "Rename the feature that holds the actions to 'action', here and in the tables below data."
-            )
         sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self.vectors.items()}
         self.layout = Layout({k: image_field(None, None) for k in self.cameras}, sizes, SUCCESS in features)
         self.hz = self.meta.fps
@@ -76,6 +74,7 @@ class LeRobotSource:
 
     def identity(self) -> dict[str, Any]:
         files = {e.data for e in self.meta.episodes} | {f for e in self.meta.episodes for f, _ in e.videos.values()}
+        others = [f for f in self.vectors.values() if f.partition(".")[0] not in ("action", "observation")]
         sizes = {str(f.relative_to(self.root)): f.stat().st_size if f.exists() else -1 for f in sorted(files)}
         return {
             "root": self.root.name,
@@ -83,7 +82,8 @@ class LeRobotSource:
             "files": sizes,
             "cameras": list(self.cameras),
             "short_side": self.short_side,
-            # Conversions by earlier versions do not count these, so they are other ones.
+            # Conversions by earlier versions lack or do not count these, so they are other ones.
+            **({"others": others} if others else {}),
             **({"lost": self._lost} if self._lost else {}),
         }
 
@@ -117,14 +117,14 @@ class LeRobotSource:
     def rows(self, entry: EpisodeEntry, columns: Iterable[str]) -> Any:
         """The episode's rows, in order: when, and those of `columns` that the file has."""
         with _as_units():
-            first, count = self._locate(entry)
+            first, count = self._locate(entry, columns := list(columns))
             available = self._tables.columns(entry.data)
             return self._tables.read(entry.data, [TIME, *(n for n in columns if n in available)], first, count)
 
     def image(self, entry: EpisodeEntry, camera: str, n: int, where: str) -> bytes:
         """Frame `n` of a camera whose images the table holds or names."""
         with _as_units():
-            first, _ = self._locate(entry)
+            first, _ = self._locate(entry, ())
             self._check_camera(entry, camera, where)
             (value,) = self._tables.read(entry.data, [camera], first + n, 1)[camera].to_pylist()
         return self._image_bytes(value, f"{where}: {quote(camera)} at row {n}")
@@ -134,10 +134,10 @@ class LeRobotSource:
         """Bytes of tables that were read so far, of whole groups of rows."""
         return self._tables.loaded
 
-    def _locate(self, entry: EpisodeEntry) -> tuple[int, int]:
-        """(first row, rows) in the episode's file."""
-        available = self._tables.columns(entry.data)
-        missing = [n for n in (EPISODE, TIME, *self.vectors.values()) if n not in available]
+    def _locate(self, entry: EpisodeEntry, columns: Sequence[str]) -> tuple[int, int]:
+        """(first row, rows) in the episode's file, which must have those of `columns` that are vectors."""
+        available, vectors = self._tables.columns(entry.data), {*self.vectors.values()}
+        missing = [n for n in (EPISODE, TIME, *(c for c in columns if c in vectors)) if n not in available]
         if missing:
             raise UnitError(f"{entry.data}: no column {quote(missing[0])}. {ADVICE}")
         place = self._tables.find(entry.data, entry.index)
@@ -235,7 +235,7 @@ def _is_camera(feature: dict[str, Any]) -> bool:
 
 def _is_vector(key: str, feature: dict[str, Any]) -> bool:
     numeric = str(feature.get("dtype")).startswith(("float", "int", "uint", "bool"))
-    return numeric and key.partition(".")[0] in ("action", "observation")
+    return numeric and not key.startswith("next.") and _key(key) not in NO_VECTORS
 
 
 def _check_names(features: Mapping[str, dict[str, Any]], path: Path) -> None:
@@ -258,9 +258,6 @@ def _short(camera: str) -> str:
 
 
 def _key(feature: str) -> str:
-    """`observation.state` -> `observation/state`, `action` and `action.arm` -> `action`, `action_arm`."""
-    head, _, rest = feature.partition(".")
-    rest = rest.replace(".", "_").replace("/", "_")
-    if head == "observation":
-        return f"observation/{rest}"
-    return f"action_{rest}" if rest else head
+    """`observation.state` -> `observation/state`, `action.arm` -> `action_arm`, `state` as it is."""
+    name = feature.removeprefix("observation.").replace(".", "_").replace("/", "_")
+    return f"observation/{name}" if feature.startswith("observation.") else name

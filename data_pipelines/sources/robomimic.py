@@ -1,7 +1,8 @@
 """Robomimic demonstrations: one HDF5 file of `data/demo_*`, with camera images.
 
 Per demonstration of N steps: `actions` [N, A], `obs/<camera>_image` uint8 [N, H, W, 3] before each
-action, other `obs/*` as vectors, `states` of the simulator, `rewards` and `dones` [N].
+action (where none has that ending, as in LIBERO's files, `obs/<camera>` of that kind), other `obs/*`
+as vectors, `states` of the simulator, `rewards` and `dones` [N].
 `mask/<key>` names demonstrations, such as the training ones (`train`, `valid`). The rate is the
 environment's `control_freq`: 20 Hz for every task that was published.
 DIFFERS: the release takes states only, renders them at 128 pixels, calls the rate 6 Hz, and has a
@@ -62,7 +63,7 @@ class RobomimicSource:
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
             self.masks = _demonstrations(self.path, file, settings.filter_key)  # of each demonstration
             self.units = list(self.masks)
-            self.layout, self.cameras, self.unsupported_images = self._read_layout(
+            self.layout, self.cameras, self.ending, self.unsupported_images = self._read_layout(
                 file["data"][self.units[0]], settings.camera
             )
         self.task = str(args.get("env_name", "robomimic"))
@@ -94,7 +95,7 @@ class RobomimicSource:
                     rows = self.array(file["data"][name], "actions", where)
                     digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
                     for camera in self.cameras:
-                        picture = read_rows(file["data"][name], f"obs/{camera}_image", slice(1), where)
+                        picture = read_rows(file["data"][name], f"obs/{camera}{self.ending}", slice(1), where)
                         digest.update(np.ascontiguousarray(picture).tobytes())
         return digest.hexdigest()[:16]
 
@@ -107,10 +108,10 @@ class RobomimicSource:
             steps = len(actions)
             images = {}
             for camera in self.cameras:
-                frames = self.array(demo, f"obs/{camera}_image", where)
+                frames = self.array(demo, f"obs/{camera}{self.ending}", where)
                 if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) != steps:
                     raise UnitError(
-                        f"{where}/obs/{camera}_image is {frames.dtype} {list(frames.shape)}; {steps} actions "
+                        f"{where}/obs/{camera}{self.ending} is {frames.dtype} {list(frames.shape)}; {steps} actions "
                         f"need uint8 images [{steps}, H, W, 3]. {ADVICE}"
                     )
                 images[f"observation/{camera}"] = [encode_jpeg(shrink(f, self.short_side)) for f in frames]
@@ -148,21 +149,18 @@ class RobomimicSource:
 
     def _read_layout(
         self, demo: Any, wanted: tuple[str, ...]
-    ) -> tuple[Layout, tuple[str, ...], dict[str, tuple[int, ...]]]:
-        """(fields, cameras, unsupported images with their shapes: those of other names, and depth images)."""
+    ) -> tuple[Layout, tuple[str, ...], str, dict[str, tuple[int, ...]]]:
+        """(fields, cameras, the ending of their fields' names, unsupported images with their shapes: those of other
+        names, and depth images)."""
         where = f"{self.path}: {demo.name.lstrip('/')}"
         obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # groups are none of robomimic's
-        available = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
-        pictures = sorted(k for k in obs if obs[k].dtype == np.uint8 and obs[k].ndim == 4 and obs[k].shape[3] == 3)
-        if not available and pictures:  # as LIBERO's, agentview_rgb
-            raise DataError(
-                f"{where}/obs has no *_image, the name of images in robomimic files, but {', '.join(pictures)}: in a "
-                "copy of the file, rename each in every demonstration so that it ends in _image (h5py: obs.move(OLD, "
-                "NEW))."
-            )
+        ending = "_image" if any(k.endswith("_image") for k in obs) else ""
+        available = sorted(k.removesuffix(ending) for k in obs if k.endswith("_image"))
+        if not ending:  # as in LIBERO's files, agentview_rgb
+            available = sorted(k for k in obs if obs[k].dtype == np.uint8 and obs[k].ndim == 4 and obs[k].shape[3] == 3)
         if not available:
             raise DataError(
-                f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): it is a "
+                f"{where}/obs has no *_image nor other uint8 images (it holds {', '.join(sorted(obs)) or 'nothing'}): it is a "
                 "low-dimensional or raw file. Download the image file of the task, or render images from its states "
                 "with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
             )
@@ -177,9 +175,10 @@ class RobomimicSource:
         if getattr(states, "ndim", 0) == 2 and states.shape[1]:
             vectors["observation/sim_state"] = int(states.shape[1])
         images = {f"observation/{c}": image_field(None, None) for c in cameras}
-        others = sorted(key for key in obs if obs[key].ndim >= 3 and not key.endswith("_image"))
+        pictures = {camera + ending for camera in available}
+        others = sorted(key for key in obs if obs[key].ndim >= 3 and key not in pictures)
         unsupported_images = {f"observation/{key}": tuple(map(int, obs[key].shape[1:])) for key in others}
-        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, unsupported_images
+        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, ending, unsupported_images
 
 
 @contextmanager

@@ -94,7 +94,7 @@ class RobomimicDataset(EpisodeSource):
         with self._read.open() as file:
             with damage_as(where):
                 demo = file["data"][self._demos[i]]
-                frames = _Frames(demo, _path(camera, image=True), where)
+                frames = _Frames(demo, _path(camera, self._read.ending), where)
                 if not len(frames):
                     self._refuse(i, "a demonstration without steps")
                 if "actions" in demo and len(frames) != len(demo["actions"]):
@@ -114,7 +114,7 @@ class RobomimicDataset(EpisodeSource):
             demo = file["data"][self._demos[i]]
             for key in keys:
                 if key in self.features and self.features[key].image:
-                    found[key] = _LazyFrames(self, i, key, len(_Frames(demo, _path(key, image=True), where)))
+                    found[key] = _LazyFrames(self, i, key, len(_Frames(demo, _path(key, self._read.ending), where)))
                 elif key in self.features:
                     found[key] = read_rows(demo, _path(key), slice(None), where).astype(np.float32).ravel()
                 elif key == INSTRUCTION_KEY:
@@ -130,7 +130,7 @@ class RobomimicDataset(EpisodeSource):
         where = self._where(i)
         with self._read.open() as file:
             with damage_as(where):
-                frames = _Frames(file["data"][self._demos[i]], _path(key, image=True), where)
+                frames = _Frames(file["data"][self._demos[i]], _path(key, self._read.ending), where)
             yield frames
 
     def _length(self, file: Any, i: int) -> int:
@@ -206,8 +206,8 @@ def dataset_name(source: RobomimicSource) -> str:
     return re.sub(r"[^a-z0-9_]+", "_", f"robomimic_{source.task}".lower()).strip("_")
 
 
-def _path(key: str, image: bool = False) -> str:
+def _path(key: str, ending: str = "") -> str:
     """Where a field lies in a demonstration."""
     field = key.removeprefix("steps/")
     path = "actions" if field == "action" else hdf5_path(field)
-    return f"{path}_image" if image else path
+    return path + ending

@@ -192,15 +192,6 @@ def test_length_and_rows_must_agree(tmp_path):
             {"features": {"top": {"dtype": "video", "shape": [8, 8, 1]}}},
             "3 channels .it has 'top': 8x8x1; write grey images",
         ),
-        (
-            {
-                "features": {
-                    "top": {"dtype": "video", "shape": [8, 8, 3]},
-                    "actions": {"dtype": "float32", "shape": [2]},
-                }
-            },
-            "no numeric feature 'action', but top, actions. Rename the feature that holds the actions to 'action', here and in the tables",
-        ),
     ],
 )
 def test_info_of_another_kind_is_named(tmp_path, change, message):

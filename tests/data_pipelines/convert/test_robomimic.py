@@ -62,18 +62,22 @@ def test_low_dimensional_files_are_refused_with_the_remedy(tmp_path):
         RobomimicSource(path)
 
 
-def test_pictures_of_another_name_are_no_low_dimensional_file(tmp_path):
+def test_without_an_image_of_that_name_every_picture_is_a_camera(tmp_path):
+    """As LIBERO writes them."""
+
     def rename(file):
         for demo in file["data"].values():
             for camera in ("agentview", "robot0_eye_in_hand"):
                 demo["obs"].move(f"{camera}_image", f"{camera}_rgb")
+            demo["obs/depth"] = np.zeros((len(demo["actions"]), 32, 32, 1), np.float32)
 
     path = write_robomimic(tmp_path / "libero.hdf5", change=rename)
-    with pytest.raises(
-        DataError,
-        match=r"demo_9/obs has no \*_image.* but agentview_rgb, robot0_eye_in_hand_rgb: in a copy of the file, rename",
-    ):
-        RobomimicSource(path)
+    source, usual = RobomimicSource(path), RobomimicSource(write_robomimic(tmp_path / "image.hdf5"))
+    assert list(source.cameras) == ["agentview_rgb", "robot0_eye_in_hand_rgb"]
+    assert list(source.unsupported_images) == ["observation/depth"]
+    assert [list(e.images.values()) for e in source.read(1)] == [list(e.images.values()) for e in usual.read(1)]
+    episode = RobomimicDataset(path).episode(1, "observation/agentview_rgb", ["action"])
+    assert [number(image) for image in episode.images] == [24 + t for t in range(7)]
 
 
 def test_groups_beside_the_arrays_of_a_demonstration_are_left_out(tmp_path):

@@ -301,7 +301,11 @@ def test_actions_that_are_kept_as_bytes_are_told_and_not_called_damage(tmp_path)
 @pytest.mark.parametrize(
     "name, shape, reason",
     [
-        ("actions", (3,), "no numeric field `action`; give the fields of the action in action_keys, from actions"),
+        (
+            "left_action",
+            (3,),
+            "no numeric field `action`; give the fields of the action in action_keys, from left_action",
+        ),
         ("action", (None,), "action has no fixed length, so it cannot be read"),
     ],
 )

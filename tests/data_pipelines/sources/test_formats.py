@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_pipelines.convert.write import convert
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, NoDatasetError, UnreachableError
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
@@ -32,6 +33,7 @@ from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import (
+    CAMERA,
     demo_actions,
     lerobot_actions,
     number,
@@ -76,6 +78,32 @@ def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
             match="机器人: a LeRobot dataset gets the name of its folder, but this name contains none of a to z",
         ):
             read(tmp_path / "机器人")
+
+
+def test_features_have_their_own_names(tmp_path):
+    """Not every program that writes LeRobot datasets writes `observation.` and `action`."""
+    names = {CAMERA: "image", "action": "actions", "observation.state": "state"}
+
+    def rename(e, rows):
+        for old, new in names.items():
+            rows[new] = rows.pop(old)
+
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1", camera="image", change=rename)
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    features = {names.get(name, name): feature for name, feature in info["features"].items()}
+    path.write_text(json.dumps(info | {"features": features}))
+    source = open_source(root)
+    assert list(source.features) == ["steps/observation/image", "steps/state", "steps/actions"]
+    entry = suggest_entry(inspect_dataset(root).facts, 10)
+    assert (entry.image_key, entry.action_keys, entry.action_dims) == ("observation/image", ("actions",), (3,))
+    episode = source.episode(1, entry.image_key, ["actions", "state"])
+    np.testing.assert_array_equal(episode.actions[:, :3], lerobot_actions(1, 9))
+    np.testing.assert_array_equal(episode.actions[:, 3:], [[1, t] for t in range(9)])
+    assert convert(LeRobotSource(root), tmp_path / "rlds", "toy").spec.action_keys == ("actions",)
+    del features["actions"]
+    path.write_text(json.dumps(info | {"features": features}))
+    assert open_source(root).episode(1, "observation/image", []).actions.shape == (9, 0), "video without actions"
 
 
 def test_in_the_cache_of_the_hub_a_dataset_has_the_name_of_its_repository(tmp_path):
