@@ -22,24 +22,13 @@ from experiments.cli.generate import generate
 from experiments.cli.judge import judge
 from experiments.cli.plan import plan
 from experiments.cli.play import play
+from experiments.cli.status import status
 from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 from hma_jax.config import ConfigError
 
-BEGIN_ANEW = (
-    "evaluate",
-    "compare",
-    "report",
-    "fit",
-    "convert",
-    "bench",
-    "plan",
-    "coord-check",
-    "play",
-    "check",
-    "branch",
-)
+BEGIN_ANEW = tuple("evaluate compare report status fit convert bench plan coord-check play check branch".split())
 """Commands that keep nothing of what they had begun when they are stopped."""
 
 app = Commands()
@@ -51,6 +40,7 @@ app.command(name="adapt")(adapt)
 app.command(name="branch")(branch)
 app.command(name="evaluate")(evaluate)
 app.command(name="compare")(compare)
+app.command(name="status")(status)
 app.command(name="report")(study.report)
 app.command(name="fit")(fit)
 app.command(data.data_app, name="data", help=data.HELP)

@@ -1,0 +1,90 @@
+"""`hma status`: how far the trials of a study are."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from experiments.progress import console
+from experiments.setting import UNSET, short
+from experiments.words import counted
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from experiments.running.attempts import State
+
+
+def status(
+    study: Annotated[Positional[Path], arg(metavar="STUDY")],
+    everything: Annotated[FlagCreatePairsOff[bool], arg(name="all"), UNSET] = False,
+) -> None:
+    """Show how far the trials of a study are: which run, where, and how those ended that have no result.
+
+    Reads only, so the study may be running, on this machine or on others.
+
+    Args:
+        study: Directory of a study.
+        everything: List finished trials, and those that have not begun, too.
+    """
+    from experiments.running.attempts import read_states
+    from experiments.running.ledger import FINISHED, MISSING, RUNNING, Ledger
+    from experiments.running.workspace import LOCK, Workspace, load_record
+    from experiments.sweeps.registry import plan_sweeps
+    from experiments.sweeps.sweep import titles
+    from hma_jax.runtime.locks import find_held
+
+    workspace = Workspace(study)
+    record = load_record(workspace)
+    require(
+        record.provenance is not None,
+        f"the study in {short(study)} has no trial yet: its data are not prepared; run `{record.command}`",
+    )
+    names = titles(plan_sweeps(record.study, record.axes, workspace.root), record.provenance)
+    states = read_states(list(names), workspace.trials, Ledger(workspace.ledger))
+    counts = Counter(state.event for state in states.values())
+    order = [
+        RUNNING,
+        *sorted(counts.keys() - {RUNNING, FINISHED, MISSING}),
+        *((FINISHED, MISSING) if everything else ()),
+    ]
+    table = Table("trial", "state", "done", "on", "directory", title=short(study), title_justify="left")
+    for event in order:
+        for id, state in states.items():
+            if state.event == event:
+                table.add_row(
+                    names[id], state.event, *_place(workspace.trials / id, state), short(workspace.trials / id)
+                )
+    if table.row_count:
+        console.print(table)
+    others = [f"{n:,} {event if event != MISSING else 'not begun'}" for event, n in counts.items() if event != FINISHED]
+    console.print(
+        f"{counts[FINISHED]:,} of {counted(len(names), 'trial')} finished" + "".join(f", {o}" for o in others)
+    )
+    for id, state in states.items():
+        if state.message:
+            console.print(Text(f"{names[id]}: {state.message}"), soft_wrap=True)
+    if counts[FINISHED] < len(names) and find_held(workspace.root / LOCK) is None:
+        console.print(Text(f"no command runs it; to go on: {record.command}"), soft_wrap=True)
+
+
+def _place(directory: Path, state: State) -> tuple[str, str]:
+    """(how far a trial is, where it runs and when it last said so)."""
+    from experiments.running.attempts import PROGRESS, read_progress, read_start
+    from experiments.running.ledger import RUNNING
+
+    progress, start = read_progress(directory), read_start(directory)
+    done = f"{progress['phase']} {progress['done']:,} of {progress['total']:,}" if progress else ""
+    if state.event != RUNNING or start is None:
+        return done, ""
+    where = " ".join(filter(None, (start.get("host"), f"job {start['job']}" if "job" in start else "")))
+    try:
+        seconds = max(time.time() - (directory / PROGRESS).stat().st_mtime, 0)
+    except OSError:  # it has just begun, or just ended
+        return done, where
+    return done, f"{where}, {seconds / 60:.0f} min ago" if seconds >= 60 else where

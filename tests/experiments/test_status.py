@@ -1,0 +1,47 @@
+"""`hma status`: what it says of trials that ran, run, failed and never began."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from experiments.cli.main import main
+from experiments.running.attempts import PROGRESS, STARTED, attempt
+from experiments.running.workspace import Workspace, save_record
+from tests.experiments.fakes import finished_study, record_of
+
+
+def said(capsys, *arguments: str) -> str:
+    assert main(["status", *arguments]) == 0
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_trials_without_a_result_are_listed_with_what_they_do_and_why_they_ended(tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    workspace = finished_study(tmp_path, broken={"width 8 · seed 0": "diverged", "width 8 · seed 1": "lost"})
+    save_record(workspace, record_of())
+    whole = said(capsys, str(tmp_path))
+    assert "1 diverged, 1 lost" in whole and whole.count("the loss is <nan> at step 2") == 2
+    assert "no command runs it; to go on: hma study" in whole
+    assert "not begun" not in whole and "9 of 11 trials finished" in whole and "2 trajectories" not in whole
+    assert "2 trajectories" in said(capsys, str(tmp_path), "--all")
+
+
+def test_a_running_trial_says_where_it_is_and_for_how_long_it_said_nothing(tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    workspace = finished_study(tmp_path)
+    save_record(workspace, record_of())
+    directory = next(workspace.trials.iterdir())
+    (directory / "result.json").unlink()
+    with attempt(directory):
+        start = json.loads((directory / STARTED).read_text())
+        (directory / PROGRESS).write_text(json.dumps({"phase": "training", "done": 1200, "total": 3000}))
+        assert f"training 1,200 of 3,000 │ {start['host']} │" in said(capsys, str(tmp_path))
+        monkeypatch.setattr("time.time", lambda: (directory / PROGRESS).stat().st_mtime + 600)
+        assert f"{start['host']}, 10 min ago" in said(capsys, str(tmp_path))
+
+
+def test_a_directory_without_a_study_is_refused(tmp_path: Path, capsys):
+    assert main(["status", str(tmp_path)]) == 2 and "no study in" in capsys.readouterr().err
+    save_record(Workspace(tmp_path), record_of())
+    assert "not begun" in said(capsys, str(tmp_path))
