@@ -80,10 +80,15 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
 
 def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
     """The sweeps along `axes` that are asked for now, of a study in `root`. Raises ConfigError as `plan_sweeps` does,
-    and for a new one without a point at its reference. Of those that the study keeps the files, some were accepted by
-    earlier versions."""
+    for a file that plans other trials each time, and for a new one without a point at its reference. Of those that the
+    study keeps the files, some were accepted by earlier versions."""
     sweeps = plan_sweeps(study, axes)
     for axis, sweep in zip(axes, sweeps, strict=True):
+        require(
+            not is_file(axis) or plan_sweeps(study, (axis,)) == [sweep],
+            f"{axis}: plan(study) returned another sweep when it was called again, so its trials would not be found when "
+            "the study continues; give random numbers a fixed seed",
+        )
         values = tuple(dict.fromkeys(p.x for p in sweep.points if p.role != CONTROL))
         kept = is_file(axis) and Path(axis).resolve().parent == (root / KEPT).resolve()
         require(

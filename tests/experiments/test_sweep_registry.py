@@ -148,6 +148,18 @@ def test_files_are_kept_by_the_names_of_their_axes(tmp_path):
     assert [min(p.x for p in s.points) for s in plan_sweeps(STUDY, axes, root)] == [8, 4, 16]
 
 
+def test_an_axis_of_other_trials_each_time_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(
+        "import random\nfrom dataclasses import replace\nfrom experiments.sweeps import width\n"
+        "def plan(study):\n"
+        "    widths = (8, random.choice(range(16, 2**20, 8)))\n"
+        "    return replace(width.plan(replace(study, widths=widths)), name='own')\n"
+    )
+    assert main(["sweep", "mine.py", "--preset", "smoke", "--dry-run"]) == 2
+    assert "returned another sweep when it was called again" in capsys.readouterr().err
+
+
 TWICE = """
 from dataclasses import replace
 from experiments.sweeps import width
