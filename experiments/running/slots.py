@@ -119,12 +119,23 @@ def _id(file: Path) -> str:
         return ""
 
 
+def core_place(core: int, cores: Path = Path("/sys/devices/system/cpu")) -> tuple[int, int, int]:
+    """Socket, core and number: sorted by it, neighbours share caches and memory."""
+    topology = cores / f"cpu{core}" / "topology"
+    return int(_id(topology / "physical_package_id") or 0), int(_id(topology / "core_id") or 0), core
+
+
 def cut(slots: int, accelerators: Accelerators | None, cores: Sequence[int]) -> list[Slot]:
     """The machine in so many `slots`. Raises ConfigError where it cannot be cut that way.
 
-    Neighbours stay together, since they are the best connected; what does not divide stays idle.
+    Neighbours, accelerators and `cores` alike, stay together, since they are the best connected; accelerators that do
+    not divide stay idle.
     """
-    shares = [tuple(cores[i::slots]) or (cores[i % len(cores)],) if cores and slots > 1 else () for i in range(slots)]
+    ends = [i * len(cores) // slots for i in range(slots + 1)]
+    shares = [
+        tuple(cores[ends[i] : ends[i + 1]]) or (cores[i % len(cores)],) if cores and slots > 1 else ()
+        for i in range(slots)
+    ]
     if accelerators is None or slots == 1:
         return [Slot(share, None, slots if accelerators is None else 1) for share in shares]
     names, kind = accelerators.names, accelerators.kind

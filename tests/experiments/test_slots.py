@@ -8,7 +8,7 @@ import pytest
 
 from experiments.running import slots
 from experiments.running.children import child_environment
-from experiments.running.slots import Accelerators, Slot, cut, find_accelerators
+from experiments.running.slots import Accelerators, Slot, core_place, cut, find_accelerators
 from hma_jax.config import ConfigError
 
 EIGHT = Accelerators("gpu", tuple("01234567"))
@@ -44,6 +44,7 @@ def test_tpu_chips_are_never_shared():
 def test_slots_share_the_cores():
     shares = [set(slot.cores) for slot in cut(2, None, range(5))]
     assert shares[0] | shares[1] == set(range(5)) and not shares[0] & shares[1]
+    assert cut(2, None, (0, 4, 1, 5))[0].cores == (0, 4)  # neighbours, as the launcher orders them
     assert [slot.cores for slot in cut(3, None, (7,))] == [(7,), (7,), (7,)]
     assert cut(1, None, range(5))[0].cores == ()
 
@@ -103,6 +104,17 @@ def test_tpu_chips_are_counted_on_the_bus(tmp_path):
     assert slots._tpu_chips(tmp_path) == ("0", "1")
 
 
+def test_cores_are_ordered_by_socket_and_core(tmp_path):
+    """As hardware threads are numbered: 0 and 2 of one core, 1 and 3 of one on the other socket."""
+    for number, (socket, core) in enumerate([("0", "0"), ("1", "0"), ("0", "0"), ("1", "0")]):
+        topology = tmp_path / f"cpu{number}" / "topology"
+        topology.mkdir(parents=True)
+        (topology / "physical_package_id").write_text(f"{socket}\n")
+        (topology / "core_id").write_text(f"{core}\n")
+    assert sorted(range(4), key=lambda n: core_place(n, tmp_path)) == [0, 2, 1, 3]
+    assert core_place(5, tmp_path) == (0, 0, 5)  # not Linux
+
+
 def test_a_child_is_told_its_slot_but_the_users_memory_stays(monkeypatch):
     monkeypatch.setenv("HMA_CORES", "0")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
@@ -114,3 +126,4 @@ def test_a_child_is_told_its_slot_but_the_users_memory_stays(monkeypatch):
     monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.2")
     assert child_environment(Path("compiled"), slot)["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.2"
     assert "HMA_CORES" not in child_environment(Path("compiled"))
+    assert child_environment(Path("compiled"), slot, "gpu")["HMA_ACCELERATOR"] == "gpu"
