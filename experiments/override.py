@@ -132,8 +132,10 @@ def _parse(path: str, text: str, old: Any) -> Any:
         return text
     if isinstance(old, list) and not text.startswith("["):
         items = [t.strip() for t in text.split(",") if t.strip()]
-        return items if _of_names(Study, path) else [_json(path, t) for t in items]
-    value = _json(path, text)
+        return items if _of_names(Study, path) else [_json(path, t, "numbers separated by commas") for t in items]
+    value = _json(
+        path, text, "a number, true, false, null or list" if old is None else f"a value like {json.dumps(old)}"
+    )
     if old is not None and value is not None:
         number = isinstance(old, (int, float)) and not isinstance(old, bool)
         fits = isinstance(value, (int, float)) if number else isinstance(value, type(old))
@@ -145,13 +147,14 @@ def _parse(path: str, text: str, old: Any) -> Any:
     return value
 
 
-def _json(path: str, text: str) -> Any:
+def _json(path: str, text: str, expected: str) -> Any:
+    """`expected`: what may stand there, for the message."""
     try:
         return json.loads(text.lower() if text in ("True", "False", "None") else text)
     except json.JSONDecodeError:
         if text == "None":
             return None
-        raise ConfigError(f"--set {path}={text}: not a number, true, false, null or list") from None
+        raise ConfigError(f"--set {path}={text}: expected {expected}") from None
 
 
 def _leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

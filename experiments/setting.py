@@ -7,6 +7,7 @@ from one command to the next. What holds for one command only (--workers, --repl
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -150,6 +151,11 @@ def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Set
     """
     arguments = where.anywhere()
     study, data, workspace = get_preset(arguments.preset), arguments.data, Workspace(arguments.out)
+    if in_the_way := [str(place) for place in (workspace.root, *workspace.root.parents) if os.path.isfile(place)]:
+        raise ConfigError(
+            f"cannot write to {workspace.root}: {in_the_way[0]} is a file; choose another --out, in a directory where you "
+            "may write"
+        )
     use_entries(arguments.registry)
     if arguments.mixture is not None:
         from data_pipelines.registry.mixtures import get_mixture

@@ -76,8 +76,9 @@ def read_side(path: Path) -> Side:
         seeds = {seed: found[id].windows for seed, id in ids.items() if id in found}
         if not seeds:
             raise ConfigError(
-                f"{path}: no reference trial of this study ({', '.join(ids.values())}) is finished here; run "
-                f"`{record.command}`, or name two trials"
+                f"{path}: no reference trial of this study ({', '.join(ids.values())}) is finished here, whose windows "
+                f"could be compared. Copy it to {workspace.trials} from where the study ran, run `{record.command}`, or "
+                "name two trials; most studies in experiments/results are kept without their trials"
             )
         steps = reference_trial(record.study, record.study.seeds[0]).train.steps
         return Side(path.name, seeds, record.provenance.tokenizer, of_study=True, step=steps, steps=steps)

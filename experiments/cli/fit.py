@@ -74,6 +74,12 @@ def _show(root: Path) -> None:
         doubts += [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
         table.add_row("isoflop", "training FLOPs", "", exponent, numbers.isoflop.refused or "; ".join(doubts))
     console.print(table)
+    planned = {position.trial for fitted in numbers.fits for position in fitted.curve.positions}
+    if left := planned - numbers.results.keys():
+        say(
+            f"{len(left)} of the {len(planned)} trials of these curves have no result; to run them: "
+            f"`{load_record(Workspace(root.absolute())).command}`"
+        )
 
 
 def _words(fitted: CurveFit) -> tuple[str, str, str]:

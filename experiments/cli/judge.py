@@ -55,7 +55,7 @@ def judge(
     explains the results.
 
     Args:
-        run: Directory of a training run, or experiments/results/simulator.
+        run: Directory of a training run, or experiments/results/simulator_grown.
         robot: One of the model's robots. It must have a true simulator (robots of the suite, metaworld_drawer and
             others) or recordings.
         out: Directory for everything that is written.

@@ -154,7 +154,12 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     step = agree_on_latest(directory)
     if step is None:
         found = "no finished checkpoint under" if directory.is_dir() else "no checkpoints at"
-        raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved a checkpoint")
+        inside = [str(place.parent) for place in run_dir.glob(f"model/{CHECKPOINTS}")]
+        inside += sorted(str(place.parent) for place in run_dir.glob(f"trials/*/run/{CHECKPOINTS}"))
+        runs = f", such as {' or '.join(inside[:2])}" if inside else ""
+        raise CheckpointError(
+            f"{found} {directory}; give the directory of a training run that has saved a checkpoint{runs}"
+        )
     while True:
         try:
             run = _read_run(run_dir, directory / str(step), weights)

@@ -58,7 +58,12 @@ def test_help_needs_no_jax():
         (["tokenizer", "pixels", "--out", "/proc/x"], 2, "cannot write to /proc/x: nothing can be written in"),
         (["compare", "{empty}", "{empty}", "--to", "/proc/x/c.csv"], 2, "choose another --to, in a directory where"),
         (["study", "--preset", "smoke", "--data", "{empty}"], 1, "{empty}"),
-        (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
+        (["study", "--preset", "smoke", "--data", "{empty}/none"], 2, "{empty}/none"),
+        (
+            ["train", "--preset", "smoke", "--out", "{file}/out", "--dry-run"],
+            2,
+            "{file} is a file; choose another --out",
+        ),
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
         (["study", "--preset", "smoke", "--dry-run", "--launcher-set", "bogus=1"], 2, "no such setting; it has none"),
@@ -191,6 +196,16 @@ def test_a_study_of_named_axes_alone_has_nothing_to_fit(tmp_path, capsys):
     assert main(["fit", str(tmp_path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "has no axis along which the loss may follow a power law" in said and "exponents" not in said
+
+
+def test_trials_of_a_curve_that_have_no_result_are_counted_beside_its_fit(tmp_path, capsys):
+    workspace = finished_study(tmp_path)
+    save_record(workspace, record_of())
+    assert main(["fit", str(tmp_path)]) == 0 and "have no result" not in capsys.readouterr().out
+    (unfinished, *_) = sorted(workspace.trials.glob("*/result.json"))
+    unfinished.unlink()
+    assert main(["fit", str(tmp_path)]) == 0
+    assert "1 of the " in (said := capsys.readouterr().out) and "trials of these curves have no result" in said
 
 
 @pytest.fixture

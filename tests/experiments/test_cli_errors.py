@@ -447,6 +447,14 @@ def test_evaluation_of_what_is_no_run(make, study, tmp_path, refused):
     assert f"no checkpoints at {tmp_path / 'run'}" in message and "the directory of a training run" in message
 
 
+def test_evaluation_of_a_study_names_a_run_in_it(study, tmp_path, refused):
+    out, data = study
+    for run in ("model", "trials/1a/run"):
+        (tmp_path / run / "checkpoints").mkdir(parents=True)
+    message = refused(2, "evaluate", tmp_path, *SMOKE, "--out", out, *data)
+    assert f"such as {tmp_path / 'model'} or {tmp_path / 'trials' / '1a' / 'run'}" in message
+
+
 def prepared_otherwise(study, root: Path, *settings: str, data: tuple[str, ...] | None = None) -> Path:
     """A study that was prepared in another way."""
     other = shutil.copytree(study[0], root / "out")

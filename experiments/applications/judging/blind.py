@@ -116,6 +116,11 @@ def _film(images: np.ndarray) -> bytes:
 
 def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
     """{(policy, world, start): a person calls it success}. Raises ConfigError for labels of another page."""
+    require(
+        (out / "blind.json").is_file(),
+        f"{out} holds no results of `hma judge` (no blind.json); give the --out of the command that evaluated the policies",
+    )
+    require(path.is_file(), f"{path}: no such file; give the file that the page {out / 'blind.html'} saved")
     try:
         saved: dict[str, Any] = json.loads(path.read_text())
         key: dict[str, Any] = json.loads((out / "blind.json").read_text())

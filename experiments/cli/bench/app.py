@@ -6,8 +6,8 @@ from experiments.cli.bench import models, others
 from experiments.cli.command_line import Commands
 
 HELP = (
-    "Measure speed on this machine. Every command times the fast implementation and the naive one alternately in one "
-    "process, prints both, and writes a JSON record with commit, hardware and versions."
+    "Measure speed on this machine. Most commands time the fast implementation and the naive one alternately in one "
+    "process and print both. Results are written as JSON records with commit, hardware and versions."
 )
 
 bench_app = Commands()

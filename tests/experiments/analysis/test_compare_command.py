@@ -164,7 +164,8 @@ def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path,
     workspace.root.mkdir()
     save_record(workspace, record_of())
     assert main(["compare", str(a), str(workspace.root)]) == 2
-    assert "no reference trial of this study" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no reference trial of this study" in said and f"Copy it to {workspace.trials} from where" in said
 
 
 def test_nats_of_two_tokenizers_are_left_out_and_it_is_said(table, tmp_path, capsys):

@@ -272,6 +272,14 @@ def test_what_is_no_file_of_labels_is_said(content, tmp_path):
         read_labels(tmp_path / "labels.json", tmp_path)
 
 
+def test_labels_that_are_not_there_and_a_directory_without_results_are_said(tmp_path):
+    with pytest.raises(ConfigError, match=f"^{tmp_path} holds no results of `hma judge`"):
+        read_labels(tmp_path / "labels.json", tmp_path)
+    (tmp_path / "blind.json").write_text("{}")
+    with pytest.raises(ConfigError, match=r"labels\.json: no such file; give the file that the page"):
+        read_labels(tmp_path / "labels.json", tmp_path)
+
+
 def test_outcomes_that_were_cut_short_are_said(tmp_path):
     path = tmp_path / "outcomes.csv"
     write_outcomes([Outcome("mine", 0, 1, 2, TRUE, HEAD, True)], path)
