@@ -136,6 +136,7 @@ class TrialPlan:
     cost: Cost
     flops: float  # that it has to itself
     seconds: float
+    keep: tuple[int, ...] = ()  # steps whose checkpoints stay, for trials that go on from there
 
 
 def plan_trials(
@@ -148,19 +149,24 @@ def plan_trials(
     for id, trial in trials.items():
         cost = estimate(trial)
         if id in done.finished or id in done.left:
-            plans[id] = TrialPlan(trial, cost, 0.0, 0.0)
+            plans[id] = TrialPlan(trial, cost, 0.0, 0.0, shared[id].keep)
             continue
         all_flops = cost.flops if evaluated else cost.train_flops
         trained_share = max(done.steps.get(id, 0), *(step for _, step in shared[id].before), 0) / trial.train.steps
         flops = all_flops - min(trained_share, 1.0) * cost.train_flops
-        plans[id] = TrialPlan(trial, cost, flops, flops / (devices * study.flops_per_second) + study.trial_seconds)
+        seconds = flops / (devices * study.flops_per_second) + study.trial_seconds
+        plans[id] = TrialPlan(trial, cost, flops, seconds, shared[id].keep)
     return plans
 
 
 def checkpoint_bytes(plan: TrialPlan) -> int:
     """Size of the checkpoints that a finished trial leaves."""
     trial, train = plan.trial, plan.trial.train
-    return UNWATCHED.keep_checkpoints * _state_bytes(trial.model, _table_of(trial), train.ema_decay > 0, train.only)
+    every, _ = UNWATCHED.steps_between(train.steps)
+    saved = {*(range(every, train.steps, every) if every else ()), *plan.keep, train.steps}
+    kept = {*sorted(saved)[-UNWATCHED.keep_checkpoints :], *plan.keep}
+    size = _state_bytes(trial.model, _table_of(trial), train.ema_decay > 0, train.only)
+    return max(len(kept), UNWATCHED.keep_checkpoints) * size
 
 
 @functools.cache

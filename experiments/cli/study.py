@@ -87,7 +87,8 @@ def _run(
         given, trained = bool(setting.data), setting.tokenizer is None
         if given:
             check_entries(setting.study, setting.data)
-        devices = Devices(check_launched(setting.study, sweeps, launcher_options), launcher_options.at_once)
+        each = check_launched(setting.study, sweeps, launcher_options) * launcher_options.cores_each()
+        devices = Devices(each, launcher_options.at_once)
         done = find_done(setting, sweeps, running.retry_failed, running.accept_code)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))
         if given:

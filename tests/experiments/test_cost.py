@@ -11,7 +11,7 @@ from experiments.cli.main import main
 from experiments.cost import checkpoint_bytes, declared_table, estimate, evaluation_flops_per_window, plan_trials
 from experiments.preparing_cost import describe, estimate_preparing
 from experiments.presets import ACCELERATOR, CPU_FULL, PAPER, SMOKE, SMOKE_CONTINUOUS
-from experiments.running.launchers import local
+from experiments.running.launchers import local, registry
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import Accelerators
 from experiments.sweeps.registry import find_axis, plan_sweeps
@@ -128,13 +128,15 @@ def test_every_launcher_says_which_devices_a_trial_runs_on(gpus, launching, mesh
     assert (devices_of(MeshConfig(*mesh), launching.share()), launching.at_once) == (each, at_once)
 
 
-def test_the_plan_prices_the_devices_that_trials_run_on(capsys):
+def test_the_plan_prices_the_devices_that_trials_run_on(capsys, monkeypatch):
     """Before, a rate was that of a whole machine, for each worker."""
+    monkeypatch.setattr(registry, "usable_cores", lambda: 4)
     plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=3600", "--set", "flops_per_second=1e20"]
     plan += ["--set", "train.batch=8"]
     for more, said in (
         ("", "priced for 1 device at 100.0 EFLOP/s each (flops_per_second); 5.0 device-hours"),
-        ("--workers 5", "priced for 5 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
+        ("--workers 4", "priced for 4 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
+        ("--workers 5", "priced for 4 devices, 0.8 for each trial, at 100.0 EFLOP/s each (flops_per_second); 4.0 dev"),
         ("--launcher slurm --launcher-set gpus=8", "if the cluster runs all at the same time"),
         ("--launcher slurm --launcher-set gpus=8", "for 8 devices at 100.0 EFLOP/s each (flops_per_second); 40.0 dev"),
     ):
@@ -154,6 +156,25 @@ def test_a_model_that_is_only_trained_pays_for_no_evaluation_and_leaves_two_chec
     assert all(plan.flops == plan.cost.train_flops < plan.cost.flops for plan in plans.values())
     counters = [checkpoint_bytes(plan) - 2 * 3 * 4 * plan.cost.parameters for plan in plans.values()]
     assert all(0 < size < 1000 for size in counters)
+
+
+def test_more_workers_than_cores_make_nothing_faster(monkeypatch):
+    """Sixteen workers were said to need a sixteenth of the time on two cores."""
+    monkeypatch.setattr(local, "find_accelerators", lambda: None)
+    monkeypatch.setattr(registry, "usable_cores", lambda: 4)
+    shares = {n: LauncherOptions("local", n).cores_each() for n in (1, 4, 16)}
+    assert shares == {1: 1, 4: 1, 16: 0.25} and LauncherOptions("slurm", 16).cores_each() == 1
+    sweeps = [find_axis("width")(SMOKE)]
+    alone, shared = (plan_trials(SMOKE, sweeps, shares[n]).values() for n in (4, 16))
+    for a, b in zip(alone, shared, strict=True):
+        assert b.seconds - SMOKE.trial_seconds == pytest.approx(4 * (a.seconds - SMOKE.trial_seconds))
+
+
+def test_checkpoints_from_which_others_go_on_are_counted():
+    plan = next(iter(plan_trials(SMOKE, [find_axis("width")(SMOKE)]).values()))
+    plan = replace(plan, trial=replace(plan.trial, train=replace(plan.trial.train, steps=100)))
+    assert checkpoint_bytes(replace(plan, keep=(10, 30))) == 2 * checkpoint_bytes(plan)
+    assert checkpoint_bytes(replace(plan, keep=(80,))) == checkpoint_bytes(plan), "one of the newest two"
 
 
 def test_what_is_frozen_leaves_no_moments_in_checkpoints():

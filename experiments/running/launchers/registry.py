@@ -14,6 +14,7 @@ from typing import Any
 from experiments.running.launchers.base import Launcher
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict
+from hma_jax.runtime.cores import usable_cores
 
 LAUNCHERS = {
     "local": "experiments.running.launchers.local:LocalLauncher",
@@ -47,6 +48,13 @@ class LauncherOptions:
         """How many accelerators each trial gets (`Launcher.share`)."""
         kind, settings = self._parsed()
         return kind.share(self.workers, settings)
+
+    def cores_each(self) -> float:
+        """The part of a core that each trial gets where more of them than there are cores run on this machine's
+        processor; otherwise 1."""
+        if self.name != "local" or self.share() is not None:
+            return 1.0
+        return min(usable_cores() / (self.at_once or 1), 1.0)
 
     def require_installed(self) -> None:
         """Raises ConfigError without the package that the launcher works through."""
