@@ -63,7 +63,13 @@ class JoinedSource(EpisodeSource):
 
     def fingerprint(self) -> str:
         """Hash over the parts' names and fingerprints, in order."""
-        text = ";".join(f"{part.name}:{part.fingerprint()}" for part in self.parts)
+        return self._hash([part.fingerprint() for part in self.parts])
+
+    def former_fingerprint(self) -> str:
+        return self._hash([part.former_fingerprint() for part in self.parts])
+
+    def _hash(self, fingerprints: Sequence[str]) -> str:
+        text = ";".join(f"{part.name}:{own}" for part, own in zip(self.parts, fingerprints, strict=True))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def sizes(self) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
-from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_meta
+from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_episodes, hash_meta
 from data_pipelines.sources.rlds.location import retry
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
@@ -89,12 +89,19 @@ class LeRobotDataset(EpisodeSource):
         return self._read.hz
 
     def fingerprint(self) -> str:
-        """Hash over the meta folder, statistics of episodes included, and all files' names and sizes."""
+        """Hash over what is read of the meta folder, with statistics of the episodes that say whether their contents are
+        the same, and all files' names and sizes. Texts and statistics of the whole dataset may change."""
         return self._fingerprint
 
     @functools.cached_property
     def _fingerprint(self) -> str:
-        digest = hash_meta(self.location)
+        return self._with_sizes(hash_episodes(self.location, self._read.meta))
+
+    def former_fingerprint(self) -> str:
+        """Over all files of the meta folder."""
+        return self._with_sizes(hash_meta(self.location))
+
+    def _with_sizes(self, digest: Any) -> str:
         for path, size in self._bytes.items():
             digest.update(f"{path.relative_to(self.location).as_posix()}:{size};".encode())
         return digest.hexdigest()[:16]

@@ -118,6 +118,32 @@ def hash_meta(root: Path) -> hashlib._Hash:
     return digest
 
 
+def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
+    """SHA-256, to be added to, of what is read of the meta folder: the rate, the features, and of every episode its
+    place, its length and its statistics, which no reader needs but which change with its actions and images."""
+
+    def place(path: Path) -> str:
+        return path.relative_to(root).as_posix()
+
+    shapes = {name: (feature["dtype"], feature["shape"]) for name, feature in sorted(meta.features.items())}
+    digest = hashlib.sha256(repr((meta.version, meta.fps, shapes, meta.stated)).encode())
+    for e in meta.episodes:
+        videos = {name: (place(path), begin) for name, (path, begin) in sorted(e.videos.items())}
+        digest.update(repr((e.index, e.length, place(e.data), videos)).encode())
+    statistics = root / "meta" / "episodes_stats.jsonl"  # 2.1; 2.0 has none of single episodes
+    if statistics.exists():
+        digest.update(retry(statistics, partial(_hash_file, statistics)).encode())
+    columns = [f"stats/{name}/{value}" for name in shapes for value in ("min", "max", "mean", "std")]
+    for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
+        digest.update(repr([(name, c.to_pylist()) for name, c in _columns(path, columns)]).encode())
+    return digest
+
+
+def _columns(path: Path, columns: list[str]) -> list[tuple[str, Any]]:
+    table = read_table(path, columns)
+    return [(name, table[name]) for name in columns if name in table.column_names]
+
+
 def _hash_file(path: Path) -> str:
     with path.open("rb") as file:  # in small parts: statistics of every episode can be half a gigabyte
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -144,6 +144,16 @@ class EpisodeSource(ABC):
     def fingerprint(self) -> str:
         """Hash of the contents, independent of the location."""
 
+    def former_fingerprint(self) -> str:
+        """What `fingerprint` was by earlier versions."""
+        return self.fingerprint()
+
+    def fingerprint_as(self, recorded: str) -> str:
+        """`recorded` where that is the former fingerprint of these contents, otherwise the fingerprint: so what was made
+        by earlier versions stays in use."""
+        own = self.fingerprint()
+        return recorded if recorded and recorded != own and recorded == self.former_fingerprint() else own
+
     @abstractmethod
     def sizes(self) -> np.ndarray:
         """int64 [episodes]: approximate bytes of each."""

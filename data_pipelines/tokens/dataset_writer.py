@@ -106,6 +106,17 @@ def differences(store_root: str | Path, plan: Manifest) -> list[str]:
     return _changes(load_manifest(final / FILE), plan) if final.exists() else []
 
 
+def recorded_source(store_root: str | Path, name: str) -> str:
+    """The fingerprint of what the existing dataset of this name was made from; "" without one that can be read."""
+    final = Path(store_root) / name
+    try:
+        return load_manifest(final / FILE).source if final.exists() else ""
+    except UnreachableError:  # it may be intact
+        raise
+    except DataError:
+        return ""
+
+
 def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
     """Ranges of consecutive items of about `part_size` together."""
     ends, filled = [], 0

@@ -25,7 +25,7 @@ from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, V
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import decoding_threads, fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
-from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, recorded_source, write_dataset
 from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
@@ -92,6 +92,7 @@ def tokenize_dataset(
     plan = plan_dataset(
         spec, source, tokenizer, val_fraction, min_val, max_val,
         max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
+        recorded=recorded_source(store_root, spec.name),
     )  # fmt: skip
     watch = TurnWatch(spec, warn or (lambda _: None))
     work = _Work(source, plan, tokenizer, batch, threads or decoding_threads(), watch)
@@ -129,14 +130,15 @@ def plan_dataset(
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
     rate: float | None = FRAME_RATE,
+    recorded: str = "",
 ) -> Manifest:
-    """The manifest of a dataset before it is made. Raises ConfigError for settings that cannot work."""
+    """The manifest of a dataset before it is made; `recorded` as of `EpisodeSource.fingerprint_as`. Raises ConfigError for settings that cannot work."""
     frame_step = resolve_frame_step(spec, frame_step, rate)
     return Manifest(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
         settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step, max_val_fraction),
-        source=source.fingerprint(),
+        source=source.fingerprint_as(recorded),
         source_version=source.version,
         action_mean=(),
         action_std=(),

@@ -133,8 +133,8 @@ def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[So
         spec.name
         for spec, path in known
         if spec.name not in otherwise
-        and data[spec.name].get("shards")
-        and data[spec.name]["shards"] != open_source((spec, path), study.store).fingerprint()
+        and (made_of := data[spec.name].get("shards"))
+        and made_of != open_source((spec, path), study.store).fingerprint_as(made_of)
     ]
     if changed:
         say(

@@ -97,7 +97,7 @@ def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:
     """How the datasets that are in the store were made otherwise; a line that holds for several is said once."""
     from data_pipelines.errors import DataError, UnreachableError
-    from data_pipelines.tokens.dataset_writer import differences
+    from data_pipelines.tokens.dataset_writer import differences, recorded_source
     from data_pipelines.tokens.tokenize_job import plan_dataset
 
     s = study.store
@@ -109,6 +109,7 @@ def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], 
         plan = plan_dataset(
             spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val,
             max_val_fraction=s.max_val_fraction, frame_step=s.frame_step, rate=study.rate,
+            recorded=recorded_source(workspace.store, spec.name),
         )  # fmt: skip
         try:
             lines = differences(workspace.store, plan)

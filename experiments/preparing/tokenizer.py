@@ -61,18 +61,20 @@ FRAMES, ENCODED, SHRUNK = "frames", "those that are encoded", "JPEG images of RL
 where a decoder could make them, by another filter than that of the frames that are encoded."""
 
 
-def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
-    """What the tokenizer of a study is trained from, under the names that --set has for it.
+def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[Source]) -> MadeFrom:
+    """What the tokenizer of a study is trained from, under the names that --set has for it. Recordings are named as the
+    tokenizer that is there names them, if by earlier versions.
 
     Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
     of where a dataset's frames are.
     """
     from data_pipelines.sampling.order import ORDER_VERSION
 
-    settings = study.store
+    settings, existing = study.store, read_stamp(workspace.tokenizer)
+    known = existing.inputs.get("data", {}) if existing else {}
     data = {
         spec.name: {
-            "shards": open_source((spec, path), settings).fingerprint(),
+            "shards": open_source((spec, path), settings).fingerprint_as(known.get(spec.name, {}).get("shards", "")),
             "image_key": spec.camera_key,
             **{name: getattr(spec, name) for name in OF_FRAMES},
         }
@@ -115,7 +117,7 @@ def make_tokenizer(
         "the study's tokenizer cannot be trained here; give the directory of an imported one with --tokenizer",
     )
     sources = _seen(study, sources)
-    made_from = tokenizer_made_from(study, sources)
+    made_from = tokenizer_made_from(study, workspace, sources)
     if _in_place(workspace.tokenizer, made_from, replace):
         return
 
@@ -144,7 +146,7 @@ def make_tokenizer(
 
 def require_same_trained(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
     """Raises ConfigError if the workspace has another tokenizer than the study would train."""
-    _in_place(workspace.tokenizer, tokenizer_made_from(study, _seen(study, sources)), None)
+    _in_place(workspace.tokenizer, tokenizer_made_from(study, workspace, _seen(study, sources)), None)
 
 
 def _seen(study: Study, sources: Sequence[Source]) -> list[Source]:

@@ -23,6 +23,7 @@ from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources import lerobot_dataset
+from data_pipelines.sources.joined import JoinedSource
 from data_pipelines.sources.lerobot import LeRobotSource
 from data_pipelines.sources.open import find_format, open_source, source_name
 from data_pipelines.sources.rlds import location
@@ -177,8 +178,40 @@ def test_hidden_files_of_the_meta_folder_are_no_part_of_the_dataset(tmp_path, mo
     monkeypatch.setattr(Path, "read_bytes", None)
     source = open_source(root)
     assert source.fingerprint() == before and LeRobotSource(root).identity() == identity
-    (root / "meta" / "stats.json").write_text("{}")
+    (root / "meta" / "episodes_stats.jsonl").write_text("{}")
     assert source.fingerprint() == before != open_source(root).fingerprint()
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_statistics_and_texts_of_a_dataset_are_no_part_of_its_recordings(tmp_path, version):
+    root = write_lerobot(tmp_path / "toy-arm", version)
+    before = open_source(root).fingerprint()
+    (root / "meta" / "stats.json").write_text('{"action": {"q01": [0]}}')
+    (root / "meta" / "README.md").write_text("Task texts were corrected.")
+    for path in (root / "meta").glob("tasks.*"):
+        path.unlink()
+    assert open_source(root).fingerprint() == before
+    if version == "v2.1":
+        path = root / "meta" / "episodes.jsonl"
+        path.write_text(path.read_text().replace('"length": 9', '"length": 8'))
+    else:
+        pq = pytest.importorskip("pyarrow.parquet")
+        (path,) = (root / "meta" / "episodes").rglob("*.parquet")
+        pq.write_table(pq.read_table(path).append_column("stats/action/mean", [[[0.0] * 3, [1.0] * 3]]), path)
+    assert open_source(root).fingerprint() != before
+
+
+def test_what_was_made_of_a_dataset_by_its_former_fingerprint_stays_in_use(tmp_path):
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1")
+    made = tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "store")
+    source, path = open_source(root), tmp_path / "store" / "toy_arm" / "manifest.json"
+    former = source.former_fingerprint()
+    assert former not in (made.source, "")
+    path.write_text(path.read_text().replace(made.source, former))
+    assert tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "store").source == former
+    joined = JoinedSource("both", [source, source], "raise", 0)
+    assert joined.fingerprint_as(joined.former_fingerprint()) == joined.former_fingerprint() != joined.fingerprint()
+    assert joined.fingerprint_as("other") == joined.fingerprint()
 
 
 def test_more_lost_episodes_than_can_be_named_are_damage_whatever_is_allowed(tmp_path):
