@@ -13,6 +13,14 @@ from experiments.running.children import silence_background
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
 
+OUT_OF_MEMORY = (
+    "(The memory of a device is too small for this. Training needs less with --set execution.remat=everything, "
+    "--set execution.accumulate=2 or more, a smaller train.batch, or --mesh 1 -1 1, which splits weights and moments among "
+    "devices; `hma plan` says how much it needs. Evaluation needs less with a smaller eval.batch. Another "
+    "program on the device may hold the rest.)"
+)
+"""Added to what the compiler or a device says."""
+
 
 def guarded(
     work: Callable[[], None],
@@ -96,9 +104,8 @@ def _exit_code(error: Exception) -> Exit | None:
 
     if isinstance(error, ConfigError):
         return Exit.REFUSED
-    if isinstance(error, (DataError, TrialsFailed, OSError)):
-        return Exit.FAILED
     if "jax" in sys.modules:  # otherwise none of these can have been raised
+        from hma_jax.training.checkpoints import SaveError
         from hma_jax.training.divergence import DivergedError
         from hma_jax.training.loop import Interrupted
 
@@ -106,7 +113,20 @@ def _exit_code(error: Exception) -> Exit | None:
             return Exit.DIVERGED
         if isinstance(error, Interrupted):
             return error.exit
+        if isinstance(error, SaveError) and error.passing:
+            return Exit.LOST
+        if _is_out_of_memory(error):
+            return Exit.REFUSED
+    if isinstance(error, (DataError, TrialsFailed, OSError)):
+        return Exit.FAILED
     return None
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether a device has too little memory for a program or an array."""
+    import jax
+
+    return isinstance(error, jax.errors.JaxRuntimeError) and str(error).startswith("RESOURCE_EXHAUSTED")
 
 
 def _words(error: Exception, skipping: str) -> str:
@@ -118,6 +138,8 @@ def _words(error: Exception, skipping: str) -> str:
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
+    if "jax" in sys.modules and _is_out_of_memory(error):
+        return f"{str(error).splitlines()[0]} {OUT_OF_MEMORY}"
     return str(error)
 
 

@@ -1,10 +1,13 @@
 """Checkpoints: whole or absent, on any mesh, and never mistaken for another run's.
 
-Orbax (v1) writes asynchronously into a temporary directory and renames. Each field of a state is an item
-of its own, so that parameters are read without moments. Beside them every checkpoint carries the JSON
-description of its run (configurations, embodiment table, data provenance); restoring under another
-description is refused by name. Once a checkpoint is finished, its files are listed with their hashes, and
-whoever reads it checks them.
+Orbax (v1) writes asynchronously. Then what it wrote is flushed to disk and listed with hashes, and only then does
+it get its name, DIRECTORY/<step>: what has that name is complete, and whoever reads it checks the hashes. Earlier
+checkpoints are removed after that. Whatever has another name was left behind by a save that did not come so far, and
+the next one removes it.
+
+Each field of a state is an item of its own, so that parameters are read without moments. Beside them every checkpoint
+carries the JSON description of its run (configurations, embodiment table, data provenance); restoring under another
+description is refused by name.
 """
 
 from __future__ import annotations
@@ -14,20 +17,23 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
-from hma_jax.runtime.files import sync, sync_tree
-from hma_jax.runtime.processes import is_writer, writer_first
-from hma_jax.training.hashes import write_list
+from hma_jax.runtime.files import IO_ERRNOS, sync, sync_tree
+from hma_jax.runtime.processes import all_gather, is_writer, writer_first
+from hma_jax.training.hashes import hash_files, write_list
 from hma_jax.training.reading import (
     CheckpointError,
     agree_on_latest,
@@ -37,6 +43,7 @@ from hma_jax.training.reading import (
     list_steps,
     load_items,
     read_description,
+    require_finished,
 )
 from hma_jax.training.run_lock import require_plain
 
@@ -45,11 +52,27 @@ Description = dict[str, Any]
 Load = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 """Reads the items of a checkpoint, as `load_items`."""
 
+UNFINISHED, REMOVED = ".unfinished", ".removed"
+"""Ends of the names of a checkpoint that is being written, or removed."""
+
+TRIES = 10
+"""A save is given up once so many in a row have failed because their disk did not answer: after about five minutes."""
+
+LONGEST_PAUSE = 60.0
+"""Seconds, at most, before a save is repeated; the first pauses are 1, 2, 4, ... seconds."""
+
+T = TypeVar("T")
+
 log = logging.getLogger(__name__)
 
 
 class SaveError(OSError):
-    """Something of a run could not be written. Its last finished checkpoint is kept."""
+    """Something of a run could not be written. Its last finished checkpoint is kept. `passing`: a disk or network
+    failed, which may answer again."""
+
+    def __init__(self, message: str, passing: bool = False):
+        super().__init__(message)
+        self.passing = passing
 
 
 class Checkpoints:
@@ -85,24 +108,25 @@ class Checkpoints:
                 f"cannot create the checkpoint directory {self.directory}: {error.strerror}; "
                 "choose another output directory"
             ) from error
-        self._orbax: ocp.training.Checkpointer | None = None
         self._background = ThreadPoolExecutor(1, "checkpoint")
-        self._pending: tuple[int, Future[None]] | None = None
+        self._pending: tuple[int, Future[OSError | None]] | None = None
+        self._failed: list[SaveError] = []  # since the last save that came to its end
+        self._repeat_at = 0.0  # time.monotonic()
         self._bytes = 0  # of the state that was saved last
 
     def __enter__(self) -> Checkpoints:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, raised: BaseException | None, _: object) -> None:
         try:
             self.wait()
         except SaveError as error:
             if kind is None:
                 raise
-            log.warning("%s", error)  # the earlier exception is the one to raise
+            if error is not raised:
+                log.warning("%s", error)  # the earlier exception is the one to raise
         finally:
             self._background.shutdown()
-            self._close_orbax()
 
     @property
     def latest_step(self) -> int | None:
@@ -114,71 +138,126 @@ class Checkpoints:
         """Starts an asynchronous save of a named tuple, an item per field that is not None; the arrays
         are copied before this returns.
 
-        Raises SaveError if this save or the one before it could not be written.
+        Raises SaveError if this save or the one before it could not be written, unless it is to be repeated
+        (`to_repeat`).
         """
-        self.wait()
+        self._bear(self._settle())
         items = {name: item for name, item in state._asdict().items() if item is not None}
         self._bytes = sum(x.nbytes for x in jax.tree.leaves(items))
+        hush_orbax()
         try:
             _require_writable(self.directory)
-            # Without `force` Orbax may decide that this step need not be saved.
-            response = self._writer().save_checkpointables_async(step, items, custom_metadata=self.meta, force=True)
+            if is_writer():
+                self._remove_leftovers()
+            response = ocp.save_checkpointables_async(
+                self._unfinished(step), items, overwrite=True, custom_metadata=self.meta
+            )
         except Exception as error:
-            raise self._failed(step, error) from error
-        self._pending = step, self._background.submit(self._finish, step, response)
+            self._bear(self._failure(step, error))
+        else:
+            self._pending = step, self._background.submit(self._finish, step, response)
 
     def raise_failure(self) -> None:
-        """Raises the SaveError of a save that has failed since; does not wait for one that is under way."""
+        """Raises the SaveError of a save that has failed since, unless it is to be repeated; does not wait for one that
+        is under way."""
         if self._pending is not None and self._pending[1].done():
-            self.wait()
+            self._bear(self._settle())
+
+    @property
+    def to_repeat(self) -> bool:
+        """Whether it is time to save again, because a disk did not answer when the last save was written."""
+        return bool(self._failed) and self._pending is None and time.monotonic() >= self._repeat_at
+
+    def finish(self, step: int, state: Any) -> None:
+        """Waits until the save of `step`, which was started, is complete; repeats it where that may help. Raises
+        SaveError."""
+        self._bear(self._settle())
+        while self._failed:
+            time.sleep(max(self._repeat_at - time.monotonic(), 0))
+            self.save(step, state)
+            self._bear(self._settle())
 
     def wait(self) -> None:
-        """Until the last save is finished and listed. Raises SaveError if it could not be written."""
+        """Waits until the last save is complete. Raises SaveError if it could not be written."""
+        error = self._settle()
+        if error or self._failed:
+            raise error or self._failed[-1]
+
+    def _settle(self) -> SaveError | None:
+        """Waits for the last save. Returns the error of one that can be repeated, and raises that of another."""
         if self._pending is None:
-            return
+            return None
         (step, future), self._pending = self._pending, None
         try:
-            future.result()
-        except Exception as error:
-            raise self._failed(step, error) from error
+            error = future.result()
+        except Exception as orbax:
+            return self._failure(step, orbax)
+        if error is not None:
+            return self._failure(step, error, agreed=True)
+        self._failed.clear()
+        return None
 
-    def _writer(self) -> ocp.training.Checkpointer:
-        """Created at the first save: by then the directory holds only checkpoints that this run continues from."""
-        if self._orbax is None:
-            hush_orbax()
-            policies = ocp.training.preservation_policies
-            self._orbax = ocp.training.Checkpointer(
-                self.directory,
-                preservation_policy=policies.AnyPreservationPolicy(
-                    [policies.LatestN(self.keep), policies.CustomSteps(self.keep_steps)]
-                    + [policies.EveryNSteps(self.keep_every)] * (self.keep_every > 0)
-                ),
-                # A save that was killed leaves a temporary directory; remove it.
-                cleanup_tmp_directories=True,
-            )
-        return self._orbax
+    def _bear(self, error: SaveError | None) -> None:
+        """Notes that a save is to be repeated. Raises its error after as many as are borne."""
+        if error is None:
+            return
+        self._failed.append(error)
+        if len(self._failed) == TRIES:
+            raise error
+        pause = min(2.0 ** (len(self._failed) - 1), LONGEST_PAUSE)
+        self._repeat_at = time.monotonic() + pause
+        log.warning("%s; the run goes on, and saves again in %.0f s", error.args[0].partition(". ")[0], pause)
 
-    def _finish(self, step: int, response: Any) -> None:
-        """In the background: waits for Orbax, then flushes what it wrote to disk and lists it."""
+    def _finish(self, step: int, response: Any) -> OSError | None:
+        """In the background: waits for Orbax, then flushes and lists what it wrote, and gives it its name. Every
+        process does so for its own shards. Returns the error, the same in all processes, if that fails."""
         response.result()
-        if is_writer():
-            sync_tree(self.directory / str(step))  # Orbax flushes arrays alone, neither its other files nor their names
-            sync(self.directory)
-            write_list(self.directory / str(step))
+        try:
+            told = _in_all("hashes", lambda: [] if is_writer() else _own_shards(self._unfinished(step)))
+            _in_all("checkpoint", lambda: self._complete(step, sum(told, [])) if is_writer() else None)
+        except OSError as error:
+            return error
+        return None
 
-    def _failed(self, step: int, error: Exception) -> SaveError:
-        """The error to raise for a failed save. What it left half-written is removed by the next start."""
-        self._close_orbax()
+    def _complete(self, step: int, rows: list[Any]) -> None:
+        unfinished = self._unfinished(step)
+        sync_tree(unfinished)  # Orbax flushes arrays alone, neither its other files nor their names
+        write_list(unfinished, rows)
+        if not (self.directory / str(step)).exists():  # otherwise only the flush of its name had failed
+            os.replace(unfinished, self.directory / str(step))
+        sync(self.directory)
+        for old in list_steps(self.directory)[: -self.keep]:
+            kept = old in self.keep_steps or self.keep_every and old % self.keep_every == 0
+            if not kept:
+                with suppress(FileNotFoundError):  # another name first: what has a number is never half removed
+                    os.replace(self.directory / str(old), self.directory / f"{old}{REMOVED}")
+        self._remove_leftovers()
+
+    def _remove_leftovers(self) -> None:
+        for path in self.directory.iterdir():
+            if re.match(r"[0-9]+\.", path.name):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def _unfinished(self, step: int) -> Path:
+        return self.directory / f"{step}{UNFINISHED}"
+
+    def _failure(self, step: int, error: Exception, agreed: bool = False) -> SaveError:
+        """The error of a failed save. Raises it where repeating the save would not help: the disk is full, or other
+        processes do not know of it."""
         latest = self.latest_step
         reason = _reason(error)
         if latest is None:
             again = "it starts from step 0, since there is no checkpoint yet"
         else:
             again = f"it continues from step {latest}, the last complete checkpoint"
-        return SaveError(
+        failure = SaveError(
             f"the checkpoint of step {step} could not be written to {self.directory}: {reason}. {self._space()}Make "
-            f"sure that there is space and permission to write, then run the same command again: {again}"
+            f"sure that there is space and permission to write, then run the same command again: {again}",
+            passing=error_code(error) in IO_ERRNOS,
         )
+        if failure.passing and (agreed or jax.process_count() == 1):
+            return failure
+        raise failure from error
 
     def _space(self) -> str:
         try:
@@ -186,14 +265,6 @@ class Checkpoints:
         except OSError:  # the directory itself is gone
             return ""
         return f"It takes about {_size(self._bytes)}, and {_size(free)} are free there. "
-
-    def _close_orbax(self) -> None:
-        orbax, self._orbax = self._orbax, None
-        if orbax is not None:
-            try:
-                orbax.close()
-            except Exception as error:  # of the save that failed, which `wait` has raised already
-                log.debug("error when closing the checkpoints at %s: %s", self.directory, error)
 
     # --- Restoring ---------------------------------------------------------------------------
 
@@ -218,6 +289,7 @@ class Checkpoints:
         if step is None:
             raise CheckpointError(f"no checkpoint in {self.directory}")
         checkpoint = self.directory / str(step)
+        require_finished(checkpoint)
         saved = read_description(checkpoint)
         if saved.keys() != self.meta.keys():
             raise CheckpointError(
@@ -264,6 +336,29 @@ def _require_writable(directory: Path) -> None:
         read_only = directory.is_dir() and os.statvfs(directory).f_flag & os.ST_RDONLY
         code = errno.EROFS if read_only else errno.EACCES if directory.is_dir() else errno.ENOENT
         raise OSError(code, os.strerror(code), str(directory))
+
+
+def _own_shards(checkpoint: Path) -> list[Any]:
+    """Flushes and hashes the files that this process alone wrote. The writer does so for the others, and for those that
+    a shared disk does not show here yet."""
+    own = f"/ocdbt.process_{jax.process_index()}/"
+    rows = hash_files(checkpoint, lambda name: own in name)
+    for row in rows:
+        sync(checkpoint / row[0])
+    return rows
+
+
+def _in_all(name: str, act: Callable[[], T]) -> list[T]:
+    """What `act` returns in each of the processes, which all call this. An OSError of any of them is raised in all."""
+    try:
+        own = {"result": act()}
+    except OSError as error:
+        own = {"failed": error_code(error), "reason": _reason(error)}
+    told = [json.loads(text) for text in all_gather(f"saved/{name}", json.dumps(own))]
+    for one in told:
+        if "failed" in one:
+            raise OSError(one["failed"], one["reason"])
+    return [one["result"] for one in told]
 
 
 def _size(count: int) -> str:

@@ -8,12 +8,20 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hma_jax.runtime.files import write_file
 
 NAME = "sha256.json"
+
+THREADS = 8
+"""At most so many files are hashed at once: one core computes SHA-256 more slowly than most disks read."""
+
+T = TypeVar("T")
+Row = list[Any]
+"""What the list says of a file: path within the checkpoint, size in bytes, SHA-256."""
 
 Chosen = Callable[[str], bool]
 """Whether a file, named by its path within the checkpoint, is meant."""
@@ -38,10 +46,18 @@ class ReadError(OSError):
         )
 
 
-def write_list(checkpoint: Path) -> None:
-    """Lists every file under `checkpoint`: path, size in bytes, SHA-256."""
-    rows = [[name, path.stat().st_size, _sha256(path)] for name, path in _files(checkpoint)]
-    write_file(checkpoint / NAME, json.dumps({"sha256": _hash_of(rows), "files": rows}, indent=0))
+def hash_files(checkpoint: Path, chosen: Chosen = lambda name: True) -> list[Row]:
+    """A row for each of the `chosen` files under `checkpoint`."""
+    files = [(name, path) for name, path in _files(checkpoint) if chosen(name)]
+    return _in_threads(lambda file: [file[0], file[1].stat().st_size, _sha256(file[1])], files)
+
+
+def write_list(checkpoint: Path, known: Iterable[Row] = ()) -> None:
+    """Lists every file under `checkpoint`; those of the rows that are `known` are not hashed again."""
+    rows = {row[0]: row for row in known}
+    rows |= {row[0]: row for row in hash_files(checkpoint, lambda name: name not in rows)}
+    files = [rows[name] for name in sorted(rows)]
+    write_file(checkpoint / NAME, json.dumps({"sha256": _hash_of(files), "files": files}, indent=0))
 
 
 def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:
@@ -61,12 +77,11 @@ def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[in
     except ValueError as error:
         raise Damaged(path, f"cannot be read ({error})") from error
     rows = [row for row in _rows(path, text) if chosen(row[0])]
-    for name, size, digest in rows[share[0] :: share[1]]:
-        _compare(checkpoint / name, size, digest)
+    _in_threads(lambda row: _compare(checkpoint / row[0], *row[1:]), rows[share[0] :: share[1]])
     return True
 
 
-def _rows(path: Path, text: str) -> Iterable[tuple[str, int, str]]:
+def _rows(path: Path, text: str) -> list[Row]:
     try:
         content: Any = json.loads(text)
         rows, stated = content["files"], content["sha256"]
@@ -95,6 +110,12 @@ def _files(checkpoint: Path) -> Iterator[tuple[str, Path]]:
         name = path.relative_to(checkpoint).as_posix()
         if path.is_file() and name != NAME:
             yield name, path
+
+
+def _in_threads(function: Callable[[Any], T], items: Iterable[Any]) -> list[T]:
+    """As `map`. Raises what the first of the items raises."""
+    with ThreadPoolExecutor(THREADS, "hash") as threads:
+        return list(threads.map(function, items))
 
 
 def _sha256(path: Path) -> str:

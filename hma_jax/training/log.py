@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import IO_ERRNOS, write_file
 from hma_jax.runtime.processes import is_writer
 from hma_jax.training.checkpoints import SaveError
 from hma_jax.training.tensorboard import TensorBoardWriter
@@ -179,7 +179,8 @@ class RunLog:
         except OSError as error:
             raise SaveError(
                 f"{self.run_dir / name} could not be written: {error.strerror}. Make sure that there is space and "
-                "permission to write, then run the same command again: it continues from the last checkpoint"
+                "permission to write, then run the same command again: it continues from the last checkpoint",
+                passing=error.errno in IO_ERRNOS,
             ) from error
 
 

@@ -196,7 +196,7 @@ def fit(
                 between.act(step, state, metrics)
             jax.block_until_ready(state)
             seconds = between.seconds()
-            checkpoints.wait()
+            checkpoints.finish(steps, state)
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 
 
@@ -261,7 +261,7 @@ class _BetweenSteps:
             self._saved = self._options.clock()
         self._agreement.submit(self._request)
         if stopping and not last:
-            self._checkpoints.wait()
+            self._checkpoints.finish(step, state)
             raise Interrupted(
                 f"stopped at step {step} of {self._steps}; the same command resumes from {self._run_dir}",
                 self._stop.exit,
@@ -282,7 +282,8 @@ class _BetweenSteps:
     def _request(self) -> int:
         if self._stop.is_set():
             return STOP
-        return SAVE if _is_late(self._options.clock() - self._saved, self._options) else 0
+        late = self._checkpoints.to_repeat or _is_late(self._options.clock() - self._saved, self._options)
+        return SAVE if late else 0
 
 
 def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
@@ -339,9 +340,9 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator[_Stop]:
-    """An event set by SIGINT, SIGTERM or SIGHUP; a second SIGINT or a second SIGTERM acts as usual, but not one of
-    another kind: schedulers send several. A request that the block did not act on is left pending for the code after
-    it."""
+    """An event set by SIGINT, SIGTERM or SIGHUP; a second SIGINT acts as usual, but further signals of other kinds do
+    not: schedulers send several, and wrappers pass each of them on to a process that has had it. A request that the
+    block did not act on is left pending for the code after it."""
     event = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield event  # only the main thread may install handlers
@@ -354,7 +355,7 @@ def _stop_requests() -> Iterator[_Stop]:
         del frame
         event.exit = take_signal(number)
         event.set()
-        if number != signal.SIGHUP:
+        if number == signal.SIGINT:
             signal.signal(number, previous[number])
 
     for number in previous:

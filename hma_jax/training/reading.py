@@ -22,7 +22,7 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.processes import all_gather, broadcast_from_writer, is_writer
-from hma_jax.training.hashes import Damaged, ReadError, verify
+from hma_jax.training.hashes import NAME, Damaged, ReadError, verify
 from hma_jax.training.run_lock import list_steps
 
 WHOLE_STATE = "state"
@@ -70,12 +70,27 @@ def raised_in_all(name: str) -> Iterator[None]:
 
 
 def find_damage(checkpoint: Path) -> Damaged | None:
-    """The first damaged file; None if there is none, or no list of hashes. Raises ReadError."""
+    """The first damaged file; None if there is none. Raises ReadError."""
     try:
-        verify(checkpoint)
+        if not verify(checkpoint):
+            _require_listed(checkpoint)
     except Damaged as damage:
         return damage
     return None
+
+
+def require_finished(checkpoint: Path) -> None:
+    """Raises CheckpointError, in all of several processes, if writing `checkpoint` was interrupted."""
+    with raised_in_all("finished"), _reading(checkpoint):
+        _require_listed(checkpoint)
+
+
+def _require_listed(checkpoint: Path) -> None:
+    """Raises Damaged for a checkpoint without a list of hashes after one that has it: nobody can tell whether its files
+    are as they were written. Where none has a list, a version that wrote none made them."""
+    earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
+    if not (checkpoint / NAME).exists() and any((checkpoint.parent / str(step) / NAME).exists() for step in earlier):
+        raise Damaged(checkpoint / NAME, "is missing, so it was not written or copied to its end")
 
 
 def read_description(checkpoint: Path) -> dict[str, Any]:

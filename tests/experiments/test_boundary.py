@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 
+import jax
 import pytest
 
 from experiments.boundary import guarded
 from experiments.progress import console
 from hma_jax.runtime.exits import Exit
+from hma_jax.training.checkpoints import SaveError
 
 
 @pytest.mark.parametrize("say", [print, console.print])
@@ -27,3 +29,29 @@ def test_another_pipe_that_breaks_is_an_error(capsys):
     with open(theirs, "wb", buffering=0) as pipe:
         assert guarded(lambda: pipe.write(b"x")) == Exit.FAILED
     assert capsys.readouterr().err.startswith("error: Broken pipe")
+
+
+def test_too_little_memory_is_one_line_that_says_what_needs_less(capsys):
+    def work() -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 7 bytes.\nBacktrace:\n 0x0")
+
+    assert guarded(work) == Exit.REFUSED
+    error = capsys.readouterr().err
+    assert error.startswith("error: RESOURCE_EXHAUSTED: Out of memory allocating 7 bytes. (") and error.count("\n") == 1
+    assert "execution.accumulate=2" in error and "`hma plan` says" in error
+
+
+def test_another_error_of_the_runtime_is_a_bug():
+    def work() -> None:
+        raise jax.errors.JaxRuntimeError("INTERNAL: of the compiler")
+
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        guarded(work)
+
+
+@pytest.mark.parametrize(("passing", "code"), [(True, Exit.LOST), (False, Exit.FAILED)])
+def test_a_disk_that_does_not_answer_is_worth_another_start_and_a_full_one_is_not(passing, code):
+    def work() -> None:
+        raise SaveError("the checkpoint of step 4 could not be written", passing)
+
+    assert guarded(work) == code

@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import shutil
+import time
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
+from hma_jax.training import checkpoints as module
 from hma_jax.training import hashes, reading
 from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
 from hma_jax.training.hashes import NAME, Damaged, ReadError, verify, write_list
@@ -67,6 +69,8 @@ def test_one_flipped_bit_in_any_file_is_refused_by_its_name(run_dir: Path):
     assert {name.split("/")[0] for name in names} > {"params", "opt_state", "step", "_CHECKPOINT_METADATA", NAME}
     for name in names:
         good = (checkpoint / name).read_bytes()
+        if not good:
+            continue
         flip(checkpoint / name)
         with pytest.raises(CheckpointError) as refused:
             fit_toy(run_dir, 8, options=EVERY_TWO)
@@ -188,11 +192,23 @@ def test_a_run_without_a_whole_checkpoint_is_not_started_again_in_silence(run_di
 
 
 def test_a_checkpoint_without_a_list_is_read_with_a_remark(run_dir: Path, caplog: pytest.LogCaptureFixture):
-    """An earlier version wrote it, or its writer died between finishing it and listing it."""
-    (run_dir / "checkpoints" / "6" / NAME).unlink()
+    """An earlier version wrote it, and those before it."""
+    for step in ("4", "6"):
+        (run_dir / "checkpoints" / step / NAME).unlink()
     with caplog.at_level(logging.WARNING):
         assert fit_toy(run_dir, 8).resumed_from == 6
     assert "without checking their hashes" in caplog.text
+
+
+def test_a_checkpoint_whose_list_is_missing_after_one_that_has_it_counts_as_damaged(run_dir: Path):
+    """Orbax reads a flipped bit of it without an error."""
+    checkpoint = run_dir / "checkpoints" / "6"
+    (checkpoint / NAME).unlink()
+    flip(max((checkpoint / "params").rglob("*"), key=lambda path: path.stat().st_size * path.is_file()))
+    with pytest.raises(CheckpointError, match=f"{NAME} is missing, .*; that of step 4 is undamaged: .*--skip-damaged"):
+        fit_toy(run_dir, 8)
+    assert fit_toy(run_dir, 8, options=SKIP).resumed_from == 4
+    assert list_steps(run_dir / "damaged") == [6] and list_steps(run_dir / "checkpoints") == [6, 8]
 
 
 def test_the_list_is_whole_or_absent(tmp_path: Path):
@@ -225,44 +241,83 @@ def test_parameters_are_read_without_the_moments(run_dir: Path):
 # --- Failing saves ---------------------------------------------------------------------------
 
 
-def test_a_checkpoint_is_on_disk_before_it_is_listed(tmp_path: Path, monkeypatch):
+def test_a_checkpoint_is_on_disk_before_it_is_listed_and_listed_before_it_has_its_name(tmp_path: Path, monkeypatch):
     """Orbax flushes its arrays alone; after a loss of power its other files would be empty, or the checkpoint gone."""
-    import hma_jax.training.checkpoints as module
-
-    synced, missing, fsync = set(), [], os.fsync
+    synced, missing, fsync, replace = set(), [], os.fsync, os.replace
 
     def record(fd: int) -> None:
         synced.add(os.fstat(fd).st_ino)
         fsync(fd)
 
-    def check(checkpoint: Path) -> None:
-        paths = [checkpoint.parent, checkpoint, *checkpoint.rglob("*")]
-        missing.append([path.name for path in paths if path.stat().st_ino not in synced])
+    def check(old: Path, new: Path) -> None:
+        if Path(new) == tmp_path / "1":
+            missing.append([path.name for path in (old, *old.rglob("*")) if path.stat().st_ino not in synced])
+            assert verify(old)
+            synced.clear()
+        replace(old, new)
 
     monkeypatch.setattr(os, "fsync", record)
-    monkeypatch.setattr(module, "write_list", check)
+    monkeypatch.setattr(os, "replace", check)
     with Checkpoints(tmp_path, {"toy": 1}) as checkpoints:
         checkpoints.save(1, toy_state())
-    assert missing == [[]]
+    assert missing == [[]] and synced == {tmp_path.stat().st_ino}
 
 
 def test_a_save_that_fails_in_the_background_is_one_message_and_keeps_the_last(tmp_path: Path, monkeypatch):
-    import hma_jax.training.checkpoints as module
-
     with pytest.raises(SaveError, match="step 2 could not be written .*: No space left on device") as refused:
-        with Checkpoints(tmp_path, {"toy": 1}) as checkpoints:
+        with Checkpoints(tmp_path, {"toy": 1}, keep=1) as checkpoints:
             checkpoints.save(1, toy_state())
             checkpoints.wait()
-
-            def full(checkpoint: Path) -> None:
-                raise OSError(28, "No space left on device")
-
-            monkeypatch.setattr(module, "write_list", full)
+            fail(monkeypatch, errno.ENOSPC, 1)
             checkpoints.save(2, toy_state())
             while checkpoints._pending is not None:
                 checkpoints.raise_failure()  # noticed while training goes on, not at the next save only
-    assert "run the same command again: it continues from step" in str(refused.value)
-    assert list_steps(tmp_path)[0] == 1
+    assert "run the same command again: it continues from step 1, the last complete" in str(refused.value)
+    assert list_steps(tmp_path) == [1] and not refused.value.passing
+
+
+def fail(monkeypatch: pytest.MonkeyPatch, code: int, times: int) -> list[Path]:
+    """The next so many checkpoints cannot be flushed to disk; returns those that are tried."""
+    real, tried = module.sync_tree, []
+
+    def sync_tree(checkpoint: Path) -> None:
+        tried.append(checkpoint)
+        if len(tried) <= times:
+            raise OSError(code, os.strerror(code))
+        real(checkpoint)
+
+    monkeypatch.setattr(module, "sync_tree", sync_tree)
+    monkeypatch.setattr(module, "LONGEST_PAUSE", 0.0)
+    return tried
+
+
+def test_a_disk_that_does_not_answer_once_costs_one_save_and_not_the_run(tmp_path: Path, monkeypatch, caplog):
+    tried = fail(monkeypatch, errno.ESTALE, 1)
+
+    def wait(step: int, *_: object) -> None:
+        if step == 5:  # that is told while step 6 is computed
+            while not tried:
+                time.sleep(0.01)
+            time.sleep(0.2)
+
+    with caplog.at_level(logging.WARNING):
+        fit_toy(tmp_path, 9, options=LoopOptions(checkpoint_every=4, log_every=1, keep_checkpoints=9), progress=wait)
+    assert "the checkpoint of step 4 could not be written" in caplog.text and "Stale file handle" in caplog.text
+    assert list_steps(tmp_path / "checkpoints") == [6, 8, 9] and len(tried) == 4
+    assert not any(find_damage(tmp_path / "checkpoints" / str(step)) for step in (6, 8, 9))
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["6", "8", "9"]
+
+
+def test_the_last_save_is_repeated_until_the_disk_answers_and_given_up_in_the_end(tmp_path: Path, monkeypatch):
+    fail(monkeypatch, errno.EIO, 3)
+    fit_toy(tmp_path / "answers", 2)
+    assert list_steps(tmp_path / "answers" / "checkpoints") == [2]
+    tried = fail(monkeypatch, errno.EIO, 100)
+    with pytest.raises(SaveError, match="step 2 could not be written .*it starts from step 0") as given_up:
+        fit_toy(tmp_path / "does not", 2)
+    assert given_up.value.passing and len(tried) == module.TRIES
+    with pytest.raises(SaveError, match="step 2"), Checkpoints(tmp_path / "no loop", {"toy": 1}) as checkpoints:
+        checkpoints.save(2, toy_state())  # whoever does not repeat it is told
 
 
 def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path):
@@ -272,3 +327,10 @@ def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path):
     assert not (tmp_path / "a [2]" / "run" / "checkpoints").exists()
     fit_toy(tmp_path / "what? a[*b" / "run", 4, options=EVERY_TWO)
     assert fit_toy(tmp_path / "what? a[*b" / "run", 6, options=EVERY_TWO).resumed_from == 4
+
+
+def test_what_one_of_several_processes_cannot_write_is_the_error_of_all(monkeypatch):
+    monkeypatch.setattr(module, "all_gather", lambda name, own: [own, '{"failed": 116, "reason": "Stale file handle"}'])
+    with pytest.raises(OSError, match="Stale file handle") as raised:
+        module._in_all("hashes", list)
+    assert raised.value.errno == errno.ESTALE

@@ -27,8 +27,8 @@ def dies_in_save(monkeypatch: pytest.MonkeyPatch):
 
     def at(step: int) -> None:
         async def finalize(self, *arguments, **options):
-            if self.get_final().name == str(step):
-                raise OSError(5, "Input/output error")
+            if self.get_final().name == f"{step}.unfinished":
+                raise OSError(28, "No space left on device")
             await real(self, *arguments, **options)
 
         monkeypatch.setattr(AtomicRenameTemporaryPath, "finalize", finalize)
@@ -58,7 +58,6 @@ def test_a_death_inside_a_save_falls_back_to_the_checkpoint_before(options, tmp_
 
 
 def test_the_same_step_is_saved_again_by_the_process_whose_save_failed(tmp_path: Path, dies_in_save, monkeypatch):
-    """Orbax takes a step whose save failed for its latest, and leaves out what comes next."""
     with Checkpoints(tmp_path, {"toy": 1}) as checkpoints:
         checkpoints.save(2, toy_state())
         checkpoints.wait()

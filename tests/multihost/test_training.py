@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import time
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 
 from hma_jax.runtime.exits import Exit
-from hma_jax.training.reading import find_damage, list_steps
+from hma_jax.training.hashes import verify
+from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
 from tests.conftest import FAST_COMPILATION
 from tests.multihost.processes import Started, launch, run
@@ -70,7 +72,12 @@ def test_processes_train_as_one_does_and_write_one_log(processes: int, devices: 
             np.testing.assert_allclose([*a.values()], [*b.values()], rtol=1e-5)
     assert len(list((tmp_path / "tensorboard").iterdir())) == 1 and len(read(tmp_path, "execution.jsonl")) == 1
     assert list_steps(tmp_path / "checkpoints") == [10, 20]
-    assert not find_damage(tmp_path / "checkpoints" / "20")
+    for step in (10, 20):
+        assert verify(tmp_path / "checkpoints" / str(step))
+    for p, report in enumerate(reports):  # each its own shards, the first one what is left
+        own = [f"/ocdbt.process_{p}/" in name for name in report["hashed"]]
+        others = [re.search(r"/ocdbt.process_[0-9]+/", name) for name in report["hashed"]]
+        assert any(own) and (all(own) if p else not any(found and "_0/" not in found[0] for found in others))
 
 
 def test_in_float64_the_losses_of_twenty_steps_are_those_of_one_process(tmp_path: Path, monkeypatch):

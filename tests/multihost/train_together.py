@@ -29,6 +29,7 @@ if FLOAT64:  # before the first module of the library says what its arrays are m
 from hma_jax.config import ExecutionConfig, MeshConfig
 from hma_jax.runtime.processes import Processes, end, is_writer, start
 from hma_jax.runtime.rows import own_rows
+from hma_jax.training import hashes
 from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.train import train_model
 from hma_jax.training.validation import Validation
@@ -58,7 +59,13 @@ def train(run_dir: Path, asked: dict[str, Any]) -> dict[str, Any]:
     model, config = model_config(action_heads=False), train_config(steps=asked["steps"], ema_decay=asked["ema"])
     mesh = MeshConfig(*asked["mesh"], min_shard_size=64)
     execution = ExecutionConfig(mesh=mesh)
-    rows, seen = own_rows(mesh, config.batch), []
+    rows, seen, hashed, sha256 = own_rows(mesh, config.batch), [], [], hashes._sha256
+
+    def record(path: Path) -> str:
+        hashed.append(path.as_posix())
+        return sha256(path)
+
+    hashes._sha256 = record
 
     def own(step: int) -> dict[str, np.ndarray]:
         return {name: x[rows] for name, x in random_batch(step, model, config.batch).items()}
@@ -86,6 +93,7 @@ def train(run_dir: Path, asked: dict[str, Any]) -> dict[str, Any]:
         "batches": seen,
         "losses": result.losses,
         "resumed_from": result.resumed_from,
+        "hashed": hashed,
         "devices": jax.device_count(),
     }
 
