@@ -60,7 +60,8 @@ def from_official(checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOIN
     robots (hma adapt), and converted to other formats; it cannot be resumed. docs/checkpoints.md shows each.
 
     Args:
-        checkpoint: Directory with config.json and model.safetensors (or pytorch_model.bin, model.bin).
+        checkpoint: Directory with config.json and model.safetensors (or pytorch_model.bin, model.bin; or several files
+            with the index that names them).
         out: Directory of the run to write. Its rates.toml has the registry entries of its robots, as far as the
             registry knows them, with the frame rates that the model was trained at.
     """
@@ -85,8 +86,8 @@ def from_official(checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOIN
 def to_official(run: RunDirectory, out: Directory, weights: Weights = "auto") -> None:
     """Write a run as a checkpoint that the official PyTorch release loads.
 
-    A run that came from the release and was not trained further is written back byte for byte. Any other run is
-    written so that the release's from_pretrained loads it and computes the same. muP that the release
+    The tensors of a run that came from the release and was not trained further are written back byte for byte. Any
+    other run is written so that the release's from_pretrained loads it and computes the same. muP that the release
     does not support (continuous models of another width than 256, other attention scales) is folded into the
     weights, and a note says so. Models that the release cannot compute are refused; the error names the setting.
 

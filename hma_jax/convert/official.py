@@ -2,8 +2,9 @@
 
 A directory holds config.json and model.safetensors, or a torch file in its place. Reading is strict: a tensor too few,
 too many or of another shape is refused, where the release leaves random weights in its place. Fields that we do not use
-are kept in the run's provenance, so that a run that was imported and not trained since is exported byte for byte. In
-every other run muP's multipliers are folded into the weights where the release would use other ones (`multipliers`).
+are kept in the run's provenance, so that a run that was imported and not trained since is exported with the same fields
+and, byte for byte, the same tensors. In every other run muP's multipliers are folded into the weights where the release
+would use other ones (`multipliers`).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from hma_jax.convert.official_config import (
 )
 from hma_jax.convert.release_limits import ATTENTION_SCALE, loads_in_release, released_form, require_official
 from hma_jax.convert.table import check_names, flat, from_official, nested, official_parts, to_official
-from hma_jax.convert.tensors import FLOATS, Stored, read_safetensors, write_safetensors
+from hma_jax.convert.tensors import FLOATS, Stored, read_finite, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
@@ -43,6 +44,10 @@ from hma_jax.training.runs import Run
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")
+INDEX = "{}.index.json"  # in the place of weights that lie in several files, which it names
+WRAPPERS = ("module.", "_orig_mod.")
+"""What torch's data parallelism and torch.compile put before every name."""
+
 ACTIONS_IN = ("stem/into/kernel", "action_head/robots/into/kernel")
 """Parameters [E, U, ...] that multiply actions, given or noised."""
 
@@ -78,17 +83,21 @@ def read_official(directory: Path) -> Run:
     )
     with _naming_file(where):
         model, masking = read_model(config, where), read_masking(config)
-    names = config["action_domains"] if isinstance(config.get("action_domains"), list) else []
+    blocks = model.layers + (model.diffusion.depth if model.diffusion else 0)
+    require(
+        blocks <= len(tensors),  # before anything is made of each
+        f"{where}: it describes {blocks} layers, but there are only {len(tensors)} tensors",
+    )
+    names = config["action_domains"]
     missing = [name for robot in names for name in _statistics(robot) if name not in tensors]
     require(not missing, f"{directory}: missing tensors {', '.join(missing[:10])}")
-    statistics = {robot: tuple(tensors[name].read() for name in _statistics(robot)) for robot in names}
+    statistics = {
+        robot: tuple(read_finite(tensors, name, str(directory)) for name in _statistics(robot)) for robot in names
+    }
     with _naming_file(where):
         table = read_table(config, statistics, where)
-    check_names(
-        official_shapes(model, table),
-        {name: tensor.shape for name, tensor in tensors.items()},
-        str(directory),
-    )
+        shapes = official_shapes(model, table)
+    check_names(shapes, {name: tensor.shape for name, tensor in tensors.items()}, str(directory))
     foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
     require(not foreign, f"{directory}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
     leaves = declare_model(model, table).leaves()
@@ -132,6 +141,8 @@ def _naming_file(where: str) -> Iterator[None]:
     """Adds the name of the file to errors of our own configurations, which do not know it."""
     try:
         yield
+    except OverflowError as error:
+        raise ConfigError(f"{where}: it contains a number that is too large ({error})") from error
     except ConfigError as error:
         raise ConfigError(str(error) if where in str(error) else f"{where}: {error}") from error
 
@@ -142,22 +153,47 @@ def read_config(directory: Path) -> dict[str, Any]:
     try:
         config = json.loads(path.read_text())
     except OSError as error:
-        raise ConfigError(f"no {path} ({error.strerror}); give a directory with {CONFIG} and {WEIGHTS}") from error
+        raise ConfigError(f"no {path} ({error.strerror}); {_advice(path.parent)}") from error
     except ValueError as error:
         raise ConfigError(f"{path} is not JSON: {error}") from error
     require(isinstance(config, dict), f"{path}: expected named fields, got {type(config).__name__}")
     return config
 
 
+def _advice(directory: Path) -> str:
+    """What to give instead of a directory without config.json."""
+    snapshots = directory / "snapshots"
+    if snapshots.is_dir():
+        return f"give the directory of a version in {snapshots}, where the Hugging Face hub keeps the files"
+    advice = f"give a directory with {CONFIG} and {WEIGHTS}"
+    if not directory.exists() and not directory.is_absolute() and len(directory.parts) == 2:
+        advice += f"; of a model on the Hugging Face hub: hf download {directory} --local-dir {directory.name}"
+    return advice
+
+
 def _read_weights(directory: Path) -> dict[str, Stored]:
-    found = [directory / name for name in (WEIGHTS, *TORCH_WEIGHTS) if (directory / name).is_file()]
+    names = (WEIGHTS, *TORCH_WEIGHTS)
+    found = [directory / name for name in (*names, *map(INDEX.format, names)) if (directory / name).is_file()]
     require(bool(found), f"{directory} has neither {WEIGHTS} nor {' nor '.join(TORCH_WEIGHTS)}")
-    tensors = read_safetensors(found[0]) if found[0].name == WEIGHTS else read_torch(found[0])
-    # What torch's data parallelism puts before every name.
-    prefix = "module."
-    if tensors and all(name.startswith(prefix) for name in tensors):
-        return {name.removeprefix(prefix): tensor for name, tensor in tensors.items()}
+    tensors = _read_shards(found[0]) if found[0].suffix == ".json" else _read_file(found[0])
+    while prefix := next((p for p in WRAPPERS if tensors and all(name.startswith(p) for name in tensors)), ""):
+        tensors = {name.removeprefix(prefix): tensor for name, tensor in tensors.items()}
     return tensors
+
+
+def _read_file(path: Path) -> dict[str, Stored]:
+    return read_safetensors(path) if path.suffix == ".safetensors" else read_torch(path)
+
+
+def _read_shards(index: Path) -> dict[str, Stored]:
+    """The tensors of all files that an index names. Raises ConfigError where one is missing."""
+    try:
+        files = sorted({str(name) for name in json.loads(index.read_text())["weight_map"].values()})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{index} is not a readable index of weight files ({error}); download it again") from error
+    missing = [name for name in files if not (index.parent / name).is_file()]
+    require(not missing, f"{index.parent}: missing {', '.join(missing[:10])}, which {index.name} names; download them")
+    return {name: tensor for file in files for name, tensor in _read_file(index.parent / file).items()}
 
 
 def _variant(config: dict[str, Any]) -> str:

@@ -218,7 +218,8 @@ def read_table(
         dim = mean.size
         require(
             dim > 0 and chunk % dim == 0,
-            f"{where}: d_actions {chunk} of {name} is not a multiple of its {dim} action dimensions",
+            f"{where}: d_actions {chunk} of {name} is not a multiple of its {dim} action dimensions, the length of "
+            f"action_preprocessor.{name}.mean",
         )
         entries.append(Embodiment(name, dim, chunk // dim, tuple(mean.tolist()), tuple(std.tolist())))
     return EmbodimentTable(tuple(entries))

@@ -70,13 +70,16 @@ def read_safetensors(path: Path) -> dict[str, Stored]:
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
-    """Writes contiguous copies where needed; the values' bytes are kept. Raises OSError."""
+    """Writes contiguous copies where needed; the values' bytes are kept. Raises OSError.
+
+    The file says that its format is PyTorch's, as those of the Hugging Face libraries do: some refuse files without it.
+    """
     dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
     # safetensors puts a file in the place of ours that its owner alone may read: it gets the mode that the umask gave.
     path.touch()
     mode = stat.S_IMODE(path.stat().st_mode)
     try:
-        safetensors.numpy.save_file(dense, path)
+        safetensors.numpy.save_file(dense, path, metadata={"format": "pt"})
     except SafetensorError as error:
         raise OSError(f"{path} cannot be written: {error}; check the space on its disk") from error
     path.chmod(mode)

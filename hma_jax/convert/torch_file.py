@@ -9,6 +9,7 @@ one entry among others; whatever else a trainer keeps there is passed over witho
 from __future__ import annotations
 
 import collections
+import io
 import pickle
 import zipfile
 from dataclasses import dataclass
@@ -36,6 +37,9 @@ STORAGES = {
     "BoolStorage": np.bool_,
 }
 
+LARGEST = 2**26
+"""Bytes of a description of tensors, at most: more than any model needs."""
+
 
 @dataclass(frozen=True, slots=True)
 class _StorageType:
@@ -46,10 +50,6 @@ class _StorageType:
 class _Storage:
     dtype: np.dtype
     key: str
-
-
-class _Refused(ConfigError):
-    """Not wrapped by what reports damaged files."""
 
 
 class _TakesItems(type):
@@ -78,12 +78,18 @@ class _Ignored(metaclass=_TakesItems):
         del items
 
 
-class _Reader(pickle.Unpickler):
+class _Reader(pickle._Unpickler):
     """Knows ordered dictionaries, storages and how a tensor is made of one. Of a `whole` training run all else is
-    passed over."""
+    passed over.
+
+    It is the unpickler in Python: that in C makes room for as many objects as any number in the file says.
+    """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, root: str, whole: bool):
-        super().__init__(archive.open(f"{root}data.pkl"))
+        size = archive.getinfo(f"{root}data.pkl").file_size
+        if size > LARGEST:
+            raise pickle.UnpicklingError(f"{size:,} bytes, more than {LARGEST:,}")
+        super().__init__(io.BytesIO(archive.read(f"{root}data.pkl")))  # all of it: the checksum comes first
         self.path, self.root, self.whole = path, root, whole
         self.bytes = {info.filename: info.file_size for info in archive.infolist()}
 
@@ -96,7 +102,7 @@ class _Reader(pickle.Unpickler):
             return _StorageType(np.dtype(STORAGES[name]))
         if self.whole:
             return _Ignored
-        raise _Refused(
+        raise ConfigError(
             f"{self.path} needs {module}.{name}, which a plain state dict of tensors does not; for safety it is not "
             "read. Save only the tensors, best as model.safetensors"
         )
@@ -125,8 +131,8 @@ class _Reader(pickle.Unpickler):
             raise pickle.UnpicklingError(f"a tensor of shape {shape} and strides {stride} from {offset}")
         entry, size = f"{self.root}data/{storage.key}", storage.dtype.itemsize
         last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
-        if prod(shape) and (last + 1) * size > self.bytes[entry]:
-            raise pickle.UnpicklingError(f"a tensor that reaches beyond {entry}")
+        if prod(shape) and max(prod(shape), last + 1) * size > self.bytes[entry]:
+            raise pickle.UnpicklingError(f"a tensor of more elements than {entry} has")
 
         def read() -> np.ndarray:
             if not prod(shape):
@@ -157,18 +163,17 @@ def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
                 little = archive.read(f"{root}byteorder") == b"little"
                 require(little, f"{path}: its byte order is not little-endian; save it on a little-endian machine")
             state = _Reader(path, archive, root, whole=within is not None).load()
-    except _Refused:
-        raise
     except zipfile.BadZipFile as error:
-        raise ConfigError(f"{path}: not a zip file; it is damaged or was saved by torch before 1.6{advice}") from error
-    except (*UNREADABLE, pickle.UnpicklingError, AttributeError) as error:
-        if isinstance(error, ConfigError):
-            raise
+        raise ConfigError(
+            f"{path}: not a readable zip file ({error}); it is damaged or was saved by torch before 1.6{advice}"
+        ) from error
+    except ConfigError:
+        raise
+    except Exception as error:  # a damaged pickle can raise anything
         raise ConfigError(f"{path}: its description of tensors cannot be read ({error}){advice}") from error
     if within is not None and isinstance(state, dict) and isinstance(state.get(within), dict):
         state = state[within]
-    plain = isinstance(state, dict) and all(
-        isinstance(name, str) and isinstance(tensor, Stored) for name, tensor in state.items()
-    )
-    require(plain, f"{path} contains something other than names and tensors{advice}")
+    entries = state.items() if isinstance(state, dict) else [(type(state).__name__, state)]
+    others = [str(name) for name, tensor in entries if not (isinstance(name, str) and isinstance(tensor, Stored))]
+    require(not others, f"{path} contains something other than names and tensors ({', '.join(others[:3])}){advice}")
     return dict(state)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import ml_dtypes
 import numpy as np
 import pytest
+from safetensors import safe_open
 
 from hma_jax.config import ConfigError
 from hma_jax.convert import (
@@ -22,7 +24,7 @@ from hma_jax.convert import (
     write_official,
 )
 from hma_jax.convert.table import flat, official_parts
-from hma_jax.convert.tensors import read_safetensors
+from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.model.hma import declare_model
 from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import (
@@ -166,12 +168,65 @@ def test_missing_extra_and_misshapen_tensors_are_all_named(base, tmp_path):
 
 def test_tensors_that_are_not_finite_are_refused_by_name(tmp_path):
     config = official_config(DISCRETE, ONE)
+    for name in ("out_x_proj.bias", "action_preprocessor.push.mean"):
+        tensors = random_tensors(config, ONE)
+        tensors[name][1] = np.inf
+        halves = {key: x.astype(ml_dtypes.bfloat16) for key, x in tensors.items()}
+        for kind, written in (("floats", tensors), ("halves", halves)):
+            folder = tmp_path / f"{name} {kind}"
+            with pytest.raises(ConfigError, match=f"^{folder}: {name} contains values that are not finite"):
+                read_official(write_checkpoint(folder, config, written))
+
+
+def test_a_checkpoint_in_several_files_is_read_by_its_index(tmp_path):
+    whole = make_checkpoint(tmp_path / "whole", DISCRETE, ONE)
+    tensors = {name: x.read() for name, x in read_safetensors(whole / "model.safetensors").items()}
+    files = {name: f"model-0000{n % 2 + 1}-of-00002.safetensors" for n, name in enumerate(tensors)}
+    folder = tmp_path / "several"
+    folder.mkdir()
+    shutil.copy(whole / "config.json", folder)
+    for file in set(files.values()):
+        write_safetensors(folder / file, {name: x for name, x in tensors.items() if files[name] == file})
+    index = folder / "model.safetensors.index.json"
+    index.write_text(json.dumps({"metadata": {}, "weight_map": files}))
+    write_official(read_official(folder), tmp_path / "back")
+    same_files(whole, tmp_path / "back")
+    (folder / "model-00002-of-00002.safetensors").unlink()
+    with pytest.raises(ConfigError, match="several: missing model-00002-of-00002.safetensors, which model.*index.json"):
+        read_official(folder)
+    index.write_text("{}")
+    with pytest.raises(ConfigError, match="index.json is not a readable index of weight files"):
+        read_official(folder)
+
+
+@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod."])
+def test_what_torch_puts_before_all_names_is_taken_off(prefix, tmp_path):
+    config = official_config(DISCRETE, ONE)
     tensors = random_tensors(config, ONE)
-    tensors["out_x_proj.bias"][3] = np.inf
-    halves = {name: x.astype(ml_dtypes.bfloat16) for name, x in tensors.items()}
-    for folder, written in (("floats", tensors), ("halves", halves)):
-        with pytest.raises(ConfigError, match=f"{folder}: out_x_proj.bias contains values that are not finite"):
-            read_official(write_checkpoint(tmp_path / folder, config, written))
+    before = read_official(write_checkpoint(tmp_path / "plain", config, tensors))
+    wrapped = {prefix + name: x for name, x in tensors.items()}
+    after = read_official(write_checkpoint(tmp_path / "wrapped", config, wrapped))
+    assert after.provenance == before.provenance  # it has a hash of the weights
+
+
+def test_who_gives_a_name_of_the_hub_or_its_cache_is_told_what_to_give(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="hf download liruiw/hma-base-disc --local-dir hma-base-disc"):
+        read_official(Path("liruiw/hma-base-disc"))
+    (tmp_path / "models--liruiw--hma-base-disc" / "snapshots").mkdir(parents=True)
+    with pytest.raises(
+        ConfigError, match="give the directory of a version in .*models--liruiw--hma-base-disc/snapshots"
+    ):
+        read_official(tmp_path / "models--liruiw--hma-base-disc")
+
+
+def test_files_say_that_they_are_pytorch_s(tmp_path):
+    """transformers and accelerate ask for it."""
+    start = make_checkpoint(tmp_path / "a", DISCRETE, ONE)
+    write_official(read_official(start), tmp_path / "b")
+    with safe_open(tmp_path / "b" / "model.safetensors", framework="np") as file:
+        assert file.metadata() == {"format": "pt"}
+    assert (tmp_path / "b" / "model.safetensors").read_bytes() == (start / "model.safetensors").read_bytes()
 
 
 def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
@@ -197,6 +252,9 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"S": None}, "S must be a positive integer, got None"),
         ({"num_prompt_frames": 0}, "prompt_frames must be at least 1"),
         ({"jointly_predict_states": False}, "jointly_predict_states and jointly_predict_actions are both false"),
+        ({"mlp_ratio": 1e308}, "a number that is too large"),
+        ({"image_vocab_size": 10**400}, "a number that is too large"),
+        ({"num_layers": 10**6}, "describes 1000000 layers, but there are only 57 tensors"),
     ],
 )
 def test_a_configuration_that_cannot_work_is_refused_by_name(changes, message, tmp_path):

@@ -18,7 +18,7 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.convert import read_official, write_official
-from hma_jax.convert.torch_file import read_torch
+from hma_jax.convert.torch_file import LARGEST, read_torch
 from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensors, write_checkpoint
 
 STORAGES = {
@@ -215,6 +215,7 @@ def test_every_other_name_is_refused(function, tmp_path):
         ((2,), (1,), 11),
         ((2,), (100,), 0),
         ((2,), (-1,), 5),
+        ((2**40,), (0,), 0),
         ((2, 2), (1,), 0),
         ((2,), (1,), -1),
     ],
@@ -230,8 +231,9 @@ def test_other_files_and_other_contents_are_named(tmp_path):
     (tmp_path / "old.bin").write_bytes(pickle.dumps({"weight": 1}))
     with pytest.raises(ConfigError, match="saved by torch before 1.6"):
         read_torch(tmp_path / "old.bin")
-    with pytest.raises(ConfigError, match="something other than names and tensors"):
-        read_torch(write_torch(tmp_path / "x.bin", {"step": 3}, {}))
+    for state, named in (({"step": 3}, "step"), ({"model": {}, "epoch": 1}, "model, epoch"), ([], "list")):
+        with pytest.raises(ConfigError, match=rf"something other than names and tensors \({named}\); save it with"):
+            read_torch(write_torch(tmp_path / "x.bin", state, {}))
     with pytest.raises(ConfigError, match="cannot be read"):
         read_torch(write_torch(tmp_path / "y.bin", {"w": rebuild(Storage("FloatStorage", "9", 1), (1,), (1,))}, {}))
     with pytest.raises(ConfigError, match="its byte order is not little-endian; save it on"):
@@ -240,6 +242,25 @@ def test_other_files_and_other_contents_are_named(tmp_path):
         archive.writestr("readme", "")
     with pytest.raises(ConfigError, match="without a torch state dict"):
         read_torch(tmp_path / "z.bin")
+
+
+@pytest.mark.parametrize(
+    ("description", "said"),
+    [
+        (b"\x80\x02" + pickle.NONE + pickle.LONG_BINPUT + (2**32 - 1).to_bytes(4, "little") + b".", "other than names"),
+        (b"\x80\x04" + pickle.BYTEARRAY8 + (2**60).to_bytes(8, "little"), "cannot be read"),
+        (b"\x80\x02" + pickle.BININT + b"\x01", "cannot be read"),
+        (bytes(LARGEST + 1), f"cannot be read .{LARGEST + 1:,} bytes, more than {LARGEST:,}"),
+    ],
+    ids=["remembered far away", "long", "short", "large"],
+)
+def test_a_description_takes_no_more_memory_than_it_has_bytes(description, said, tmp_path):
+    """A damaged or hostile one took tens of gigabytes; it ended in a MemoryError or was killed."""
+    path = tmp_path / "x.bin"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", description)
+    with pytest.raises(ConfigError, match=said):
+        read_torch(path)
 
 
 @pytest.mark.parametrize(
