@@ -89,8 +89,8 @@ class LeRobotDataset(EpisodeSource):
         return self._read.hz
 
     def fingerprint(self) -> str:
-        """Hash over what is read of the meta folder, with statistics of the episodes that say whether their contents are
-        the same, and all files' names and sizes. Texts and statistics of the whole dataset may change."""
+        """Hash over what is read of the meta folder, with the statistics of single episodes, and all files' names and
+        sizes. Texts and statistics of the whole dataset may change."""
         return self._fingerprint
 
     @functools.cached_property

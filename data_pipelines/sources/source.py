@@ -149,8 +149,8 @@ class EpisodeSource(ABC):
         return self.fingerprint()
 
     def fingerprint_as(self, recorded: str) -> str:
-        """`recorded` where that is the former fingerprint of these contents, otherwise the fingerprint: so what was made
-        by earlier versions stays in use."""
+        """`recorded` where that is the former fingerprint of these contents, otherwise the fingerprint. So what was
+        made by earlier versions stays in use."""
         own = self.fingerprint()
         return recorded if recorded and recorded != own and recorded == self.former_fingerprint() else own
 

@@ -132,7 +132,9 @@ def plan_dataset(
     rate: float | None = FRAME_RATE,
     recorded: str = "",
 ) -> Manifest:
-    """The manifest of a dataset before it is made; `recorded` as of `EpisodeSource.fingerprint_as`. Raises ConfigError for settings that cannot work."""
+    """The manifest of a dataset before it is made; `recorded` as of `EpisodeSource.fingerprint_as`.
+
+    Raises ConfigError for settings that cannot work."""
     frame_step = resolve_frame_step(spec, frame_step, rate)
     return Manifest(
         spec=spec.facts(),
