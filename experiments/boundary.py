@@ -104,6 +104,8 @@ def _exit_code(error: Exception) -> Exit | None:
 
     if isinstance(error, ConfigError):
         return Exit.REFUSED
+    if isinstance(error, TrialsFailed):
+        return error.exit
     if "jax" in sys.modules:  # otherwise none of these can have been raised
         from hma_jax.training.checkpoints import SaveError
         from hma_jax.training.divergence import DivergedError
@@ -117,7 +119,7 @@ def _exit_code(error: Exception) -> Exit | None:
             return Exit.LOST
         if _is_out_of_memory(error):
             return Exit.REFUSED
-    if isinstance(error, (DataError, TrialsFailed, OSError)):
+    if isinstance(error, (DataError, OSError)):
         return Exit.FAILED
     return None
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from experiments.preparing.made_from import read_stamp
-from experiments.running.attempts import RESULT, RUN
-from experiments.running.ledger import DIVERGED, FAILED, Ledger
+from experiments.running.attempts import RUN, newest_step, read_states
+from experiments.running.ledger import DIVERGED, FAILED, FINISHED, Ledger
 from experiments.running.provenance import Provenance, trial_closure
 from experiments.running.results_version import RESULTS_VERSION
 from experiments.running.shared_runs import latest_common, share_runs
@@ -26,7 +25,6 @@ from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
-from hma_jax.training.run_lock import CHECKPOINTS, list_steps
 
 UNKNOWN = Provenance("", "", "")
 """Stands in where nothing is known of it, and only the trials' own fields matter."""
@@ -51,7 +49,7 @@ NOTHING = Done()
 def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = False, accept_code: bool = False) -> Done:
     """What there is of the trials of `sweeps` in the study's directory; nothing where another study is.
 
-    `retry_failed`: trials that failed or diverged are run again; `accept_code`: they may go on from what other sources
+    `retry_failed`: trials that failed are run again; `accept_code`: they may go on from what other sources
     trained. Raises ConfigError for a damaged ledger.
     """
     study, workspace = setting.study, setting.workspace
@@ -75,20 +73,15 @@ def find_prepared(setting: Setting) -> Done:
     return Done(_suite(setting), _tokenizer(setting), _tokens(setting.study, setting.workspace))
 
 
-def newest_step(run: Path) -> int:
-    """Step of the run's newest checkpoint; 0 if it has none."""
-    return max(list_steps(run / CHECKPOINTS), default=0)
-
-
 def _trials(
     workspace: Workspace, ids: Mapping[str, Trial], former: Mapping[str, Trial], retry_failed: bool
 ) -> dict[str, Any]:
-    finished = frozenset(id for id in ids if (workspace.trials / id / RESULT).exists())
-    events = {id: record["event"] for id, record in Ledger(workspace.ledger).states().items()}
-    ended = {id: events[id] for id in ids if id not in finished and events.get(id) in (FAILED, DIVERGED)}
-    left = {} if retry_failed else ended
-    # A trial that diverged is run anew (`runner`).
-    to_run = [id for id in ids if id not in finished and id not in left and events.get(id) != DIVERGED]
+    events = {
+        id: state.event for id, state in read_states(list(ids), workspace.trials, Ledger(workspace.ledger)).items()
+    }
+    finished = frozenset(id for id in ids if events[id] == FINISHED)
+    left = {id: events[id] for id in ids if events[id] in ((DIVERGED,) if retry_failed else (FAILED, DIVERGED))}
+    to_run = [id for id in ids if id not in finished and id not in left]
     steps = {id: newest_step(workspace.trials / id / RUN) for id in to_run}
     if former:
         shared = share_runs(ids, former)

@@ -13,6 +13,7 @@ from experiments.cost import TrialPlan, checkpoint_bytes, plan_trials
 from experiments.done import NOTHING, Done
 from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
 from experiments.progress import tidy_table
+from experiments.running.ledger import FAILED
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.study import Study
@@ -96,7 +97,8 @@ def _describe_done(done: Done, trials: int) -> str:
     text = f"Already done, and not counted: {', '.join(parts)}. " if parts else ""
     if done.left:
         how = " or ".join(sorted(set(done.left.values())))
-        text += f"{len(done.left)} of {trials} trials {how}: not run again, and not counted, without --retry-failed. "
+        unless = "; --retry-failed runs the failed ones again" if FAILED in done.left.values() else ""
+        text += f"{len(done.left)} of {trials} trials {how}: not run again, and not counted{unless}. "
     return text
 
 

@@ -6,17 +6,17 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from experiments.done import newest_step
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console, say
 from experiments.report.draw import draw
 from experiments.running.apart import call_apart
-from experiments.running.attempts import RESULT, RUN, State, read_states
+from experiments.running.attempts import RESULT, RUN, State, newest_step, read_states
+from experiments.running.children import require_accelerator
 from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import LauncherOptions
-from experiments.running.ledger import FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
+from experiments.running.ledger import DIVERGED, FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
 from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import latest_common, share_runs
@@ -31,14 +31,20 @@ from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
+from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
+from hma_jax.runtime.locks import Lock
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
 
 
 class TrialsFailed(Exception):
-    """The sweep went on to its end, but some trials have no result."""
+    """The sweep went on to its end, but some trials have no result. `exit`: what the command ends with."""
+
+    def __init__(self, message: str, exit: Exit = Exit.FAILED):
+        super().__init__(message)
+        self.exit = exit
 
 
 def run_study(
@@ -77,7 +83,7 @@ def run_study(
     say_average(point.trial.train for sweep in sweeps for point in sweep.points)
     say_prepared_here(setting, launcher_options)
     # Without the place every trial would fail, once all is prepared.
-    with launcher_options.launcher(workspace.root) as launcher, workspace.locked():
+    with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
@@ -104,7 +110,7 @@ def run_study(
         former = find_trained(workspace.trials, trials, provenance, None if accept_code else sources)
         jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common, former)
         say_trained(jobs, former, workspace)
-        states = run_jobs(jobs, workspace, launcher, retry_failed)
+        states = run_jobs(jobs, workspace, launcher, lock, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again, accept_code)
 
@@ -124,16 +130,21 @@ def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
 def prepare_apart(setting: Setting, replace: Step | None) -> Provenance:
     """Prepares the study. Where there are accelerators, in a process of its own: JAX keeps them for the process that it
     computes in, and the trials need them."""
-    if find_accelerators() is None:
+    accelerators = find_accelerators()
+    if accelerators is None:
         return _prepare(setting, replace)
     from data_pipelines.registry import find_spec
 
     specs = [find_spec(name) for name in setting.study.all_names()]
-    return call_apart("prepares the data", _prepare, setting, replace, [spec for spec in specs if spec is not None])
+    own = [spec for spec in specs if spec is not None]
+    return call_apart("prepares the data", _prepare, setting, replace, own, accelerators.kind)
 
 
-def _prepare(setting: Setting, replace: Step | None, specs: Sequence[DatasetSpec] = ()) -> Provenance:
-    """`specs`: registry entries, of which a new process lacks the user's own."""
+def _prepare(
+    setting: Setting, replace: Step | None, specs: Sequence[DatasetSpec] = (), accelerator: str = ""
+) -> Provenance:
+    """`specs`: registry entries, of which a new process lacks the user's own; `accelerator`: the kind that is here."""
+    require_accelerator(accelerator)
     from data_pipelines.registry import register
     from experiments.preparing.pipeline import prepare
 
@@ -217,7 +228,9 @@ def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Re
     return None if lines else earlier
 
 
-def run_jobs(jobs: Sequence[Job], workspace: Workspace, launcher: Launcher, retry_failed: bool) -> dict[str, State]:
+def run_jobs(
+    jobs: Sequence[Job], workspace: Workspace, launcher: Launcher, lock: Lock, retry_failed: bool
+) -> dict[str, State]:
     """Runs what is missing, visibly."""
     ledger = Ledger(workspace.ledger)
     before = read_states([job.id for job in jobs], workspace.trials, ledger)
@@ -227,20 +240,31 @@ def run_jobs(jobs: Sequence[Job], workspace: Workspace, launcher: Launcher, retr
     if kept == len(jobs):
         return before
     with SweepMonitor(len(jobs), kept) as monitor:
-        return run_missing(jobs, workspace.trials, ledger, launcher, retry_failed=retry_failed, monitor=monitor)
+        return run_missing(
+            jobs, workspace.trials, ledger, launcher, lost=lock.lost, retry_failed=retry_failed, monitor=monitor
+        )
 
 
 def require_results(jobs: Sequence[Job], states: dict[str, State], again: str, accept_code: bool) -> None:
     """Raises TrialsFailed, naming every trial without a result, and the command that tries them again: `again`, which
-    has to accept the changed code where that stopped the sweep."""
+    has to accept the changed code where that stopped the sweep. It leaves those that diverged as they are."""
     bad = [(job, states[job.id]) for job in jobs if states[job.id].event != FINISHED]
-    if bad:
-        refused = any(state.event == REFUSED for _, state in bad)
-        lines = "\n".join(f"  {_without_result(job, state, refused)}" for job, state in bad)
-        how = "To try them again"
+    if not bad:
+        return
+    diverged = sum(state.event == DIVERGED for _, state in bad)
+    refused = any(state.event == REFUSED for _, state in bad)
+    words = [f"{len(bad)} of {len(jobs)} trials have no result:"]
+    words += [f"  {_without_result(job, state, refused)}" for job, state in bad]
+    if diverged:
+        words.append(
+            f"{diverged} diverged, which is final: from the same seed they would diverge again. The report shows it"
+        )
+    if len(bad) > diverged:
+        how = "To try the others again" if diverged else "To try them again"
         if refused and not accept_code:
             how, again = f"{how}, if the change of the sources alters no result", f"{again} --accept-code"
-        raise TrialsFailed(f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\n{how}: {again}")
+        words.append(f"{how}: {again}")
+    raise TrialsFailed("\n".join(words), Exit.DIVERGED if len(bad) == diverged else Exit.FAILED)
 
 
 def _without_result(job: Job, state: State, refused: bool) -> str:

@@ -39,21 +39,22 @@ class OutputLock:
 
 
 @contextmanager
-def lock_output(output: Path, *, wait: bool = False) -> Iterator[OutputLock]:
+def lock_output(output: Path, *, wait: float = 0.0) -> Iterator[OutputLock]:
     """Holds the lock of `output`, whose parent directory is made if it is missing.
 
     Removes the scratch directories that dead holders left. While another process holds the lock: raises Held, which
-    names it, or with `wait` waits until it is released. By then `output` may exist: check again. Raises OSError.
+    names it, or waits first until it is released, `wait` seconds at most. By then `output` may exist: check again.
+    Raises OSError.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        pauses = backoff()
+        pauses, deadline = backoff(), time.monotonic() + wait
         while True:
             try:
                 lock = stack.enter_context(exclusive(lock_file(output), lease=True, remove=True))
                 break
             except Held:
-                if not wait:
+                if time.monotonic() >= deadline:
                     raise
                 time.sleep(next(pauses))
         for stale in output.parent.glob(f"{output.name}.scratch.*"):

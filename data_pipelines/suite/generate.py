@@ -163,7 +163,7 @@ def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewes
     """One dataset, unless another process makes it meanwhile."""
     (spec,) = select([name])
     final, expected = root / name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
-    with lock_output(final.with_name(f".{VERSION}"), wait=True) as lock:
+    with lock_output(final.with_name(f".{VERSION}"), wait=math.inf) as lock:
         if is_complete(final, expected):
             return
         write_dataset(

@@ -26,8 +26,8 @@ class RunningArguments:
     launcher_set: Annotated[UseAppendAction[tuple[str, ...]], arg(name="launcher-set", metavar="KEY=VALUE")] = ()
     """One setting of the launcher, such as partition=gpu or gpus=1."""
     retry_failed: Annotated[FlagCreatePairsOff[bool], arg(name="retry-failed"), UNSET] = False
-    """Run failed trials again from their last checkpoint, and diverged trials from the start.
-    Without it they are not run again; the report lists them as failed or diverged."""
+    """Run failed trials again from their last checkpoint; without it the report lists them as failed.
+    Trials that diverged are never run again: they would diverge again."""
     accept_code: Annotated[FlagCreatePairsOff[bool], arg(name="accept-code"), UNSET] = False
     """Continue although the code has changed since earlier trials of the study ran.
     Only for changes that alter no result. The report then says how many versions of the code ran."""

@@ -370,8 +370,9 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> None:
     """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so
     many `processes` as this one."""
-    from experiments.done import UNKNOWN, find_prepared, newest_step
+    from experiments.done import UNKNOWN, find_prepared
     from experiments.plan_table import Devices, plan_table
+    from experiments.running.attempts import newest_step
     from experiments.running.launchers.registry import LauncherOptions
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import Point, Sweep
@@ -389,7 +390,7 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
 
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
-    from experiments.done import newest_step
+    from experiments.running.attempts import newest_step
     from experiments.running.run_trial import open_prepared_data, train_trial
     from experiments.running.shared_runs import common_steps
     from hma_jax.runtime.processes import is_writer

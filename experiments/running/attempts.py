@@ -29,11 +29,16 @@ from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTE
 from experiments.running.shared_disk import patient
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
+from hma_jax.runtime.locks import EXPIRES, RENEWED_EVERY
+from hma_jax.training.run_lock import CHECKPOINTS, list_steps
 
 JOB, STARTED, PROGRESS = "job.json", "started.json", "progress.json"
 RESULT, FAILURE, OUTPUT = "result.json", "failure.json", "output.txt"
 RUN = "run"
 """The training run, with its checkpoints."""
+
+CRASHES = (signal.SIGABRT, signal.SIGBUS, signal.SIGSEGV)
+"""Signals by which a process ends when a driver, an accelerator or memory fails."""
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """Signals that ask an attempt to stop. It saves and ends with 130 or 143; before it is ready to save, with -n."""
@@ -58,21 +63,31 @@ class AttemptEnd:
 
 @contextmanager
 def attempt(directory: Path) -> Iterator[OutputLock]:
-    """The trial's lock, held while the process of an attempt runs. Waits while another process holds it.
-
-    A process that died on another machine holds it until its lease is over (`hma_jax.runtime.locks.EXPIRES`).
+    """The trial's lock, held while the process of an attempt runs. Waits while another process holds it, until a lease
+    of a machine that died would be over. Raises Held if one that lives holds it.
     """
-    with lock_output(directory / "trial", wait=True) as lock:
+    with lock_output(directory / "trial", wait=EXPIRES + RENEWED_EVERY) as lock:
         who = {"host": socket.gethostname(), "process": os.getpid(), "token": secrets.token_hex(4)}
         write_file(directory / STARTED, json.dumps(who | _engine_job()))
         yield lock
 
 
 def _engine_job() -> dict[str, str]:
-    """The job of an engine that this process is in, by the name that the engine's commands take."""
+    """The job of an engine that this process is in, and its node, by the names that the engine's commands take."""
     array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     job = f"{array}_{task}" if array else os.environ.get("SLURM_JOB_ID")
-    return {"job": job} if job else {}
+    named = {"job": job, "node": os.environ.get("SLURMD_NODENAME")}
+    return {key: value for key, value in named.items() if value}
+
+
+def newest_step(run: Path) -> int:
+    """Step of the run's newest checkpoint; 0 if it has none."""
+    return max(list_steps(run / CHECKPOINTS), default=0)
+
+
+def reached(directory: Path) -> int:
+    """How far a trial has got, of what the next attempt need not do again: its newest checkpoint's step."""
+    return newest_step(directory / RUN)
 
 
 def is_alive(directory: Path) -> bool:
@@ -125,6 +140,8 @@ def outcome(directory: Path, ended: AttemptEnd) -> State:
         return State(LOST, f"its process was ended by SIGKILL (out of memory?); {log}")
     if ended.code == Exit.LOST:
         return State(LOST, f"its files could not be written (is the disk full?); {log}")
+    if number in CRASHES:
+        return State(LOST, f"its process was ended by {signal.Signals(number).name}; {log}")
     if number:
         return State(FAILED, f"its process was ended by {signal.Signals(number).name}; {log}")
     return State(FAILED, f"its process ended with exit code {ended.code} and no result; {log}")
@@ -147,7 +164,7 @@ def _state(directory: Path, record: dict[str, Any] | None) -> State:
         return State(FINISHED)
     if is_alive(directory):
         return State(RUNNING)
-    if record is None or record["event"] == FINISHED:  # its directory was deleted: run it again
+    if record is None or record["event"] == FINISHED or not directory.is_dir():  # it was deleted: run it again
         return State(MISSING)
     if record["event"] == RUNNING:  # its runner ended before it
         return outcome(directory, AttemptEnd(None, "its process is gone"))

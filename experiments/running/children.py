@@ -10,26 +10,34 @@ import faulthandler
 import logging
 import os
 import signal
+import socket
 import sys
 import warnings
 from pathlib import Path
 
 from experiments.running.slots import Slot
+from hma_jax.config import ConfigError
 from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely, keep_freed_memory
 from hma_jax.runtime.parent import die_with
 
-_PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
+_PARENT, _CORES, _ACCELERATOR = "HMA_PARENT_PID", "HMA_CORES", "HMA_ACCELERATOR"
 
 CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
 """Variables of a slot that the user's environment overrides. Which accelerators a slot has is not among them: they are
 some of those that the user allows."""
 
 
-def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str]:
-    """The environment of a child that has `slot` for itself. Variables that the user has set stay as they are."""
+class NoAccelerator(ConfigError):
+    """JAX does not compute on the accelerators that are here."""
+
+
+def child_environment(compile_cache: Path, slot: Slot = Slot(), accelerator: str = "") -> dict[str, str]:
+    """The environment of a child that has `slot` for itself, on a machine with that kind of `accelerator`, "gpu" or
+    "tpu". Variables that the user has set stay as they are."""
     environment = {**KEPT_PAGES, **os.environ}
     environment[_PARENT] = str(os.getpid())
+    environment[_ACCELERATOR] = accelerator
     environment.pop(_CORES, None)
     if slot.cores:
         environment[_CORES] = ",".join(map(str, slot.cores))
@@ -59,6 +67,26 @@ def enter_child(parent: int = 0) -> None:
     parent = parent or int(os.environ.get(_PARENT, "0"))
     if parent:
         die_with(parent)
+
+
+def require_accelerator(kind: str | None = None) -> None:
+    """Raises NoAccelerator if JAX computes on the processor though there is this `kind` of accelerator, by default the
+    one that the parent of this process named; "": none is expected. JAX itself would go on without a word."""
+    kind = os.environ.get(_ACCELERATOR, "") if kind is None else kind
+    if not kind:
+        return
+    import jax
+
+    try:
+        found, why = jax.default_backend(), ""
+    except RuntimeError as error:  # JAX_PLATFORMS names one that does not start
+        found, why = "nothing", f" ({error})"
+    if found in ("cpu", "nothing") and found != kind:
+        extra = "'hma-jax[tpu]'" if kind == "tpu" else "'hma-jax[cuda]', or [cuda12] for an older driver"
+        raise NoAccelerator(
+            f"{socket.gethostname()}: a {kind.upper()} is expected, but JAX computes on {found}{why}; check its driver, and "
+            f"that JAX is installed for it (pip install {extra}), or set JAX_PLATFORMS=cpu to do without"
+        )
 
 
 def silence_background() -> None:

@@ -1,18 +1,19 @@
 """Runs the trials that are missing, by a launcher, and recovers from failures.
 
 A trial that crashes is recorded with its message and the others go on. One whose process is lost or asked to stop
-is tried again and goes on from its checkpoint. The runner itself may be interrupted or killed at any point: the
-next run goes on with what is there, and waits for trials that still run on other machines.
+is tried again and goes on from its checkpoint, for as long as its attempts get further (`attempts.reached`). A place
+where one trial after another is lost before its first step gets no more of them. The runner itself may be interrupted
+or killed at any point: the next run goes on with what is there, and waits for trials that still run on other machines.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import shutil
+import math
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,25 +21,34 @@ from typing import Any
 from experiments.running.attempts import (
     FAILURE,
     JOB,
+    OUTPUT,
     PROGRESS,
-    RUN,
     STARTED,
     AttemptEnd,
     State,
     is_alive,
     outcome,
+    reached,
     read_progress,
     read_start,
     read_states,
 )
 from experiments.running.launchers.base import Launcher
-from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
+from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
 from experiments.running.shared_disk import patient
 from hma_jax.config import ConfigError
 from hma_jax.runtime.files import IO_ERRNOS, write_file
+from hma_jax.runtime.locks import EXPIRES, RENEWED_EVERY
 
 TRIES = 3
-"""How often in one command a trial may be lost: it may run out of memory each time."""
+"""How many attempts in a row at a trial, in one command, may be lost or stopped without getting further: it may run
+out of memory each time, or need more time than its jobs have."""
+
+BAD_PLACE = 3
+"""So many trials in a row lost before their first step are the fault of the place where they ran."""
+
+STALL_SECONDS = 1800.0
+"""Seconds without progress after which a running trial is said to stall."""
 
 POLL_SECONDS = 5.0
 """Seconds between two checks of trials that an earlier runner started elsewhere."""
@@ -76,22 +86,24 @@ def run_missing(
     ledger: Ledger,
     launcher: Launcher,
     *,
+    lost: Callable[[], bool] = lambda: False,
     retry_failed: bool = False,
     monitor: Monitor | None = None,
 ) -> dict[str, State]:
     """Brings every job to an end and returns their states.
 
-    Failed and diverged trials of earlier runs are left alone unless `retry_failed`; a failed one then goes on from
-    its checkpoint, a diverged one starts anew. On KeyboardInterrupt the running trials save their state before it is
-    raised again. One runner at a time: see `Workspace.locked`.
+    Trials of earlier runs that diverged are left alone: they would diverge again. So are failed ones unless
+    `retry_failed`; they then go on from their checkpoints. On KeyboardInterrupt the running trials save their state
+    before it is raised again. One runner at a time (`Workspace.locked`): raises ConfigError, and leaves the trials
+    alone, when `lost` says that another one has taken over.
     """
-    run = _Run(trials, ledger, launcher, monitor or Monitor())
+    run = _Run(trials, ledger, launcher, monitor or Monitor(), lost)
     before = read_states([job.id for job in jobs], trials, ledger)
     recorded = ledger.states()
     for id, state in before.items():  # an earlier runner ended between an event and its line
         if state.event not in (RUNNING, MISSING) and recorded.get(id, {}).get("event") != state.event:
             run.record(id, state)
-    again = {MISSING, LOST, PREEMPTED, REFUSED} | ({FAILED, DIVERGED} if retry_failed else set())
+    again = {MISSING, LOST, PREEMPTED, REFUSED} | ({FAILED} if retry_failed else set())
     run.waiting = [(job, before[job.id].event) for job in jobs if before[job.id].event in again]
     run.elsewhere = [job for job in jobs if before[job.id].event == RUNNING]
     try:
@@ -107,6 +119,8 @@ class _Attempt:
     directory: Path
     handle: Any
     launched: float
+    reached: int  # of the trial, when this attempt began
+    moved: float  # when it last made progress
     start: dict[str, Any] | None = None
     shown: dict[str, Any] | None = None
 
@@ -115,23 +129,36 @@ class _Run:
     """`waiting` jobs with the state that each is in, those that are `running`, and those of earlier runners that
     still run `elsewhere`."""
 
-    def __init__(self, trials: Path, ledger: Ledger, launcher: Launcher, monitor: Monitor):
-        self.trials, self.ledger, self.launcher, self.monitor = trials, ledger, launcher, monitor
+    def __init__(self, trials: Path, ledger: Ledger, launcher: Launcher, monitor: Monitor, lost: Callable[[], bool]):
+        self.trials, self.ledger, self.launcher, self.monitor, self.lost = trials, ledger, launcher, monitor, lost
         self.waiting: list[tuple[Job, str]] = []
         self.elsewhere: list[Job] = []
         self.running: list[_Attempt] = []
-        self.lost = Counter[str]()
-        self.polled = -POLL_SECONDS
+        self.fruitless = Counter[str]()  # attempts in a row at a trial that did not get further
+        self.lost_at: dict[str, set[str]] = {}  # trials lost before their first step, in a row, by place
+        self.polled, self.asked = -POLL_SECONDS, 0.0
         self.launched = False  # whether the launcher has taken any trial
         self.relaunch_at = 0.0
 
     def run_all(self) -> None:
         while self.waiting or self.running or self.elsewhere:
+            self._require_ours()
             self._launch()
             time.sleep(self.launcher.pause)
             for attempt in list(self.running):
                 self._poll(attempt)
             self._poll_elsewhere()
+
+    def _require_ours(self) -> None:
+        if time.monotonic() - self.asked < RENEWED_EVERY:
+            return
+        self.asked = time.monotonic()
+        if self.lost():
+            self.running.clear()
+            raise ConfigError(
+                f"another command has taken over {self.trials.parent}, because this one did not renew its lock for "
+                f"{EXPIRES / 60:.0f} minutes; that one continues the study"
+            )
 
     def stop(self) -> None:
         """Trials that still run save their state; how each ended is recorded."""
@@ -148,7 +175,7 @@ class _Run:
         chosen = self._runnable()[:room]
         if not chosen or time.monotonic() < self.relaunch_at:
             return
-        directories = [patient(self._prepare, job, state) for job, state in chosen]
+        directories = [patient(self._prepare, job) for job, _ in chosen]
         now = time.monotonic()
         try:
             handles = self.launcher.launch(directories)
@@ -162,7 +189,7 @@ class _Run:
         self.launched = True
         self.waiting = [entry for entry in self.waiting if entry not in chosen]
         for (job, state), directory, handle in zip(chosen, directories, handles, strict=True):
-            self.running.append(_Attempt(job, directory, handle, now))
+            self.running.append(_Attempt(job, directory, handle, now, patient(reached, directory), now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
     def _runnable(self) -> list[tuple[Job, str]]:
@@ -172,12 +199,10 @@ class _Run:
         )
         return [(job, state) for job, state in self.waiting if not job.after & pending]
 
-    def _prepare(self, job: Job, state: str) -> Path:
-        """The directory of a trial that was left in `state`, ready for the next attempt."""
+    def _prepare(self, job: Job) -> Path:
+        """The directory of a trial, ready for the next attempt."""
         directory = self.trials / job.id
         directory.mkdir(parents=True, exist_ok=True)
-        if state == DIVERGED:  # from its checkpoint it would diverge again
-            shutil.rmtree(directory / RUN, ignore_errors=True)
         for name in (FAILURE, STARTED, PROGRESS):
             (directory / name).unlink(missing_ok=True)
         write_file(directory / JOB, json.dumps(job.record, indent=1))
@@ -189,20 +214,41 @@ class _Run:
         if ended is not None:
             self.running.remove(attempt)
             state = outcome(attempt.directory, ended)
-            self._end(attempt, state, again=self._try_again(attempt.job, state))
+            self._judge_place(attempt, state)
+            again = self._try_again(attempt, state)
+            if state.event == PREEMPTED and not again:
+                why = f"stopped {TRIES} times in a row before it got further; its attempts need more time"
+                state = State(PREEMPTED, ": ".join(filter(None, (why, state.message))))
+            self._end(attempt, state, again)
             if state.event == REFUSED:  # as every other one would be
                 self.waiting.clear()
             return
+        if self._note_progress(attempt):
+            self.monitor.progressed(attempt.job, **attempt.shown)
+        elif attempt.start and time.monotonic() - attempt.moved > STALL_SECONDS:
+            attempt.moved = math.inf  # it is said once
+            where = f"process {attempt.start['process']} on {attempt.start['host']}"
+            log.warning(
+                "%s makes no progress since %.0f minutes; if it hangs (%s), kill its %s, and it continues from its "
+                "checkpoint", attempt.job.title, STALL_SECONDS / 60, attempt.directory / OUTPUT, where,
+            )  # fmt: skip
+
+    def _note_progress(self, attempt: _Attempt) -> bool:
         progress = read_progress(attempt.directory)
-        if progress and progress != attempt.shown:
-            attempt.shown = progress
-            self.monitor.progressed(attempt.job, **progress)
+        if not progress or progress == attempt.shown:
+            return False
+        attempt.shown, attempt.moved = progress, time.monotonic()
+        return True
 
     def _note_start(self, attempt: _Attempt) -> None:
         """An engine may start the process of an attempt more than once."""
         start = read_start(attempt.directory)
         if start and start != attempt.start:
-            attempt.start = start
+            if attempt.start:
+                self._count(attempt)
+                if self.fruitless[attempt.job.id] >= TRIES:  # the engine would go on for ever
+                    self.launcher.ask_to_stop([attempt.handle])
+            attempt.start, attempt.moved = start, time.monotonic()
             where = {key: value for key, value in start.items() if key != "token"}
             self.ledger.append(attempt.job.id, RUNNING, title=attempt.job.title, **where)
 
@@ -213,12 +259,46 @@ class _Run:
             self.record(attempt.job.id, state, seconds=round(seconds, 1))
         self.monitor.ended(attempt.job, state, seconds, again)
 
-    def _try_again(self, job: Job, state: State) -> bool:
-        self.lost[job.id] += state.event == LOST
-        again = state.event == PREEMPTED or state.event == LOST and self.lost[job.id] < TRIES
-        if again:
-            self.waiting.insert(0, (job, state.event))
-        return again
+    def _count(self, attempt: _Attempt) -> None:
+        """What an attempt that is over has achieved decides whether it counts."""
+        before, attempt.reached = attempt.reached, patient(reached, attempt.directory)
+        self.fruitless[attempt.job.id] = 0 if attempt.reached > before else self.fruitless[attempt.job.id] + 1
+
+    def _try_again(self, attempt: _Attempt, state: State) -> bool:
+        if state.event not in (LOST, PREEMPTED):
+            return False
+        job = attempt.job
+        if state.event == LOST or attempt.start:  # otherwise it was only queued
+            self._count(attempt)
+        if self.fruitless[job.id] >= TRIES:
+            return False
+        if self._is_held(job):  # by an earlier runner's attempt, or until the lease of a dead machine is over
+            self.elsewhere.append(job)
+        else:  # one that got no further goes last: others may meanwhile show that the place is to blame
+            self.waiting.insert(len(self.waiting) if self.fruitless[job.id] else 0, (job, state.event))
+        return True
+
+    def _is_held(self, job: Job) -> bool:
+        try:
+            return is_alive(self.trials / job.id)
+        except OSError:  # the next attempt finds out
+            return False
+
+    def _judge_place(self, attempt: _Attempt, state: State) -> None:
+        """A broken GPU or node would lose one trial after another, within seconds."""
+        self._note_progress(attempt)
+        place = self.launcher.place(attempt.handle, attempt.start)
+        if state.event == FINISHED or attempt.shown and attempt.shown["done"]:
+            self.lost_at.pop(place, None)
+        elif place and state.event == LOST:
+            lost = self.lost_at.setdefault(place, set())
+            lost.add(attempt.job.id)
+            if len(lost) == BAD_PLACE:
+                left_out = self.launcher.leave_out(attempt.handle, place)
+                log.warning(
+                    "%d trials in a row were lost on %s before their first step%s; the last one: %s",
+                    BAD_PLACE, place, ", which gets no more of them" if left_out else "", state.message,
+                )  # fmt: skip
 
     def _poll_elsewhere(self) -> None:
         """What an earlier runner started and left: once its lock is free, it has ended or is ours to try."""

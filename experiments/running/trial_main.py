@@ -17,27 +17,46 @@ from functools import partial
 from pathlib import Path
 
 from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, RUN, attempt
-from experiments.running.children import enter_child
+from experiments.running.children import NoAccelerator, enter_child, require_accelerator
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_pending_stop, sigterm_as_interrupt
+from hma_jax.runtime.locks import Held
 
 POLL_SECONDS = 30.0
 """Seconds between two checks that the trial is still ours."""
 
+DEVICE_FAILURES = ("FAILED_PRECONDITION", "INTERNAL", "UNAVAILABLE")
+"""How messages of JAX begin where a device or its driver fails; one whose memory is too small is no failure."""
+
 
 def main(directory: Path) -> int:
     """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; LOST: its files could not be
-    written, or its data not be read; STOPPED or INTERRUPTED: the next attempt goes on from here."""
+    written, its data not be read, or its accelerator failed; STOPPED or INTERRUPTED: the next attempt goes on from
+    here, or another one is running."""
     enter_child()  # before anything imports JAX
     try:
+        before = _read_failure(directory)
         with sigterm_as_interrupt(), attempt(directory) as lock:
-            if (directory / RESULT).exists():  # another attempt finished while this one waited
+            # Another attempt may have ended while this one waited.
+            if (directory / RESULT).exists():
                 return Exit.DONE
+            if _read_failure(directory) not in ("", before):
+                return Exit.FAILED
             return _run(directory, lock.lost)
     except KeyboardInterrupt as request:
         return exit_of_interrupt(request)
+    except Held as held:
+        print(f"another attempt at this trial is running: {held}", file=sys.stderr)
+        return Exit.STOPPED
     except OSError:  # before there was anything to record it with
         _print_traceback()
         return Exit.LOST
+
+
+def _read_failure(directory: Path) -> str:
+    try:
+        return (directory / FAILURE).read_text()
+    except FileNotFoundError:
+        return ""
 
 
 def _run(directory: Path, lost: Callable[[], bool]) -> int:
@@ -62,6 +81,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
 
     report = _ProgressFile(directory / PROGRESS, lost)
     try:
+        require_accelerator()
         trial, execution, shared = read_job(job)
         record_start(directory, inputs_of(job["provenance"]), closure)
         if branched_from := begin_shared(directory, shared.before):
@@ -82,12 +102,18 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         _print_traceback()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
-        # A disk that is full or gone is no fault of the trial.
-        lost = isinstance(error, (OSError, UnreachableError))
+        # A disk that is full or gone, or a device that fails, is no fault of the trial.
+        lost = isinstance(error, (OSError, UnreachableError, NoAccelerator)) or _is_of_device(error)
         state = LOST if lost else DIVERGED if isinstance(error, DivergedError) else FAILED
         with suppress(OSError):  # the same disk, most likely: then the code says it alone
             write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
         return Exit.LOST if lost else Exit.FAILED
+
+
+def _is_of_device(error: Exception) -> bool:
+    from jax.errors import JaxRuntimeError
+
+    return isinstance(error, JaxRuntimeError) and str(error).startswith(DEVICE_FAILURES)
 
 
 def _print_traceback() -> None:

@@ -16,7 +16,7 @@ from experiments.study import Study
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
-from hma_jax.runtime.locks import Held, Holder, Lock, exclusive, read_holder
+from hma_jax.runtime.locks import EXPIRES, Held, Holder, Lock, exclusive, machine, read_holder
 from hma_jax.runtime.outputs import writing_to
 
 LOCK = ".lock"
@@ -158,7 +158,7 @@ class Workspace:
     @contextmanager
     def locked(self, lock: str = LOCK) -> Iterator[Lock]:
         """Makes the directory and holds the right to write in it, or what another `lock` is for; it dies with its
-        process.
+        process. It has a lease, for machines that do not see each other's locks.
 
         Raises ConfigError if the directory cannot be written, Busy if another process holds it.
         """
@@ -166,10 +166,12 @@ class Workspace:
             try:
                 with writing_to(self.root):
                     self.root.mkdir(parents=True, exist_ok=True)
-                    held_lock = stack.enter_context(exclusive(self.root / lock))
+                    held_lock = stack.enter_context(exclusive(self.root / lock, lease=True))
             except Held as held:
+                elsewhere = held.holder is not None and held.holder.machine != machine()
+                dead = f" (if its machine died or started anew: {EXPIRES / 60:.0f} minutes)" if elsewhere else ""
                 raise Busy(
-                    f"another command is using {self.root} ({held.who}); wait until it has finished, or choose "
+                    f"another command is using {self.root} ({held.who}); wait until it has finished{dead}, or choose "
                     "another --out",
                     held.holder,
                 ) from None

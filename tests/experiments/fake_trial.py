@@ -1,7 +1,8 @@
 """A trial that counts instead of training: what the runner's tests start as a process.
 
 Used as `fake_trial.py DIRECTORY` (one trial) or `fake_trial.py --sweep ROOT` (the runner with
-three trials). Behaviour comes from job.json: 'steps', 'seconds' per step, 'end'.
+three trials). Behaviour comes from job.json: 'steps', 'seconds' per step, 'end', 'times' that it is killed, and whether
+every start leaves one of 'checkpoints'.
 """
 
 import json
@@ -17,6 +18,7 @@ from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job, run_missing
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
+from hma_jax.training.run_lock import CHECKPOINTS
 
 THREE = [Job(f"t{i}", f"trial {i}", {"steps": 8, "seconds": 0.05, "end": "result"}) for i in range(3)]
 
@@ -44,7 +46,10 @@ def count_to_the_end(directory: Path) -> int:
         aside = saved.with_suffix(".tmp")
         aside.write_text(str(count))
         aside.replace(saved)
-    killed = len((directory / "starts.txt").read_text().split()) <= job.get("times", 1)
+    starts = len((directory / "starts.txt").read_text().split())
+    if job.get("checkpoints"):
+        (saved.parent / CHECKPOINTS / str(starts)).mkdir(parents=True)
+    killed = starts <= job.get("times", 1)
     match job["end"]:
         case "diverge":
             (directory / "failure.json").write_text(json.dumps({"state": "diverged", "message": "loss is nan"}))

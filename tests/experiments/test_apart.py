@@ -100,12 +100,15 @@ import sys
 from jax._src import xla_bridge
 from experiments import run_study
 from experiments.cli.main import main
+from experiments.running import slots
 
 def run_jobs(jobs, *_):
     print(len(jobs), "trials, devices taken:", xla_bridge.backends_are_initialized())
     raise SystemExit(0)
 
 run_study.run_jobs = run_jobs
+kind = "gpu" if slots._jax_uses("gpu") else "cpu"  # what JAX computes on here
+run_study.find_accelerators = lambda: slots.Accelerators(kind, ("0",))
 main(sys.argv[1:])
 """
 
@@ -126,14 +129,18 @@ def test_a_study_has_given_back_its_accelerators_when_its_trials_begin(tmp_path)
     assert done.stdout.splitlines()[-1] == "2 trials, devices taken: False"
 
 
-@pytest.mark.parametrize("found", [None, Accelerators("gpu", ("0",))])
-def test_an_error_of_preparing_is_the_same_wherever_that_is_done(found, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [(None, "cannot hold checkpoints"), (Accelerators("cpu", ("0",)), "cannot hold checkpoints"),
+     (Accelerators("gpu", ("0",)), "a GPU is expected, but JAX computes on cpu; check its driver")],
+)  # fmt: skip
+def test_an_error_of_preparing_is_the_same_wherever_that_is_done(found, words, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_study, "find_accelerators", lambda: found)
     out = tmp_path / "a[1]"
     assert main(["study", "--preset", "smoke", "--out", str(out)]) == Exit.REFUSED
     said = capsys.readouterr().err
     assert (
-        said.startswith("error: ") and said.count("\n") == 1 and "cannot hold checkpoints" in said and str(out) in said
+        said.startswith("error: ") and said.count("\n") == 1 and words in said and (words[0] == "a" or str(out) in said)
     )
 
 
@@ -143,8 +150,9 @@ def test_entries_of_the_user_are_known_where_a_study_is_prepared(tmp_path, monke
     monkeypatch.setattr(run_study, "find_accelerators", lambda: Accelerators("tpu", ("0",)))
     monkeypatch.setattr(run_study, "call_apart", lambda what, *call: calls.append(call))
     setting = make_setting(StudyArguments("smoke", tmp_path, set=("datasets=mine", "dataset_counts=1")))
+    monkeypatch.setattr(run_study, "require_accelerator", lambda kind: calls.append(kind))
     run_study.prepare_apart(setting, None)
     ((function, *arguments),) = calls
     registry_table._registered.clear()  # as in another process
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: find_spec("mine"))
-    assert function(*arguments) == mine
+    assert function(*arguments) == mine and calls[1:] == ["tpu"]

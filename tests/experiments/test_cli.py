@@ -11,17 +11,20 @@ from pathlib import Path
 import pytest
 
 from experiments import run_study as study_runs
+from experiments.boundary import guarded
 from experiments.cli.main import main
 from experiments.preparing import pipeline, windows
 from experiments.presets import get_preset
-from experiments.running.attempts import read_states
+from experiments.running.attempts import State, read_states
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import Ledger
+from experiments.running.runner import Job
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.setting import StudyArguments, make_setting
 from experiments.sweeps.draws import draw_judged
 from hma_jax.config import ConfigError
 from hma_jax.runtime import outputs
+from hma_jax.runtime.exits import Exit
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
 COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer",
@@ -266,6 +269,22 @@ def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp
     assert "1 of 5 trials have no result" in said.err and "width 8" in said.err and "--retry-failed" in said.err
     assert "failed" in (tmp_path / "results.csv").read_text()
     assert (tmp_path / "report.html").exists()
+
+
+def test_trials_that_diverged_are_final(capsys):
+    """No command is advised that would train them again to the same end."""
+    jobs = [Job(id, f"trial {id}", {}) for id in "abc"]
+
+    def ends(*events: str) -> int:
+        states = {job.id: State(event) for job, event in zip(jobs, events, strict=True)}
+        return guarded(lambda: study_runs.require_results(jobs, states, "hma study --retry-failed", False))
+
+    assert ends("finished", "diverged", "diverged") == Exit.DIVERGED
+    assert capsys.readouterr().err.endswith("  diverged: trial c\n2 diverged, which is final: from the same seed they "
+                                            "would diverge again. The report shows it\n")  # fmt: skip
+    assert ends("finished", "diverged", "failed") == Exit.FAILED
+    assert capsys.readouterr().err.endswith("To try the others again: hma study --retry-failed\n")
+    assert ends("finished", "finished", "finished") == Exit.DONE
 
 
 def test_an_ablation_ends_in_its_own_page(instant_trials, unrendered, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """What a dry run does not count again."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -76,13 +77,15 @@ def test_trials_that_stay_without_a_result_are_priced_only_where_they_are_tried_
     assert not any(plan.seconds for plan in plans.values())
     assert {"failed", "diverged", "finished"} == set(table.columns[-1].cells)
     assert table.caption.endswith(
-        f"2 of {len(plans)} trials diverged or failed: not run again, and not counted, without --retry-failed. "
+        f"2 of {len(plans)} trials diverged or failed: not run again, and not counted; --retry-failed runs the failed ones again. "
     )
 
     done = find_done(setting, sweeps, retry_failed=True)
     plans = plan_trials(STUDY, sweeps, done=done)
     assert plans[failed].flops == pytest.approx(plans[failed].cost.flops - 2 / 3 * plans[failed].cost.train_flops)
-    assert plans[diverged].flops == plans[diverged].cost.flops  # from its first step
+    assert not plans[diverged].seconds and done.left == {diverged: DIVERGED}
+    shutil.rmtree(setting.workspace.trials / diverged)
+    assert find_done(setting, sweeps).left == {failed: FAILED}
 
 
 def test_nothing_of_a_study_on_other_tokens_or_none_is_taken_for_done(setting, tmp_path):

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,6 +28,7 @@ from experiments.running.launchers.slurm import SlurmAttempt, SlurmLauncher, Slu
 from experiments.running.ledger import Ledger
 from experiments.running.runner import run_missing
 from hma_jax.config import ConfigError
+from hma_jax.runtime.exits import Exit
 from tests.experiments import fake_trial
 from tests.experiments.test_runner import job, starts
 
@@ -35,13 +37,14 @@ class FakeSlurm:
     """What the launcher uses of submitit, squeue and scancel."""
 
     def __init__(self, folder: Path, monkeypatch):
-        self.folder, self.arrays, self.states, self.cancelled = folder, [], {}, []
+        self.folder, self.arrays, self.states, self.cancelled, self.most = folder, [], {}, [], 0
         folder.mkdir()
         monkeypatch.setattr(slurm, "ask_states", lambda: dict(self.states))
         monkeypatch.setattr(slurm.subprocess, "run", lambda words, **_: self.cancelled.append(words))
 
     def submit_array(self, attempts):
         self.arrays.append(len(attempts))
+        self.most = max(self.most, sum(state == "RUNNING" for state in self.states.values()) + len(attempts))
         return [self.submit(attempt, f"{len(self.arrays)}_{i}") for i, attempt in enumerate(attempts)]
 
     def submit(self, attempt, id):
@@ -138,6 +141,70 @@ def test_slurm_gets_one_array_of_all_trials_and_those_that_are_lost_later(places
     assert place._executor.arrays == [3, 1]
 
 
+def test_slurm_gets_no_more_jobs_at_a_time_than_there_are_workers(tmp_path, monkeypatch):
+    """Neither in one array nor in those of trials that wait for others."""
+    pytest.importorskip("submitit", reason="needs the extra `slurm`")
+    fake = FakeSlurm(tmp_path / "slurm", monkeypatch)
+    place = SlurmLauncher(tmp_path, 2, command=fake_trial.command, executor=fake)
+    place.pause = 0.01
+    jobs = [job("a"), job("b"), job("c"), *(replace(job(f"after {id}"), after=frozenset({id})) for id in "ab")]
+    run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert place.at_once == fake.most == 2 and sum(fake.arrays) == len(jobs)
+    assert SlurmLauncher(tmp_path, None, executor=fake).at_once == sys.maxsize
+
+
+def test_a_job_has_nothing_of_the_job_that_submits_it(submitted, tmp_path, monkeypatch):
+    place, fake, _ = submitted
+    for name in ("SLURM_JOB_ID", "SLURM_MEM_PER_CPU", "SLURM_CONF", "SBATCH_ACCOUNT"):
+        monkeypatch.setenv(name, "of the runner")
+    seen = {}
+    fake.submit_array = lambda attempts: seen.update(os.environ) or attempts
+    place.launch([tmp_path])
+    assert {name for name, value in seen.items() if value == "of the runner"} == {"SLURM_CONF", "SBATCH_ACCOUNT"}
+    assert os.environ["SLURM_JOB_ID"] == "of the runner"
+
+
+def test_a_node_that_loses_one_trial_after_another_gets_no_new_jobs(submitted, monkeypatch):
+    place, fake, handle = submitted
+    given = []
+    fake.update_parameters = lambda **parameters: given.append(parameters)
+    start = {"host": "node7.cluster", "process": 1, "token": "a", "node": "node7"}
+    assert place.place(handle, start) == "node7" and place.place(handle, None) is None
+    assert place.leave_out(handle, "node7") and place.leave_out(handle, "node9")
+    assert given == [{"exclude": "node7"}, {"exclude": "node7,node9"}]
+    place = SlurmLauncher(place._root, None, SlurmSettings(sbatch=("exclude=node1",)), executor=fake)
+    assert place.leave_out(handle, "node7") and given[-1] == {"exclude": "node1,node7"}
+
+
+def test_nodes_that_the_user_leaves_out_are_no_option_that_hides_others(tmp_path, monkeypatch):
+    submitit = pytest.importorskip("submitit", reason="needs the extra `slurm`")
+    given = {}
+    executor = SimpleNamespace(update_parameters=lambda **parameters: given.update(parameters))
+    monkeypatch.setattr(submitit, "SlurmExecutor", lambda *_, **__: executor)
+    slurm._make_executor(tmp_path, SlurmSettings(sbatch=("exclude=node1", "exclusive")))
+    assert given["exclude"] == "node1" and given["additional_parameters"] == {"requeue": True, "exclusive": True}
+
+
+def test_an_attempt_that_an_earlier_command_left_in_the_queue_does_not_begin(tmp_path):
+    first, second = (Attempt(tmp_path, tmp_path / "compiled", lambda directory: ["true"]) for _ in range(2))
+    assert first.run() == Exit.STOPPED and not (tmp_path / "output.txt").exists()
+    assert second.run() == 0
+
+
+def say_accelerator(directory: Path) -> list[str]:
+    return ["sh", "-c", 'echo "has $HMA_ACCELERATOR."']
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind"), [(RaySettings(), ""), (RaySettings(gpus=1), "gpu"), (RaySettings(tpus=4), "tpu")]
+)
+def test_a_trial_is_told_which_accelerator_it_has_on_ray(tmp_path, settings, kind):
+    place = RayLauncher(tmp_path, None, settings, command=say_accelerator, engine=FakeRay())
+    [task] = place.launch([tmp_path])
+    assert task.reference.result(timeout=20) == 0
+    assert (tmp_path / "output.txt").read_text() == f"has {kind}.\n"
+
+
 def test_where_slurm_takes_some_jobs_but_not_all_none_stays_in_its_queue(submitted, tmp_path, monkeypatch):
     from submitit.core.utils import FailedJobError
 
@@ -151,8 +218,11 @@ def test_where_slurm_takes_some_jobs_but_not_all_none_stays_in_its_queue(submitt
         return [fake.submit(None, f"8_{i}") for i in range(len(attempts))]
 
     fake.submit_array = submit_array
-    with pytest.raises(ConfigError, match="does not take the jobs: QOSMaxSubmitJobPerUserLimit"):
-        place.launch([tmp_path / str(i) for i in range(3)])
+    directories = [tmp_path / str(i) for i in range(3)]
+    for directory in directories:
+        directory.mkdir()
+    with pytest.raises(ConfigError, match="take the jobs: QOSMaxSubmitJobPerUserLimit; .* with --workers N"):
+        place.launch(directories)
     assert fake.cancelled == [["scancel", "8_0", "8_1"]]
 
 
@@ -280,15 +350,16 @@ def test_a_trial_has_the_grace_of_its_job_to_save(tmp_path, monkeypatch, grace, 
     pytest.importorskip("submitit", reason="needs the extra `slurm`")
     fake, submitted = FakeSlurm(tmp_path / "slurm", monkeypatch), []
     fake.submit_array = lambda attempts: submitted.extend(attempts) or attempts
-    SlurmLauncher(tmp_path, None, SlurmSettings(grace=grace), executor=fake).launch([tmp_path])
+    SlurmLauncher(tmp_path, None, SlurmSettings(grace=grace, gpus=1), executor=fake).launch([tmp_path])
     (attempt,) = submitted
+    assert attempt.accelerator == "gpu"
     attempt._code = 130  # it has saved
     assert attempt.grace == attempt.checkpoint().function.grace == to_save
 
 
 def test_a_trial_that_does_not_end_within_its_grace_is_killed(tmp_path):
-    attempt = Attempt(tmp_path, tmp_path / "compiled", lambda directory: ["sleep", "60"], grace=0.2)
-    (tmp_path / "stop").touch()
+    unwanted = ["sh", "-c", f"rm {tmp_path}/wanted; exec sleep 60"]
+    attempt = Attempt(tmp_path, tmp_path / "compiled", lambda directory: unwanted, grace=0.2)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which the child inherits
     try:
         assert attempt.run() == -signal.SIGKILL

@@ -1,6 +1,7 @@
 """The ledger keeps every whole line through a torn write; a workspace has one writer at a time."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Workspace
 from hma_jax.config import ConfigError
+from hma_jax.runtime.locks import EXPIRES
 from tests.full_disk import full_disk
 
 
@@ -76,3 +78,16 @@ def test_second_writer_is_refused(tmp_path):
             pass
     with Workspace(tmp_path).locked():
         pass  # free again
+
+
+def test_a_writer_on_another_machine_is_refused_where_its_lock_is_not_seen(tmp_path):
+    """As on Lustre with localflock; one that died is no hindrance for longer than its lease."""
+    lock = tmp_path / ".lock"
+    lock.write_text(json.dumps({"process": 7, "host": "other", "since": "noon", "machine": "other", "token": "x"}))
+    with pytest.raises(ConfigError, match=r"process 7 on other, since noon\).*\(if its machine died .*: 5 minutes\)"):
+        with Workspace(tmp_path).locked():
+            pass
+    ago = lock.stat().st_mtime - EXPIRES - 1
+    os.utime(lock, (ago, ago))
+    with Workspace(tmp_path).locked() as held:
+        assert not held.lost()

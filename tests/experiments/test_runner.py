@@ -5,23 +5,31 @@ import gc
 import json
 import os
 import platform
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from jax.errors import JaxRuntimeError
 
 from experiments.running import attempts, ledger, runner, shared_disk, trial_main
-from experiments.running.attempts import attempt, read_states
+from experiments.running.attempts import AttemptEnd, attempt, outcome, read_states
 from experiments.running.children import child_environment
+from experiments.running.launchers import local
+from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import TRIES, Job, Monitor, run_missing
+from experiments.running.slots import Accelerators
 from hma_jax.config import ConfigError
 from hma_jax.runtime import locks
+from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely
 from tests.experiments import fake_trial
 
@@ -64,23 +72,25 @@ def test_second_run_starts_nothing(tmp_path):
 
 
 def test_failures_are_recorded_and_the_sweep_goes_on(tmp_path):
-    jobs = [job("crash", "crash"), job("nan", "diverge"), job("abort", "SIGABRT"), job("silent", "none"), job("good")]
+    jobs = [job("crash", "crash"), job("nan", "diverge"), job("trap", "SIGILL"), job("silent", "none"), job("good")]
     states = run(tmp_path, jobs, workers=2)
     assert {k: s.event for k, s in states.items()} == {
-        "crash": "failed", "nan": "diverged", "abort": "failed", "silent": "failed", "good": "finished",
+        "crash": "failed", "nan": "diverged", "trap": "failed", "silent": "failed", "good": "finished",
     }  # fmt: skip
     assert states["nan"].message == "loss is nan"
-    assert "SIGABRT" in states["abort"].message and "output.txt" in states["abort"].message
-    (said,) = tmp_path.rglob("abort/output.txt")
-    assert "Fatal Python error: Aborted" in said.read_text()  # and what its threads did
+    assert "SIGILL" in states["trap"].message and "output.txt" in states["trap"].message
+    (said,) = tmp_path.rglob("trap/output.txt")
+    assert "Fatal Python error: Illegal instruction" in said.read_text()  # and what its threads did
     assert "exit code 1" in states["crash"].message
     assert "no such luck" in (tmp_path / "trials/crash/output.txt").read_text()
 
 
-@pytest.mark.parametrize(("end", "state"), [("SIGKILL", "lost"), ("SIGTERM", "preempted"), ("full disk", "lost")])
+@pytest.mark.parametrize(
+    ("end", "state"), [("SIGKILL", "lost"), ("SIGTERM", "preempted"), ("full disk", "lost"), ("SIGABRT", "lost")]
+)
 def test_a_trial_that_is_killed_goes_on_from_where_it_was(tmp_path, end, state):
-    """The kernel's out-of-memory killer, a machine that is taken away, a disk that is full: nothing is wrong with the
-    trial."""
+    """The kernel's out-of-memory killer, a machine that is taken away, a disk that is full, a driver that aborts:
+    nothing is wrong with the trial."""
     assert run(tmp_path, [job("a", end, steps=3)])["a"].event == "finished"
     assert starts(tmp_path, "a") == [0, 3]
     assert events(tmp_path, "a") == ["running", state, "running", "finished"]
@@ -92,6 +102,150 @@ def test_what_kills_a_trial_every_time_is_not_tried_for_ever(tmp_path):
     assert len(starts(tmp_path, "big")) == TRIES and starts(tmp_path, "good") == [0]
     run(tmp_path, [job("big", "SIGKILL", times=99)])  # the next command tries as often
     assert len(starts(tmp_path, "big")) == 2 * TRIES
+
+
+def test_what_is_stopped_every_time_before_it_gets_further_is_not_tried_for_ever(tmp_path):
+    """A job that is too short, or something that sends SIGTERM to what needs too much memory."""
+    state = run(tmp_path, [job("slow", "SIGTERM", times=99)])["slow"]
+    assert state.event == "preempted" and state.message.startswith(
+        f"stopped {TRIES} times in a row before it got further"
+    )
+    assert events(tmp_path, "slow") == ["running", "preempted"] * TRIES
+
+
+@pytest.mark.parametrize("end", ["SIGKILL", "SIGTERM"])
+def test_a_trial_that_gets_further_each_time_is_never_given_up(tmp_path, end):
+    """A long one on machines that are taken away every few hours."""
+    state = run(tmp_path, [job("long", end, times=TRIES + 1, checkpoints=True)])["long"]
+    assert state.event == "finished" and len(starts(tmp_path, "long")) == TRIES + 2
+
+
+class Requeueing(Launcher):
+    """An engine that starts what it has preempted again by itself, until it is asked to stop. `further`: each time
+    after another checkpoint; it then finishes at last."""
+
+    pause = 0.0
+    share = kill = None
+
+    def __init__(self, further: bool):
+        self.further, self.starts, self.cancelled = further, 0, False
+
+    def launch(self, directories):
+        return list(directories)
+
+    def ended(self, directory):
+        if self.cancelled or self.starts > 10:
+            return AttemptEnd(-signal.SIGTERM, "cancelled")
+        self.starts += 1
+        (directory / "started.json").write_text(json.dumps({"host": "far", "process": 1, "token": self.starts}))
+        if self.further:
+            (directory / "run/checkpoints" / str(self.starts)).mkdir(parents=True)
+        if self.starts > 10:
+            (directory / "result.json").write_text("{}")
+        return None
+
+    def ask_to_stop(self, handles):
+        self.cancelled = True
+
+
+@pytest.mark.parametrize("further", [False, True])
+def test_nor_is_one_that_the_engine_itself_starts_again(tmp_path, further):
+    place = Requeueing(further)
+    state = run_missing([job("a")], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)["a"]
+    assert (state.event, place.starts) == (("finished", 11) if further else ("preempted", TRIES + 1))
+
+
+def test_one_bad_gpu_does_not_eat_the_queue(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", ("0", "1", "2")))
+    trial = "[ $CUDA_VISIBLE_DEVICES = 1 ] && kill -SEGV $$; sleep 0.5; touch $0/result.json"
+    place = LocalLauncher(tmp_path, 3, command=lambda directory: ["sh", "-c", trial, str(directory)])
+    place.pause = 0.01
+    jobs = [job(str(i)) for i in range(8)]
+    states = run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert {state.event for state in states.values()} == {"finished"}
+    lost = [line["trial"] for line in Ledger(tmp_path / "ledger.jsonl").records() if line["event"] == "lost"]
+    assert len(lost) == len(set(lost)) == runner.BAD_PLACE
+    assert (
+        "lost on slot 1 (gpu 1) before their first step, which gets no more of them; the last one: its" in caplog.text
+    )
+
+
+def test_the_only_place_there_is_goes_on(tmp_path):
+    jobs = [job(str(i), "SIGSEGV") for i in range(runner.BAD_PLACE)]
+    assert {state.event for state in run(tmp_path, jobs).values()} == {"finished"}
+
+
+def test_a_trial_that_makes_no_progress_is_named_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(runner, "STALL_SECONDS", 0.1)
+    run(tmp_path, [job("a", steps=8, seconds=0.1)])
+    assert caplog.text.count("trial a makes no progress") == 1
+
+
+def test_a_study_that_another_command_has_taken_over_is_left_to_it(tmp_path):
+    place = fake_trial.launcher(tmp_path, 1)
+    place.launch = lambda directories: pytest.fail("it launched")
+    with pytest.raises(ConfigError, match=f"another command has taken over {tmp_path}"):
+        run_missing([job("a")], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place, lost=lambda: True)
+
+
+def test_a_trial_that_another_process_turns_out_to_run_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.05)
+    place = LocalLauncher(tmp_path, 1, command=lambda directory: ["sh", "-c", f"exit {Exit.STOPPED}"])
+    launch, launched = place.launch, []
+    with ExitStack() as stack:
+
+        def late(directories):  # a job that an earlier command left in the queue has begun
+            launched.extend(directories)
+            held = stack.enter_context(attempt(directories[0]))
+            threading.Timer(0.5, lambda: (directories[0] / "result.json").touch() or stack.close()).start()
+            return launch(directories) if held else []
+
+        place.launch = late
+        states = run_missing([job("a")], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert states["a"].event == "finished" and len(launched) == 1
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """The process of a trial is that of the test."""
+    monkeypatch.setattr(trial_main, "enter_child", lambda: None)
+
+
+def test_an_attempt_does_not_keep_its_machine_while_another_one_runs(tmp_path, monkeypatch, in_this_process, capsys):
+    monkeypatch.setattr(attempts, "EXPIRES", 0.1)
+    monkeypatch.setattr(attempts, "RENEWED_EVERY", 0.1)
+    with attempt(tmp_path):
+        (tmp_path / "started.json").unlink()
+        assert trial_main.main(tmp_path) == Exit.STOPPED
+    assert (
+        not (tmp_path / "started.json").exists()
+        and "another attempt at this trial is running" in capsys.readouterr().err
+    )
+
+
+def test_what_failed_while_an_attempt_waited_is_not_run_again(tmp_path, in_this_process):
+    with ExitStack() as stack:
+        stack.enter_context(attempt(tmp_path))
+        threading.Timer(0.3, lambda: (tmp_path / "failure.json").write_text("{}") and stack.close()).start()
+        assert trial_main.main(tmp_path) == Exit.FAILED  # there is no job.json to read
+
+
+def test_a_trial_that_should_have_a_gpu_does_not_run_without(tmp_path, monkeypatch, in_this_process):
+    monkeypatch.setenv("HMA_ACCELERATOR", "gpu")
+    (tmp_path / "job.json").write_text("{}")
+    assert trial_main.main(tmp_path) == Exit.LOST
+    state = outcome(tmp_path, AttemptEnd(Exit.LOST))
+    assert state.event == "lost" and "a GPU is expected, but JAX computes on cpu" in state.message
+    assert f"{socket.gethostname()}: " in state.message and "pip install 'hma-jax[cuda]'" in state.message
+
+
+@pytest.mark.parametrize(
+    ("says", "of_device"), [("INTERNAL: CUDA error", True), ("RESOURCE_EXHAUSTED: no room", False)]
+)
+def test_a_device_that_fails_is_no_fault_of_the_trial(says, of_device):
+    assert trial_main._is_of_device(JaxRuntimeError(says)) == of_device and not trial_main._is_of_device(
+        ValueError(says)
+    )
 
 
 def test_the_reason_is_kept_of_a_trial_that_is_lost_before_it_has_begun(tmp_path):
@@ -183,16 +337,19 @@ def test_failed_trials_run_again_only_on_request_and_keep_their_checkpoint(tmp_p
     assert starts(tmp_path, "a") == [0, 3]
 
 
-def test_a_diverged_trial_is_tried_from_the_start(tmp_path):
+def test_a_diverged_trial_is_left_as_it_is(tmp_path):
+    """It would diverge again, and what it left is the evidence."""
     run(tmp_path, [job("a", "diverge", steps=3)])
-    assert run(tmp_path, [job("a", steps=3)], retry_failed=True)["a"].event == "finished"
-    assert starts(tmp_path, "a") == [0, 0]
+    assert run(tmp_path, [job("a", steps=3)], retry_failed=True)["a"].event == "diverged"
+    assert starts(tmp_path, "a") == [0]
 
 
-def test_deleted_trial_directory_is_run_again(tmp_path):
-    run(tmp_path, [job("a")])
-    (tmp_path / "trials/a/result.json").unlink()
+@pytest.mark.parametrize("end", ["result", "crash", "diverge"])
+def test_deleted_trial_directory_is_run_again(tmp_path, end):
+    run(tmp_path, [job("a", end)])
+    shutil.rmtree(tmp_path / "trials/a")
     assert run(tmp_path, [job("a")])["a"].event == "finished"
+    assert events(tmp_path, "a")[-2:] == ["running", "finished"]
 
 
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])

@@ -314,7 +314,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
     from data_pipelines.registry.toml_file import load_entries, put_entry
 
     spec = suggestion.spec()
-    with lock_output(path, wait=True):  # another process may add its own at the same moment
+    with lock_output(path, wait=math.inf):  # another process may add its own at the same moment
         old = [entry for entry in load_entries(path) if entry.name == spec.name] if path.exists() else []
         if old == [spec]:  # its comments and its order stay
             say(f"unchanged: {path} has this entry of {spec.name}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -73,6 +73,14 @@ class Launcher(ABC):
             time.sleep(self.pause)
         self.kill([h for h in handles if self.ended(h) is None])
         return [self.ended(h) or AttemptEnd(None, "it did not end when it was asked to") for h in handles]
+
+    def place(self, handle: Any, start: Mapping[str, Any] | None) -> str | None:
+        """Where an attempt ran, of what its process said at its `start`; None if that is not known."""
+        return start and start["host"]
+
+    def leave_out(self, handle: Any, place: str) -> bool:
+        """Starts nothing more at the `place` where an attempt ran. False if it cannot, or if there is no other."""
+        return False
 
     def __enter__(self) -> Self:
         return self

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from experiments.running.attempts import OUTPUT, AttemptEnd
 from experiments.running.children import child_environment
 from experiments.running.launchers.base import Command, Launcher, trial_command
-from experiments.running.slots import cut, find_accelerators
+from experiments.running.slots import core_place, cut, find_accelerators
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,9 @@ class LocalLauncher(Launcher):
         command: Command = trial_command,
     ):
         self.at_once = workers or 1
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else ()
-        self._slots = cut(self.at_once, find_accelerators(), cores)
+        cores = sorted(os.sched_getaffinity(0), key=core_place) if hasattr(os, "sched_getaffinity") else ()
+        self._accelerators = find_accelerators()
+        self._slots = cut(self.at_once, self._accelerators, cores)
         self._free = list(range(self.at_once))
         self._root, self._command = root, command
 
@@ -66,13 +68,14 @@ class LocalLauncher(Launcher):
 
     def _start(self, directory: Path) -> Child:
         slot = self._free[0]
+        kind = self._accelerators.kind if self._accelerators else ""
         with open(directory / OUTPUT, "a") as output:
             process = subprocess.Popen(
                 self._command(directory),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=child_environment(self._root / "compiled", self._slots[slot]),
+                env=child_environment(self._root / "compiled", self._slots[slot], kind),
                 start_new_session=True,  # Ctrl-C reaches the runner only, which asks them to save
             )
         self._free.remove(slot)
@@ -85,6 +88,17 @@ class LocalLauncher(Launcher):
         if handle.slot not in self._free:
             self._free.append(handle.slot)
         return AttemptEnd(code)
+
+    def place(self, handle: Child, start: Mapping[str, Any] | None) -> str:
+        has = self._slots[handle.slot].accelerators
+        return f"slot {handle.slot}" + (f" ({has.kind} {', '.join(has.names)})" if has else "")
+
+    def leave_out(self, handle: Child, place: str) -> bool:
+        if self.at_once == 1:
+            return False
+        self._free.remove(handle.slot)
+        self.at_once -= 1
+        return True
 
     def ask_to_stop(self, handles: Sequence[Child]) -> None:
         for handle in handles:

@@ -19,7 +19,7 @@ from typing import Any
 
 from experiments.running.attempts import AttemptEnd, is_alive
 from experiments.running.launchers.base import Command, Launcher, trial_command
-from experiments.running.launchers.remote import STOP, Attempt
+from experiments.running.launchers.remote import Attempt, unwant
 from hma_jax.config import ConfigError, require
 
 
@@ -74,6 +74,7 @@ class RayLauncher(Launcher):
     ):
         self.at_once = workers or Launcher.at_once
         self._root, self._command = root, command
+        self._accelerator = "tpu" if settings.tpus else "gpu" if settings.gpus else ""
         self._ray = engine or _join(settings.address)
         self._run = self._ray.remote(**_options(settings))(run)
 
@@ -83,7 +84,7 @@ class RayLauncher(Launcher):
 
     def launch(self, directories: Sequence[Path]) -> list[Task]:
         # Before any is asked for: making one may raise.
-        attempts = [Attempt(d, self._root / "compiled", self._command) for d in directories]
+        attempts = [Attempt(d, self._root / "compiled", self._command, self._accelerator) for d in directories]
         return [Task(attempt.directory, self._run.remote(attempt)) for attempt in attempts]
 
     def ended(self, handle: Task) -> AttemptEnd | None:
@@ -99,7 +100,7 @@ class RayLauncher(Launcher):
 
     def ask_to_stop(self, handles: Sequence[Task]) -> None:
         for handle in handles:
-            (handle.directory / STOP).touch()  # what Ray does about a task that has just begun comes to nothing
+            unwant(handle.directory)  # what Ray does about a task that has just begun comes to nothing
             self._ray.cancel(handle.reference, force=False)  # raises KeyboardInterrupt in the task, which asks too
 
     def kill(self, handles: Sequence[Task]) -> None:

@@ -7,6 +7,7 @@ of a kind for impatience.
 
 from __future__ import annotations
 
+import secrets
 import signal
 import subprocess
 import threading
@@ -16,20 +17,35 @@ from pathlib import Path
 from experiments.running.attempts import OUTPUT
 from experiments.running.children import child_environment
 from experiments.running.launchers.base import GRACE_SECONDS, Command
+from hma_jax.runtime.exits import Exit
+from hma_jax.runtime.files import write_file
 
 POLL_SECONDS = 0.1
 """Seconds between two checks whether the child has ended, or is to."""
 
-STOP = "stop"
-"""A file in the trial's directory that asks its attempt to stop, for engines whose own way does not always arrive."""
+WANTED_SECONDS = 1.0
+"""Seconds between two checks whether the attempt is still wanted."""
+
+WANTED = "wanted"
+"""A file in the trial's directory with the token of the one attempt that may run: any other stops, and one that an
+earlier command left in the queue does not begin."""
+
+
+def unwant(directory: Path) -> None:
+    """Asks a trial's attempt to stop, where an engine's own way does not always arrive."""
+    (directory / WANTED).unlink(missing_ok=True)
 
 
 class Attempt:
-    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk. `grace`: seconds to save."""
+    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk. `accelerator`: the kind that
+    it is given, if any; `grace`: seconds to save. The newest one made for a directory is the one that is wanted."""
 
-    def __init__(self, directory: Path, cache: Path, command: Command, grace: float = GRACE_SECONDS):
+    def __init__(
+        self, directory: Path, cache: Path, command: Command, accelerator: str = "", grace: float = GRACE_SECONDS
+    ):
         self.directory, self.cache, self.command, self.grace = directory, cache, command, grace
-        (directory / STOP).unlink(missing_ok=True)  # it asked an earlier attempt
+        self.accelerator, self.token = accelerator, secrets.token_hex(4)
+        write_file(directory / WANTED, self.token)
         self._child: subprocess.Popen | None = None
         self._code: int | None = None
         self._stop_requested = False
@@ -39,13 +55,15 @@ class Attempt:
 
     def run(self) -> int:
         """Makes the attempt and returns its exit code, as of `subprocess`."""
+        if self.directory.is_dir() and not self._is_wanted():  # without the shared disk, what follows fails
+            return Exit.STOPPED
         with open(self.directory / OUTPUT, "a") as output:
             self._child = subprocess.Popen(
                 self.command(self.directory),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=child_environment(self.cache),
+                env=child_environment(self.cache, accelerator=self.accelerator),
                 start_new_session=True,  # signals come through here, once
             )
         # Engines stop us by calls from signal handlers in this thread. Here and there it must hold no lock,
@@ -54,12 +72,22 @@ class Attempt:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, lambda *_: self._request_stop())
         try:
-            while self._code is None and not (self.directory / STOP).exists():
-                time.sleep(POLL_SECONDS)
+            while self._code is None and self._is_wanted():
+                until = time.monotonic() + WANTED_SECONDS
+                while self._code is None and time.monotonic() < until:
+                    time.sleep(POLL_SECONDS)
             self.end()
             return self._code
         finally:  # the engine interrupts the call
             self.end()
+
+    def _is_wanted(self) -> bool:
+        try:
+            return (self.directory / WANTED).read_text() == self.token
+        except FileNotFoundError:
+            return False
+        except OSError:  # a shared disk that does not answer for a while
+            return True
 
     def _wait(self) -> None:
         self._code = self._child.wait()

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import pickle
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,11 +87,11 @@ class SlurmAttempt(Attempt):
         from submitit.helpers import DelayedSubmission
 
         self.end()
-        return DelayedSubmission(SlurmAttempt(self.directory, self.cache, self.command, self.grace))
+        return DelayedSubmission(self)
 
 
 class SlurmLauncher(Launcher):
-    """`workers`: how many jobs of the array run at a time; None: as many as Slurm gives.
+    """`workers`: how many jobs are submitted at a time; None: all.
 
     Raises ConfigError where Slurm is missing.
     """
@@ -106,9 +108,12 @@ class SlurmLauncher(Launcher):
         command: Command = trial_command,
         executor: Any = None,
     ):
+        self.at_once = workers or Launcher.at_once
         self._root, self._command = root, command
+        self._accelerator = "gpu" if settings.gpus else ""
         self._grace = max(settings.grace - REQUEUE, LEAST_TO_SAVE)
-        self._executor = executor or _make_executor(root / "slurm", workers, settings)
+        self._executor = executor or _make_executor(root / "slurm", settings)
+        self._left_out = [o.removeprefix("exclude=") for o in settings.sbatch if o.startswith("exclude=")]  # nodes
         self._polled = -math.inf
         self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
         self._over: dict[str, float] = {}  # when a job was first seen to be over
@@ -120,13 +125,19 @@ class SlurmLauncher(Launcher):
     def launch(self, directories: Sequence[Path]) -> list[Any]:
         from submitit.core.utils import FailedJobError
 
-        attempts = [SlurmAttempt(d, self._root / "compiled", self._command, self._grace) for d in directories]
+        attempts = [
+            SlurmAttempt(d, self._root / "compiled", self._command, self._accelerator, self._grace) for d in directories
+        ]
         jobs: list[Any] = []
         try:
             for first in range(0, len(attempts), LARGEST_ARRAY):
-                jobs += self._executor.submit_array(attempts[first : first + LARGEST_ARRAY])
+                with _no_job():
+                    jobs += self._executor.submit_array(attempts[first : first + LARGEST_ARRAY])
         except FailedJobError as error:
-            raise ConfigError(f"Slurm does not take the jobs: {error}; change --launcher-set") from error
+            raise ConfigError(
+                f"Slurm does not take the jobs: {error}; change --launcher-set or, where it allows fewer jobs than these "
+                f"{len(attempts)}, submit fewer at a time with --workers N"
+            ) from error
         finally:
             if len(jobs) < len(attempts):  # the caller has no handles of those that Slurm took
                 self.ask_to_stop(jobs)
@@ -170,6 +181,15 @@ class SlurmLauncher(Launcher):
             return "UNKNOWN"
         return self._states.get(id, COMPLETED)  # squeue forgets what has been over for a while
 
+    def place(self, handle: Any, start: Mapping[str, Any] | None) -> str | None:
+        return start and start.get("node")
+
+    def leave_out(self, handle: Any, place: str) -> bool:
+        """Jobs that are in the queue already may still get there."""
+        self._left_out.append(place)
+        self._executor.update_parameters(exclude=",".join(self._left_out))
+        return True
+
     def ask_to_stop(self, handles: Sequence[Any]) -> None:
         """Slurm sends SIGTERM, and SIGKILL after its KillWait; jobs in the queue leave it."""
         if handles:
@@ -177,6 +197,18 @@ class SlurmLauncher(Launcher):
 
     def kill(self, handles: Sequence[Any]) -> None:
         """Slurm has done that by now."""
+
+
+@contextmanager
+def _no_job() -> Iterator[None]:
+    """What the job that this process may be in has in its environment would be taken for that of the jobs it submits,
+    besides how Slurm is found and the user's own options of sbatch."""
+    from submitit.helpers import clean_env
+
+    kept = {key: value for key, value in os.environ.items() if key == "SLURM_CONF" or key.startswith("SBATCH_")}
+    with clean_env():
+        os.environ.update(kept)
+        yield
 
 
 def ask_states() -> dict[str, str] | None:
@@ -190,7 +222,7 @@ def ask_states() -> dict[str, str] | None:
     return dict(line.split() for line in done.stdout.splitlines())
 
 
-def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -> Any:
+def _make_executor(folder: Path, settings: SlurmSettings) -> Any:
     from submitit import SlurmExecutor
 
     try:
@@ -209,11 +241,12 @@ def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -
         "mem": None if settings.memory_gb is None else f"{round(settings.memory_gb * 1024)}M",
     }
     further = {name: value if equals else True for name, equals, value in (o.partition("=") for o in settings.sbatch)}
+    options["exclude"] = further.pop("exclude", None)  # further ones would hide what `leave_out` adds
     executor.update_parameters(
         job_name="hma",
         time=settings.minutes,
         signal_delay_s=settings.grace,
-        array_parallelism=workers or LARGEST_ARRAY,
+        array_parallelism=LARGEST_ARRAY,  # the runner submits no more than `at_once`
         stderr_to_stdout=True,
         additional_parameters={"requeue": True, **further},
         **{name: value for name, value in options.items() if value is not None},
