@@ -28,8 +28,8 @@ class Exit(IntEnum):
     REFUSED = 2  # wrong arguments or configuration, or a directory that another process holds
     DIVERGED = 3  # a number was not finite: the same command would end so again
     # EX_TEMPFAIL. Another process of the same program is lost or failed: start all of them again. Or the disk of a run
-    # did not answer for minutes. Of the process of a trial: its files could not be written, its data not be read, or its
-    # accelerator failed.
+    # did not answer for minutes. Of the process of a trial: its files could not be written, its data not be read, or
+    # its accelerator failed.
     LOST = 75
     UNREAD = 128 + signal.SIGPIPE  # whoever read the output does so no more, as `| head`
     INTERRUPTED = 128 + signal.SIGINT  # Ctrl-C; what could be saved is, and the same command goes on
