@@ -8,7 +8,8 @@ Expected: well above random actions; no better than policies made for nothing el
 
 The world model gets action heads and is post-trained, all of it, to predict what an expert does next
 (`masking.setting` is policy). The others are trained on the same episodes. All begin at the same starts, which no
-recording has.
+recording has. `--policies` takes some of them; with `--predicts chunk` the Diffusion Policy predicts the clean chunk of
+actions instead of the noise in it.
 
 Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts;
 run, the post-trained model, and its tokenizer: a policy, and no simulator any more.
@@ -20,9 +21,10 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
@@ -38,7 +40,7 @@ from experiments.applications.policies.demonstrations import (
     record,
     save_demonstrations,
 )
-from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
+from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, Predicts, train_diffusion
 from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.own_head import OwnHeadPolicy
@@ -81,11 +83,13 @@ class Settings:
     steps: int = 3000  # of training, of every policy
     batch: int = 12  # windows of the model
     learning_rate: float = 1e-3
+    predicts: Predicts = "noise"  # of the Diffusion Policy
     seed: int = 0
 
     def __post_init__(self):
         require(self.steps >= 1, f"--steps must be at least 1, got {self.steps}")
         require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
+        require(self.demonstrations >= 1, f"--demonstrations must be at least 1, got {self.demonstrations}")
 
     def make_task(self) -> Task:
         return find_task(self.robot, self.task, self.frames, self.hold)
@@ -159,7 +163,7 @@ def make_policy(
     if name == CLONED:
         return clone(demos, BcConfig(frames=1, fit=fit), settings.seed, report)
     if name == DIFFUSION:
-        config = DiffusionConfig(frames=1, fit=fit)
+        config = DiffusionConfig(frames=1, predicts=settings.predicts, fit=fit)
         made = train_diffusion(demos, config, settings.seed, report)
         return DiffusionPolicy(config, made[settings.steps], scale_of(demos))
     return RandomPolicy(robot)
@@ -187,9 +191,12 @@ def markdown(rows: list[tuple[str, float, float, float]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bool, float]]]:
-    """What `read_trials` reads. Every policy's outcomes are kept in `out` and made once. Raises ConfigError where they
-    were made with other settings, and for a model that sees more frames than there are to train it on."""
+def compare(
+    run: Path, out: Path, settings: Settings, policies: Collection[str] = POLICIES
+) -> dict[str, list[tuple[bool, float]]]:
+    """What `read_trials` reads, of `policies` and of those in `out`, where every policy's outcomes are kept and made
+    once. Raises ConfigError where they were made with other settings, and for a model that sees more frames than there
+    are to train it on."""
     simulator = load_simulator(run)
     robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
     window = simulator.model.config.frames
@@ -212,6 +219,8 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
     for name in POLICIES:
         path = out / "outcomes" / f"{name.replace(' ', '_')}.json"
         if not path.exists():
+            if name not in policies:
+                continue
             path.parent.mkdir(exist_ok=True)
             with step(name) as report:
                 policy = make_policy(name, simulator, robot, demos, settings, out, report)
@@ -237,9 +246,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
     parser.add_argument("--starts", type=int, default=Settings.starts)
-    args = parser.parse_args()
-    settings, out = Settings(steps=args.steps, starts=args.starts), args.out
-    write_results(compare(args.run, out, settings), out)
+    parser.add_argument("--demonstrations", type=int, default=Settings.demonstrations, help="episodes of the expert")
+    parser.add_argument(
+        "--predicts", choices=get_args(Predicts), default=Settings.predicts, help="what the Diffusion Policy predicts"
+    )
+    parser.add_argument(
+        "--policies", nargs="+", default=POLICIES, choices=POLICIES, metavar="POLICY", help=f"of: {', '.join(POLICIES)}"
+    )
+    args = vars(parser.parse_args())
+    run, out, policies = args.pop("run"), args.pop("out"), args.pop("policies")
+    write_results(compare(run, out, Settings(**args), policies), out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
 
 

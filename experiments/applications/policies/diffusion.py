@@ -1,8 +1,8 @@
 """Diffusion Policy, small: a chunk of actions is drawn by denoising, given what is seen (Chi et al. 2023).
 
 The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps.
-Training adds noise of one of `levels` strengths (squared-cosine schedule) and predicts it; acting takes `samples` steps
-of DDIM.
+Training adds noise of one of `levels` strengths (squared-cosine schedule) and predicts that noise or the clean chunk;
+acting takes `samples` steps of DDIM.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from experiments.applications.policies.network import (
     stack_frames,
 )
 from hma_jax.config import require
+from hma_jax.config.base import require_choice
 from hma_jax.kernels.random import key_of
 
 EMBEDDED = 32
@@ -37,6 +39,9 @@ EMBEDDED = 32
 
 CLIP = 3.0
 """Standard deviations beyond which no action is denoised to."""
+
+Predicts = Literal["noise", "chunk"]
+"""What the denoiser is trained to predict."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class DiffusionConfig:
     execute: int = 2
     levels: int = 100
     samples: int = 10
+    predicts: Predicts = "noise"  # policies that were saved without this field predict noise
     width: int = 256
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=FitConfig)
@@ -62,6 +68,7 @@ class DiffusionConfig:
             1 <= self.samples <= self.levels,
             f"the number of denoising steps must lie in 1..{self.levels}, the noise levels, got {self.samples}",
         )
+        require_choice(self.predicts, get_args(Predicts), "predicts")
 
 
 def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:
@@ -82,7 +89,8 @@ def signal(levels: int) -> np.ndarray:
 
 
 def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array) -> jax.Array:
-    """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, 3 K]."""
+    """The noise in chunks [B, chunk * A] at levels [B], or the clean chunks, as the network was trained, given features
+    of what is seen [B, 3 K]."""
     rate = jnp.exp(-jnp.log(1000.0) * jnp.arange(EMBEDDED // 2, dtype=jnp.float32) / (EMBEDDED // 2))
     angle = level[:, None] * rate
     return mlp(params["denoiser"], jnp.concatenate([seen, jnp.sin(angle), jnp.cos(angle), noised], -1))
@@ -97,8 +105,10 @@ def draw(params: Params, config: DiffusionConfig, frames: jax.Array, start: jax.
 
     def step(x: jax.Array, at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         now, then = at
-        noise = denoise(params, seen, x, jnp.full(len(x), now, jnp.float32))
-        clean = jnp.clip((x - jnp.sqrt(1 - kept[now]) * noise) / jnp.sqrt(kept[now]), -CLIP, CLIP)
+        found = denoise(params, seen, x, jnp.full(len(x), now, jnp.float32))
+        if config.predicts == "noise":
+            found = (x - jnp.sqrt(1 - kept[now]) * found) / jnp.sqrt(kept[now])
+        clean = jnp.clip(found, -CLIP, CLIP)
         noise = (x - jnp.sqrt(kept[now]) * clean) / jnp.sqrt(1 - kept[now])
         left = jnp.where(then < 0, 1.0, kept[then])
         return jnp.sqrt(left) * clean + jnp.sqrt(1 - left) * noise, None
@@ -122,7 +132,8 @@ def train_diffusion(
         noise = jax.random.normal(noise_key, chunk.shape, jnp.float32)
         share = kept[level][:, None]
         noised = jnp.sqrt(share) * chunk + jnp.sqrt(1 - share) * noise
-        return jnp.mean((denoise(params, seen, noised, level.astype(jnp.float32)) - noise) ** 2)
+        wanted = noise if config.predicts == "noise" else chunk
+        return jnp.mean((denoise(params, seen, noised, level.astype(jnp.float32)) - wanted) ** 2)
 
     start = init_diffusion(config, demos.actions.shape[-1], seed)
     return fit(start, loss, data, len(data["episode"]), config.fit, seed, report)

@@ -123,6 +123,8 @@ def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_pa
         monkeypatch.setattr(own_policy, "load_simulator", lambda _, made=made: made)
         trials.append(compare(tmp_path / "run", tmp_path / "out", FEW))
     assert trials[0] == trials[1] and len(trials[0][RANDOM]) == FEW.starts
+    assert compare(tmp_path / "run", tmp_path / "some", FEW, policies=(OWN,)) == {}  # of these there is none here
+    assert compare(tmp_path / "run", tmp_path / "out", FEW, policies=(OWN,)) == trials[0]  # made before
     monkeypatch.undo()
     monkeypatch.setattr(own_policy, "load_simulator", lambda _: made)
     with pytest.raises(ConfigError, match="policies and success heads need images of 32 x 32 pixels, but 8 x 8"):

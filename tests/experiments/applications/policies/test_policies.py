@@ -1,7 +1,9 @@
 """Recorded demonstrations, and policies that are trained on them."""
 
+import json
 from dataclasses import replace
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -200,19 +202,43 @@ def test_random_actions_depend_on_the_seed_of_an_episode_alone():
     assert not np.array_equal(first[1], first[2])
 
 
-def test_denoising_with_the_true_noise_gives_the_chunk(monkeypatch, demos):
-    config = DiffusionConfig(encoder=SMALL, samples=10)
+@pytest.mark.parametrize("predicts", get_args(diffusion.Predicts))
+def test_denoising_with_the_true_noise_or_chunk_gives_the_chunk(monkeypatch, demos, predicts):
+    config = DiffusionConfig(encoder=SMALL, samples=10, predicts=predicts)
     params, wanted = init_diffusion(config, 4, 0), jnp.linspace(-1, 1, 16)
     kept = jnp.asarray(diffusion.signal(config.levels))
 
     def exact(params, seen, noised, level):
         share = kept[level.astype(int)][:, None]
-        return (noised - jnp.sqrt(share) * wanted) / jnp.sqrt(1 - share)
+        noise = (noised - jnp.sqrt(share) * wanted) / jnp.sqrt(1 - share)
+        return noise if predicts == "noise" else jnp.broadcast_to(wanted, noised.shape)
 
     monkeypatch.setattr(diffusion, "denoise", exact)
     frames = jnp.zeros((2, 2, 8, 8, 3))
     drawn = diffusion.draw(params, config, frames, jnp.ones((2, 16)))
     np.testing.assert_allclose(drawn, np.broadcast_to(wanted, (2, 16)), atol=1e-4)
+
+
+def test_a_denoiser_learns_the_noise_or_the_chunk_as_its_config_says(monkeypatch, demos):
+    """Of constant actions, which are 0 in their own scale, a network that gives 0 knows the chunk, and no noise."""
+    monkeypatch.setattr(diffusion, "denoise", lambda params, seen, noised, level: 0 * noised)
+    still, losses = replace(demos, actions=np.ones_like(demos.actions)), []
+    for predicts in ("chunk", "noise"):
+        config = DiffusionConfig(encoder=SMALL, predicts=predicts, fit=FitConfig(steps=1, batch=64))
+        train_diffusion(still, config, 0, lambda done, total, note: losses.append(float(note.split()[1])))
+    assert losses[0] == 0 and losses[1] == pytest.approx(1, abs=0.1)
+    with pytest.raises(ConfigError, match="predicts: .velocity. is not allowed; choose one of noise, chunk"):
+        DiffusionConfig(predicts="velocity")
+
+
+def test_saved_diffusion_policies_that_do_not_say_what_they_predict_predict_noise(demos, tmp_path):
+    config, path = DiffusionConfig(encoder=SMALL, samples=2, predicts="chunk"), tmp_path / "one/policy.json"
+    save_policy(DiffusionPolicy(config, init_diffusion(config, 4, 0), scale_of(demos)), tmp_path / "one")
+    assert load_policy(tmp_path / "one").config == config
+    description = json.loads(path.read_text())
+    del description["config"]["predicts"]
+    path.write_text(json.dumps(description))
+    assert load_policy(tmp_path / "one").config == replace(config, predicts="noise")
 
 
 def test_a_ladder_has_its_first_and_last_rung():
