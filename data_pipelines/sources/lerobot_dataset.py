@@ -7,10 +7,10 @@ An episode is named by its `episode_index`.
 from __future__ import annotations
 
 import functools
-import os
 import re
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_episodes, hash_meta
-from data_pipelines.sources.rlds.location import retry
+from data_pipelines.sources.rlds.listing import list_files
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
@@ -37,6 +37,9 @@ from data_pipelines.sources.source import (
 )
 from data_pipelines.sources.video import open_video
 from hma_jax.config import require
+
+LISTINGS = 16
+"""Folders that are listed at a time."""
 
 
 class LeRobotDataset(EpisodeSource):
@@ -75,7 +78,7 @@ class LeRobotDataset(EpisodeSource):
         self._lengths = np.asarray([e.length for e in self._entries], np.int64)
         self._paths = sorted({p for e in self._entries for p in (e.data, *(f for f, _ in e.videos.values()))})
         self.files = len(self._paths)
-        self._bytes = {path: _size(path) for path in self._paths}
+        self._bytes = _sizes(self._paths)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -242,8 +245,17 @@ def _runs(numbers: np.ndarray) -> tuple[EpisodeRun, ...]:
     return tuple(EpisodeRun("episodes", int(numbers[a]), b - a) for a, b in zip(starts.tolist(), ends, strict=True))
 
 
-def _size(path: Path) -> int:
+def _sizes(paths: Sequence[Path]) -> dict[Path, int]:
+    """0 for one that is missing: its episodes cannot be read, as reading them says. Folders are listed at a time, since
+    on a network drive asking for each file takes minutes."""
+    folders = sorted({path.parent for path in paths})
+    with ThreadPoolExecutor(LISTINGS, "sizes") as pool:
+        listed = dict(zip(folders, pool.map(_list_folder, folders), strict=True))
+    return {path: listed[path.parent].get(path.name, (0, ""))[0] for path in paths}
+
+
+def _list_folder(folder: Path) -> dict[str, tuple[int, str]]:
     try:
-        return retry(path, lambda: os.stat(path)).st_size
+        return list_files(folder)
     except FileNotFoundError:
-        return 0  # its episodes cannot be read, as reading them says
+        return {}

@@ -7,12 +7,12 @@ parquet tables that say in which file, and at what time of a video, each one beg
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -62,8 +62,8 @@ class LeRobotMeta:
     may_lose: bool
 
 
-def read_meta(root: Path) -> LeRobotMeta:
-    """Raises DataError, naming file and field, for what is missing, damaged or of another version."""
+def read_info(root: Path) -> dict[str, Any]:
+    """info.json. Raises DataError, naming the field, for what is missing, damaged or of another version."""
     info_path = root / "meta" / "info.json"
     info = _json(info_path)
     version = info.get("codebase_version")
@@ -76,7 +76,20 @@ def read_meta(root: Path) -> LeRobotMeta:
         if not info.get(field):
             raise DataError(f"{info_path}: no {field!r}. {ADVICE}")
     _check_info(info, info_path)
-    features = info["features"]
+    return info
+
+
+def read_meta(root: Path) -> LeRobotMeta:
+    """Raises DataError, naming file and field, for what is missing, damaged or of another version. What was read is
+    kept while no file of the folder changes: a command opens a dataset several times."""
+    files = retry(root, lambda: [(p, p.stat()) for p in sorted((root / "meta").rglob("*")) if p.is_file()])
+    return _read_meta(root, tuple((path, stat.st_mtime_ns, stat.st_size) for path, stat in files))
+
+
+@functools.lru_cache(8)
+def _read_meta(root: Path, stamp: tuple[tuple[Path, int, int], ...]) -> LeRobotMeta:
+    info_path, info = root / "meta" / "info.json", read_info(root)
+    version, features = info["codebase_version"], info["features"]
     videos = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if videos and not info.get("video_path"):
         raise DataError(f"{info_path}: 'video_path' is missing, but {quote(videos[0])} is a video. {ADVICE}")
@@ -114,7 +127,7 @@ def hash_meta(root: Path) -> hashlib._Hash:
     for path in sorted(p for p in meta.rglob("*") if p.is_file()):
         name = path.relative_to(meta).as_posix()
         if not any(part.startswith(".") for part in name.split("/")):
-            digest.update(f"{name}:{retry(path, partial(_hash_file, path))};".encode())
+            digest.update(f"{name}:{retry(path, functools.partial(_hash_file, path))};".encode())
     return digest
 
 
@@ -132,7 +145,7 @@ def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
         digest.update(repr((e.index, e.length, place(e.data), videos)).encode())
     statistics = root / "meta" / "episodes_stats.jsonl"  # 2.1; 2.0 has none of single episodes
     if statistics.exists():
-        digest.update(retry(statistics, partial(_hash_file, statistics)).encode())
+        digest.update(retry(statistics, functools.partial(_hash_file, statistics)).encode())
     columns = [f"stats/{name}/{value}" for name in shapes for value in ("min", "max", "mean", "std")]
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         digest.update(repr([(name, c.to_pylist()) for name, c in _columns(path, columns)]).encode())

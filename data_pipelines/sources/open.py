@@ -114,14 +114,21 @@ def open_source(
     return RldsDataset(location, split, files=files, **options)
 
 
-def read_rate(location: Location | Parts, split: str = "train", corrupt: Corrupt = "raise") -> float | None:
+def read_rate(location: Location | Parts) -> float | None:
     """Native frames per second, as the files of a dataset say, or those of the first of `Parts` that do; None where
-    none does. The records of RLDS are not looked for, which may take hours. Raises what `open_source` raises."""
+    none does. No episode is looked for, which may take hours. Raises DataError for a location that is no dataset."""
 
     def rate_of(place: Location) -> float | None:
-        if find_format(place) == "rlds":
-            return rlds_rate(resolve_version(place))
-        return open_source(place, split, corrupt=corrupt, max_skipped=sys.maxsize).hz
+        kind = find_format(place)
+        if kind == "lerobot":
+            from data_pipelines.sources.lerobot_meta import read_info
+
+            return float(read_info(place)["fps"])
+        if kind == "robomimic":
+            from data_pipelines.sources.robomimic import read_environment
+
+            return read_environment(place)[1]
+        return rlds_rate(resolve_version(place))
 
     places = location.places if isinstance(location, Parts) else (location,)
     return next((hz for hz in map(rate_of, places) if hz is not None), None)
@@ -135,10 +142,10 @@ def source_name(location: str | Location) -> str:
 
         return dataset_name(locate(location))
     if kind == "robomimic":
-        from data_pipelines.sources.robomimic import RobomimicSource
+        from data_pipelines.sources.robomimic import read_environment
         from data_pipelines.sources.robomimic_dataset import dataset_name as name_of
 
-        return name_of(RobomimicSource(locate(location)))
+        return name_of(read_environment(locate(location))[0])
     from data_pipelines.sources.rlds.schema import dataset_name as rlds_name
 
     return rlds_name(location)

@@ -58,16 +58,12 @@ class RobomimicSource:
         settings.check()
         self.path, self.short_side = Path(path), settings.short_side
         with self.open() as file, damage_as(str(path), DataError):
-            if "data" not in file:
-                raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
-            args = _env_args(self.path, file["data"].attrs.get("env_args"))
+            self.task, self.recorded_hz = _environment(self.path, file)
             self.masks = _demonstrations(self.path, file, settings.filter_key)  # of each demonstration
             self.units = list(self.masks)
             self.layout, self.cameras, self.ending, self.unsupported_images = self._read_layout(
                 file["data"][self.units[0]], settings.camera
             )
-        self.task = str(args.get("env_name", "robomimic"))
-        self.recorded_hz = _control_rate(self.path, args)
         self.hz = float(settings.hz or self.recorded_hz or CONTROL_RATE)
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
@@ -132,17 +128,7 @@ class RobomimicSource:
         )
 
     def open(self) -> Any:
-        h5py = require_module("h5py")
-
-        def opened() -> Any:
-            try:
-                return h5py.File(self.path, "r")
-            except OSError as error:
-                if is_io_error(error):
-                    raise  # to be tried again
-                raise DataError(f"{self.path}: not a readable HDF5 file ({error}). Download it again.") from error
-
-        return retry(self.path, opened)
+        return _open_file(self.path)
 
     def array(self, demo: Any, key: str, where: str) -> np.ndarray:
         return read_rows(demo, key, slice(None), where)
@@ -179,6 +165,33 @@ class RobomimicSource:
         others = sorted(key for key in obs if obs[key].ndim >= 3 and key not in pictures)
         unsupported_images = {f"observation/{key}": tuple(map(int, obs[key].shape[1:])) for key in others}
         return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, ending, unsupported_images
+
+
+def read_environment(path: Path) -> tuple[str, float | None]:
+    """(task, Hz or None), without a look at the demonstrations. Raises DataError for another file."""
+    with _open_file(path) as file, damage_as(str(path), DataError):
+        return _environment(path, file)
+
+
+def _environment(path: Path, file: Any) -> tuple[str, float | None]:
+    if "data" not in file:
+        raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
+    args = _env_args(path, file["data"].attrs.get("env_args"))
+    return str(args.get("env_name", "robomimic")), _control_rate(path, args)
+
+
+def _open_file(path: Path) -> Any:
+    h5py = require_module("h5py")
+
+    def opened() -> Any:
+        try:
+            return h5py.File(path, "r")
+        except OSError as error:
+            if is_io_error(error):
+                raise  # to be tried again
+            raise DataError(f"{path}: not a readable HDF5 file ({error}). Download it again.") from error
+
+    return retry(path, opened)
 
 
 @contextmanager

@@ -55,7 +55,7 @@ class RobomimicDataset(EpisodeSource):
         self.location = self.schema = Path(path)
         self.split, self.version, self.files = split, "", 1
         self._read = RobomimicSource(path, RobomimicSettings(filter_key=None if split == "train" else split))
-        self.name = dataset_name(self._read)
+        self.name = dataset_name(self._read.task)
         self._demos = list(self._read.units)
         self.features = self._read.layout.flat_features(self._read.unsupported_images)
         several = "+" in split
@@ -201,9 +201,9 @@ class _LazyFrames(Sequence[SourceFrame]):
             return frame
 
 
-def dataset_name(source: RobomimicSource) -> str:
+def dataset_name(task: str) -> str:
     """`robomimic_<task>`, as names of datasets are written."""
-    return re.sub(r"[^a-z0-9_]+", "_", f"robomimic_{source.task}".lower()).strip("_")
+    return re.sub(r"[^a-z0-9_]+", "_", f"robomimic_{task}".lower()).strip("_")
 
 
 def _path(key: str, ending: str = "") -> str:

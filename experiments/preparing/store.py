@@ -86,7 +86,7 @@ def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
     from data_pipelines.sources.source import same_rate
 
     for spec, path in sources:
-        own = read_rate(path, spec.split, study.store.corrupt)
+        own = read_rate(path)
         if own is not None and not same_rate(own, spec.hz):
             say(
                 f"note: {spec.name}: its files say {own:g} Hz, but its registry entry {spec.hz:g} Hz, which is used; "

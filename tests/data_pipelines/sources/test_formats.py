@@ -22,10 +22,10 @@ from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources import lerobot_dataset
+from data_pipelines.sources import lerobot_dataset, lerobot_meta
 from data_pipelines.sources.joined import JoinedSource
 from data_pipelines.sources.lerobot import LeRobotSource
-from data_pipelines.sources.open import find_format, open_source, source_name
+from data_pipelines.sources.open import find_format, open_source, read_rate, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.robomimic import RobomimicSource
@@ -180,6 +180,23 @@ def test_hidden_files_of_the_meta_folder_are_no_part_of_the_dataset(tmp_path, mo
     assert source.fingerprint() == before and LeRobotSource(root).identity() == identity
     (root / "meta" / "episodes_stats.jsonl").write_text("{}")
     assert source.fingerprint() == before != open_source(root).fingerprint()
+
+
+def test_the_meta_folder_is_read_again_only_where_it_changed(tmp_path, monkeypatch):
+    """A command opens a dataset several times: to check it, to train a tokenizer and to tokenise."""
+    root, read = write_lerobot(tmp_path / "toy-arm", "v2.1"), []
+    monkeypatch.setattr(lerobot_meta, "_tasks", lambda *given: read.append(given) or {})
+    assert read_rate(root) == 10 and not read, "the rate is known without the episodes"
+    fingerprint = open_source(root).fingerprint()
+    assert open_source(root).fingerprint() == fingerprint and len(read) == 1
+    path = root / "meta" / "episodes.jsonl"
+    path.write_text(path.read_text().replace('"length": 12', '"length": 11'))
+    assert open_source(root).steps().tolist() == [11, 9] and len(read) == 2
+
+
+def test_the_name_and_the_rate_of_a_robomimic_file_need_no_demonstration(tmp_path):
+    path = write_robomimic(tmp_path / "image.hdf5", images=False)
+    assert (source_name(path), read_rate(path)) == ("robomimic_lift", 20)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
