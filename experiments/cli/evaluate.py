@@ -19,7 +19,7 @@ from experiments.setting import UNSET, Setting, make_setting, require_local, sho
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
-from hma_jax.config.json import from_dict, to_strict_json
+from hma_jax.config.json import from_dict, to_dict, to_strict_json
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -84,7 +84,11 @@ def evaluate_model(
 
 
 def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: bool) -> None:
-    from experiments.running.run_trial import evaluate_on, open_prepared_data, write_evaluation
+    import jax
+
+    from experiments.running.provenance import closure_hash, trial_closure
+    from experiments.running.run_trial import EVALUATING, evaluate_on, open_prepared_data, write_evaluation
+    from hma_jax.evaluation.parts import Parts
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
 
@@ -122,6 +126,9 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     made_from = describe_evaluation(trained, names, prepared, setting.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)
+    execution = setting.study.execution
+    depends = lambda: [made_from.identity(), to_dict(execution), closure_hash(trial_closure())]
+    parts = Parts(place / EVALUATING, depends) if jax.process_count() == 1 else None
     with step(f"evaluate {short(run)}") as update:
         evaluation = evaluate_on(
             names,
@@ -131,8 +138,9 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             prepared,
             setting.study.eval,
             masking.setting,
-            execution=setting.study.execution,
+            execution=execution,
             progress=lambda phase, done, total: update(done, total, phase),
+            parts=parts,
         )
     if not is_writer():
         return
@@ -146,6 +154,8 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     write_evaluation(place, evaluation)
     write_file(place / MEANS, to_strict_json(summary.to_dict()))
     made_from.save(place, STAMP)
+    if parts is not None:
+        parts.remove()
     wrote(place / MEANS, place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
 
 

@@ -28,7 +28,7 @@ from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 from hma_jax.config import ConfigError
 
-BEGIN_ANEW = tuple("evaluate compare report status fit convert bench plan coord-check play check branch".split())
+BEGIN_ANEW = tuple("compare report status fit convert bench plan coord-check play check branch".split())
 """Commands that keep nothing of what they had begun when they are stopped."""
 
 app = Commands()

@@ -4,6 +4,7 @@ A trial's directory holds
     job.json        the trial and its provenance (written by the runner)
     run/            the training run (`hma_jax.training`): log, checkpoints
     samples.npz     true and predicted frames of a few windows per dataset, where frames are predicted
+    evaluating/     of an evaluation that has not ended: what was measured, from which the next attempt goes on
     windows.parquet every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
     provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
     result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
@@ -20,19 +21,21 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.running.attempts import RUN
 from experiments.running.machine import describe_machine
-from experiments.running.provenance import record_end
+from experiments.running.provenance import read_record, record_end
 from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.sealed import SAMPLES
 from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
 from hma_jax.config.json import to_dict
+from hma_jax.training.run_lock import CHECKPOINTS
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.evaluation.evaluate import Evaluation
+    from hma_jax.evaluation.parts import Parts
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
     from hma_jax.tokenizers.base import Tokenizer
@@ -40,6 +43,8 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(phase, done, total)."""
+
+EVALUATING = "evaluating"
 
 LAST = 0.1
 """The part of a run's steps over which its training loss is averaged."""
@@ -178,8 +183,9 @@ def evaluate_on(
     execution: ExecutionConfig = ExecutionConfig(),
     first: int | None = None,
     progress: Progress = lambda *_: None,
+    parts: Parts | None = None,
 ) -> Evaluation:
-    """The protocol over the frozen windows of `names`, or over the `first` ones of each.
+    """The protocol over the frozen windows of `names`, or over the `first` ones of each; `parts` are done already.
 
     Counterfactual PSNR needs simulated frames for this very prompt, and generated ones. What was trained for actions
     alone is shown none of other episodes.
@@ -215,6 +221,7 @@ def evaluate_on(
         setting=setting,
         execution=execution,
         progress=lambda done: progress("evaluating", done, windows),
+        parts=parts,
     )
 
 
@@ -238,6 +245,7 @@ def run_trial(
 
     from data_pipelines.loading.selection import count_trajectories, training_table
     from experiments.running.sealed import write_result
+    from hma_jax.evaluation.parts import Parts
     from hma_jax.model.flops import train_flops_per_step
     from hma_jax.model.hma import declare_model
     from hma_jax.runtime.processes import is_writer
@@ -260,7 +268,8 @@ def run_trial(
     del trained, beginning  # moments and initial parameters would lie on the devices beside what evaluation computes
 
     subject = (trial.model, table, prepared, trial.eval, trial.train.masking.setting)
-    evaluation = evaluate_on(trial.evaluated, weights, *subject, execution=execution, progress=progress)
+    parts = Parts(directory / EVALUATING, lambda: _evaluated(trial, prepared, directory, execution))
+    evaluation = evaluate_on(trial.evaluated, weights, *subject, execution=execution, progress=progress, parts=parts)
     del weights
     untrained = None
     if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
@@ -287,7 +296,17 @@ def run_trial(
         write_evaluation(directory, evaluation)
         record_end(directory)
         write_result(directory, result)
+        parts.remove()
     return result
+
+
+def _evaluated(trial: Trial, prepared: PreparedData, directory: Path, execution: ExecutionConfig) -> list[Any]:
+    """On what the numbers of a trial's evaluation depend: sources, settings, windows and weights."""
+    from hma_jax.training.hashes import NAME as LIST
+
+    record, weights = read_record(directory), directory / RUN / CHECKPOINTS / str(trial.train.steps) / LIST
+    hashes = weights.read_text() if weights.exists() else ""
+    return [record and record.code, to_dict(trial), to_dict(execution), prepared.manifest.hash(), hashes]
 
 
 def last_loss(losses: Sequence[float]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from jax.sharding import Mesh, PartitionSpec
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.images import Decoder, Sample, ToImages, image_metrics, make_clips
 from hma_jax.evaluation.lpips import load_lpips
+from hma_jax.evaluation.parts import Part, Parts
 from hma_jax.evaluation.protocol import Predicted, make_predictor
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable, join
@@ -71,13 +72,15 @@ def evaluate(
     execution: ExecutionConfig = ExecutionConfig(),
     samples_per_dataset: int = 1,
     progress: Callable[[int], None] | None = None,
+    parts: Parts | None = None,
 ) -> Evaluation:
     """Applies the protocol to `batches`, equal in shape.
 
     A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's) and valid
     (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the
-    model was trained for. `progress` is called with the number of windows done so far. With several processes
-    (`runtime.processes`) all call this with the same batches, and each gets the whole result. A model that was trained
+    model was trained for. `progress` is called with the number of windows done so far. Batches that are in `parts`
+    are not measured again, and what others give is added to it. With several processes (`runtime.processes`) all call
+    this with the same batches, and each gets the whole result; they measure every batch. A model that was trained
     for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for incomplete
     batches, unknown ids or robots and parameters of another model, for a model whose predictions are not finite, or as
     `make_predictor` and `lpips.load_lpips`.
@@ -93,9 +96,15 @@ def evaluate(
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
     metric_params, units = lay_out((metric_params, table.scale()), replicated(mesh))
 
-    def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
+    if jax.process_count() > 1:  # they would have to agree on what each finds on its disk
+        parts = None
+
+    def dispatched() -> Iterator[tuple[dict[str, Any], Part | tuple[dict[str, jax.Array], Predicted | None]]]:
         compiled = None
-        for batch in batches:
+        for n, batch in enumerate(batches):
+            if parts is not None and (part := parts.read(n)) is not None:
+                yield batch, part
+                continue
             missing = [name for name in (*REQUIRED_ARRAYS, "dataset", "valid") if name not in batch]
             require(not missing, f"a batch to evaluate lacks {', '.join(missing)}")
             require_known(model, table, *(np.asarray(batch[name]) for name in ("tokens", "actions", "embodiment")))
@@ -113,12 +122,17 @@ def evaluate(
 
     tables: list[WindowTable] = []
     samples: dict[str, list[Sample]] = {}
-    for batch, (found, predicted) in one_ahead(dispatched()):
-        tables.append(_rows_of(batch, found))
-        for row in np.flatnonzero(batch["valid"]).tolist() if predicted is not None else ():
-            own = samples.setdefault(batch["dataset"][row], [])
-            if len(own) < samples_per_dataset:
-                own.append(_sample(batch, predicted, row))
+    for n, (batch, found) in enumerate(one_ahead(dispatched())):
+        if isinstance(found, Part):
+            part = found
+        else:
+            left = {name: samples_per_dataset - len(samples.get(name, ())) for name in set(batch["dataset"])}
+            part = Part(_rows_of(batch, found[0]), _samples(batch, found[1], left))
+            if parts is not None:
+                parts.add(n, part)
+        tables.append(part.windows)
+        for name, sample in part.samples:
+            samples.setdefault(name, []).append(sample)
         if progress is not None:
             progress(sum(map(len, tables)))
     windows = join(tables)
@@ -184,6 +198,19 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: Setting) 
         f"a window of {batch['dataset'][row]} has {real[row]} frames, so with {what} there is nothing to predict; "
         f"{advice}",
     )
+
+
+def _samples(
+    batch: dict[str, Any], predicted: Predicted | None, left: dict[str, int]
+) -> tuple[tuple[str, Sample], ...]:
+    """The first windows of each dataset, at most as many as are `left` to take; none of a model without frames."""
+    found = []
+    for row in np.flatnonzero(batch["valid"]).tolist() if predicted is not None else ():
+        name = str(batch["dataset"][row])
+        if left[name] > 0:
+            left[name] -= 1
+            found.append((name, _sample(batch, predicted, row)))
+    return tuple(found)
 
 
 def _sample(batch: dict[str, Any], predicted: Predicted, row: int) -> Sample:
