@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -32,6 +33,9 @@ from experiments.preparing import tokenizer, windows
 from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.convert import read_official, write_run
+from hma_jax.evaluation import evaluate as evaluation
+from hma_jax.evaluation.parts import Parts
+from hma_jax.evaluation.windows import WindowTable
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
 from tests.data_pipelines.fakes import make_spec, write_rlds
@@ -654,3 +658,26 @@ def test_a_path_that_is_not_utf8_is_refused_at_the_start(tmp_path, monkeypatch, 
     monkeypatch.chdir(latin)
     assert main(["study", *SMOKE, "--out", "out"]) == 2
     assert "caf\\xe9 is not UTF-8" in capsys.readouterr().err and not any(latin.iterdir())
+
+
+def test_an_evaluation_that_was_stopped_goes_on(study, tmp_path, monkeypatch):
+    out, data = study
+    command = ["evaluate", str(out / "model"), *SMOKE, "--out", str(out), *map(str, data), "--set", "eval.batch=1"]
+    assert main([*command, "--to", str(tmp_path / "whole")]) == 0
+    to, sent, put = tmp_path / "stopped", [], evaluation._put
+    monkeypatch.setattr(evaluation, "_put", lambda *batch: sent.append(batch) or put(*batch))
+
+    class Stopped(Parts):
+        def add(self, n, part):
+            super().add(n, part)
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hma_jax.evaluation.parts.Parts", partial(Stopped, every=0))
+        assert main([*command, "--to", str(to)]) == 130
+    assert sorted(p.name for p in (to / "evaluating").iterdir()) == ["0.npz", "made_from"]
+    sent.clear()
+    assert main([*command, "--to", str(to)]) == 0 and not (to / "evaluating").exists()
+    assert len(sent) == len(WindowTable.load(to / "windows.parquet")) - 1, "the first was not measured again"
+    for name in ("evaluation.json", "evaluation.made_from.json"):
+        assert (to / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
