@@ -88,7 +88,11 @@ def advance_each(
 
     filling_B = episodes.count <= model.config.frames - 1
     filled, slid = unless_none(filling_B, "filling"), unless_none(~filling_B, "sliding")
-    return choose(filling_B, filled, slid)
+    new, frames = choose(filling_B, filled, slid)
+    if decode.slide == "exact":
+        # Past the window no pass reads an episode's cache: all take what filling leaves, and no cache is copied.
+        new = new._replace(cache=filled[0].cache)
+    return new, frames
 
 
 def choose(which_B: jax.Array, new: T, old: T) -> T:

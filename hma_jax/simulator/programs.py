@@ -2,7 +2,7 @@
 
 `reset_from_images`, `reset_from_tokens`, `advance` and `take` each map the state of all episodes to a new one; all but
 the last donate it. The first three work on some of the episodes, and are compiled once per power of two of how many
-(`padded`): the other episodes cost nothing.
+(`padded`): the other episodes cost nothing. Advancing all of them is a program of its own, which copies no state.
 """
 
 from __future__ import annotations
@@ -93,12 +93,13 @@ class Programs:
             return state, tokens, seen
 
         def advance(
-            weights: ProgramParams, state: Episodes, rows_n: jax.Array, chunk_nU: jax.Array, seed_n: jax.Array
+            weights: ProgramParams, state: Episodes, rows_n: jax.Array | None, chunk_nU: jax.Array, seed_n: jax.Array
         ) -> tuple[Episodes, jax.Array, jax.Array]:
+            """Advances the episodes `rows_n`; None: all, in order."""
             keys = jax.vmap(key_of)(seed_n)
-            before, hma = take(state, rows_n), declared.merge(weights.model)
+            before, hma = state if rows_n is None else take(state, rows_n), declared.merge(weights.model)
             new, frames = advance_each(hma, before, chunk_nU, keys, decode, hidden=hidden)
-            return put(state, rows_n, new), frames, to_images(weights, frames)
+            return new if rows_n is None else put(state, rows_n, new), frames, to_images(weights, frames)
 
         self.reset_from_images = jax.jit(reset_from_images, donate_argnums=1)
         self.reset_from_tokens = jax.jit(reset_from_tokens, donate_argnums=1)

@@ -274,7 +274,7 @@ class Simulator:
         for i, b in enumerate(rows):
             chunk_nU[i, : chunks[b].size] = chunks[b].ravel()
         seeds = np.array([self._running_episode(b).seed for b in rows], np.uint32)
-        rows_n = np.array(rows, np.int32)
+        rows_n = None if len(chunks) == len(self) else np.array(rows, np.int32)
         with self._donating_state():
             state, tokens, seen = self._programs.advance(self._programs.weights, self._state, rows_n, chunk_nU, seeds)
             tokens, seen = np.asarray(tokens), np.asarray(seen)
@@ -305,9 +305,10 @@ class Simulator:
         require(
             1 <= together <= len(self), f"between 1 and {len(self)} episodes can be stepped together, got {together}"
         )
-        rows_n = np.array(padded(list(range(together)), len(self)), np.int32)
-        chunk_nU = np.zeros((len(rows_n), self.model.table.action_width), np.float32)
-        seeds, state = np.zeros(len(rows_n), np.uint32), self._programs.empty()
+        rows = padded(list(range(together)), len(self))
+        rows_n = None if together == len(self) else np.array(rows, np.int32)
+        chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
+        seeds, state = np.zeros(len(rows), np.uint32), self._programs.empty()
         jax.block_until_ready(self._programs.advance(self._programs.weights, state, rows_n, chunk_nU, seeds))
 
     # --- Going back, and apart ---------------------------------------------------------------------

@@ -42,5 +42,6 @@ def warm_up_more(
 
 
 def sizes(episodes: int) -> list[int]:
-    """Batch sizes of the programs that advance any number of so many episodes."""
-    return sorted({len(padded(list(range(together)), episodes)) for together in range(1, episodes + 1)})
+    """How many each of the programs that advance any number of so many episodes advances at most."""
+    numbers = range(1, episodes + 1)
+    return list({(len(padded(list(range(n)), episodes)), n == episodes): n for n in numbers}.values())

@@ -13,9 +13,11 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.generation import rollout
+from hma_jax.model.hma import declare_model
 from hma_jax.runtime.arrays import write_arrays
 from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.episode import as_arrays, from_arrays
+from hma_jax.simulator.programs import Programs
 from hma_jax.simulator.starts import load_starts, save_starts
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
@@ -90,6 +92,41 @@ def test_nothing_is_compiled_once_an_episode_is_under_way():
     everything(4)
     everything(9)
     assert not compiled, f"{len(compiled)} programs were compiled again"
+
+
+def test_what_advances_any_number_of_episodes_was_compiled_before(monkeypatch):
+    sim, asked = simulator(episodes=4), set()
+    sim.reset([start(b % 3, 1) for b in range(4)])
+    monkeypatch.setattr(sim, "_programs", copy(sim._programs))  # others share them
+
+    def recorded(weights, state, rows_n, chunk_nU, seed_n):
+        asked.add((rows_n is None, len(chunk_nU)))
+        frames = np.zeros((len(chunk_nU), *sim._programs.token_shape), np.int32)
+        return state, frames, np.zeros((len(chunk_nU), *sim.images.shape[1:]), np.uint8)
+
+    monkeypatch.setattr(sim._programs, "advance", recorded)
+    warm_up_more(sim, 0)
+    compiled = set(asked)
+    asked.clear()
+    for together in range(1, 5):
+        sim.step([chunks_of(b % 3, 1)[0] if b < together else None for b in range(4)])
+    assert asked == compiled == {(False, 1), (False, 2), (False, 4), (True, 4)}
+
+
+def test_caches_are_not_copied_in_vain():
+    """Past the window no pass reads the cache. A program that advances all episodes holds activations and the cache of
+    the window that it computes, one that advances some of them those episodes' too; both held more."""
+    model, tokenizer = parts()
+    config = replace(CONFIG, layers=32)  # so that caches are large beside activations
+    declared = declare_model(config, TABLE)
+    deep = Model(replace(model.run, model=config, params=declared.shapes()), declared, model.execution)
+    programs = Programs(deep, tokenizer, 8, DECODE)
+    state = programs._shapes
+    chunk_nU, seed_n = np.zeros((8, TABLE.action_width), np.float32), np.zeros(8, np.uint32)
+    cache = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.cache.layers))
+    for rows_n, caches in ((None, 3), (np.arange(8, dtype=np.int32), 4)):
+        compiled = programs.advance.lower(programs.weights, state, rows_n, chunk_nU, seed_n).compile()
+        assert compiled.memory_analysis().temp_size_in_bytes < caches * cache
 
 
 def run(sim, plan: np.ndarray, b: int = 0) -> np.ndarray:
