@@ -19,8 +19,9 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.cli.main import main
-from experiments.running.attempts import AttemptEnd, outcome
-from experiments.running.launchers import ray, slurm
+from experiments.running.attempts import OUTPUT, AttemptEnd, outcome
+from experiments.running.launchers import base, ray, slurm
+from experiments.running.launchers.local import LocalLauncher
 from experiments.running.launchers.ray import RayLauncher, RaySettings
 from experiments.running.launchers.registry import LAUNCHERS, LauncherOptions, launcher_class
 from experiments.running.launchers.remote import Attempt
@@ -490,3 +491,21 @@ def test_without_the_engine_nothing_is_prepared(tmp_path, monkeypatch, capsys):
     assert main(["sweep", "width", "--preset", "smoke", "--out", str(tmp_path / "out"), "--launcher", "slurm"]) == 2
     assert "--launcher slurm needs submitit: pip install 'hma-jax[slurm]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_an_attempt_that_is_killed_because_it_does_not_stop_is_not_said_to_be_out_of_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(base, "GRACE_SECONDS", 0.2)
+    deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
+    place = LocalLauncher(tmp_path, 1, command=lambda directory: [sys.executable, "-c", deaf])
+    place.pause = 0.01
+    directory = tmp_path / "trial"
+    directory.mkdir()
+    handles = place.launch([directory])
+    while not (directory / OUTPUT).exists() or not (directory / OUTPUT).read_text():
+        time.sleep(0.01)
+    (ended,) = place.stop(handles)
+    state = outcome(directory, ended)
+    assert state.event == "lost" and "memory" not in state.message
+    assert "it had not saved 0.2 s after it was asked to stop, and was killed" in state.message
+    again = place.launch([directory])  # its slot is free
+    place.kill(again)

@@ -71,8 +71,10 @@ class Launcher(ABC):
         deadline = time.monotonic() + GRACE_SECONDS
         while time.monotonic() < deadline and any(self.ended(h) is None for h in handles):
             time.sleep(self.pause)
-        self.kill([h for h in handles if self.ended(h) is None])
-        return [self.ended(h) or AttemptEnd(None, "it did not end when it was asked to") for h in handles]
+        late = [h for h in handles if self.ended(h) is None]
+        self.kill(late)
+        killed = AttemptEnd(None, f"it had not saved {GRACE_SECONDS:g} s after it was asked to stop, and was killed")
+        return [ended if (ended := self.ended(h)) and h not in late else killed for h in handles]
 
     def place(self, handle: Any, start: Mapping[str, Any] | None) -> str | None:
         """Where an attempt ran, of what its process said at its `start`; None if that is not known."""
