@@ -81,7 +81,7 @@ def test_help_needs_no_jax():
         (["evaluate", "{empty}", "--preset", "smoke"], 2, "checkpoint"),
         (["tokenizer", "import", "{empty}", "--out", "{empty}/t"], 2, "{empty}/config.json"),
         (["tokenizer", "import", "{empty}/no.ckpt", "--out", "{empty}/t"], 2, "at {empty}/no.ckpt"),
-        (["tokenizer", "import", "{file}", "--out", "{empty}/t"], 2, "{file}: not a zip file"),
+        (["tokenizer", "import", "{file}", "--out", "{empty}/t"], 2, "{file}: not a readable zip file"),
         (["tokenizer", "pixels", "--out", "{file}"], 2, "{file} exists already"),
         (["tokenizer", "pixels", "--out", "{empty}/t", "--patch", "7"], 2, "64 is not a multiple of 7"),
         (["tokenize", "--preset", "smoke", "--tokenizer", "{empty}"], 2, "hma tokenizer import"),
