@@ -166,11 +166,13 @@ def adapt_model(
     from experiments.running.initial_model import add_robots
     from experiments.running.run_trial import open_prepared_data
     from experiments.trainable import require_only
-    from hma_jax.training.runs import load_run
 
-    trained = load_run(source, "auto")
+    run = run or arguments.anywhere().out / "model"
+    trained, gone = _load_initial(source, run), not source.exists()
     setting = setting_of(source, trained, arguments)
-    study, new = setting.study, new_datasets(trained, setting)
+    study = setting.study
+    # Of a source that is gone `run` itself is read, which has the new robots already.
+    new = list(trained.train.only) or study.dataset_names() if gone else new_datasets(trained, setting)
     require(
         bool(new),
         f"{short(source)} already knows {few(study.dataset_names())}: there is nothing to add. To train it on: "
@@ -181,7 +183,6 @@ def adapt_model(
         "leave out train.only: `hma adapt` trains only the new robots' parameters, or all with --everything",
     )
     _say_average(setting)
-    run = run or setting.workspace.root / "model"
     require_other_directory(source, run)
     origin = _check(setting, run, trajectories, options, trained)
     train = dataclasses.replace(study.train, seed=study.seeds[0], only=() if everything else tuple(new))
@@ -189,7 +190,10 @@ def adapt_model(
     _require_devices(setting)
     _prepare(setting, replace)
     trial = dataclasses.replace(_single_trial(setting, trajectories), train=train)
-    beginning = add_robots(trained, trial, open_prepared_data(setting.workspace)) | {"origin": origin}
+    if gone:
+        beginning = {"table": trained.table, "initial": trained.params, "origin": origin}
+    else:
+        beginning = add_robots(trained, trial, open_prepared_data(setting.workspace)) | {"origin": origin}
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
     _train(setting, trial, run, options, **beginning)
@@ -415,7 +419,8 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
         )
     if not is_writer():
         return
-    console.print(f"loss {result.losses[-1]:.4f} after {counted(len(result.losses), 'step')}")
+    loss = f"{result.losses[-1]:.4f}" if result.losses else "unknown (the log is lost)"
+    console.print(f"loss {loss} after {counted(steps, 'step')}")
     profiles = _say_profiled(run, options.trace or 0, result.resumed_from, steps)
     wrote(run, *profiles, then=setting.command("evaluate", run.absolute()))
 

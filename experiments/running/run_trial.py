@@ -83,6 +83,7 @@ def train_trial(
     execution: ExecutionConfig = ExecutionConfig(),
     options: RunOptions = UNWATCHED,
     keep: tuple[int, ...] = (),
+    whole_log: bool = False,
     progress: Progress = lambda *_: None,
     table: EmbodimentTable | None = None,
     initial: Params | None = None,
@@ -145,6 +146,7 @@ def train_trial(
             keep_steps=keep,
             keep_every=options.keep_every,
             skip_damaged=options.skip_damaged,
+            whole_log=whole_log,
             trace_steps=options.trace or 0,
         ),
         validation=Validation(validate_every, lambda: validation_batches(trial, prepared, table, execution))
@@ -259,7 +261,14 @@ def run_trial(
     table = beginning["table"]
     declared = declare_model(trial.model, table)
     trained = train_trial(
-        trial, prepared, directory / RUN, execution=execution, keep=keep, progress=progress, **beginning
+        trial,
+        prepared,
+        directory / RUN,
+        execution=execution,
+        keep=keep,
+        whole_log=True,  # the result has the mean loss of the last steps, and seals the log
+        progress=progress,
+        **beginning,
     )
 
     weights, loss = trained.state.weights, last_loss(trained.losses)

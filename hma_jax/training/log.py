@@ -6,17 +6,20 @@ Files of a resumed run are truncated after the step that it resumes from.
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from hma_jax.config import ConfigError
+from hma_jax.config import require
 from hma_jax.runtime.files import IO_ERRNOS, write_file
 from hma_jax.runtime.processes import is_writer
 from hma_jax.training.checkpoints import SaveError
 from hma_jax.training.tensorboard import TensorBoardWriter
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, dict[str, float]], None]
 """Called as progress(step, steps, metrics) after every step; once the run was validated, with the latest
@@ -66,18 +69,23 @@ class RunLog:
         peak_flops: float | None,
         clock: Callable[[], float],
         progress: Progress | None,
+        whole: bool = False,
     ):
-        """`every` steps there is a line of timing. Raises ConfigError if the log lacks steps up to `start`."""
+        """`every` steps there is a line of timing. With `whole`, raises ConfigError if the log lacks steps up to
+        `start`: the checkpoint does not need it."""
         self.run_dir, self.steps, self.every = run_dir, steps, every
         self.flops_per_step, self.peak_flops = flops_per_step, peak_flops
         self.clock, self.progress = clock, progress
         kept = self._cut("metrics.jsonl", start)
         self.losses = [record["loss"] for record in kept]
-        if len(kept) != start:
-            raise ConfigError(
-                f"{run_dir / 'metrics.jsonl'} has only {len(kept)} of the {start} steps of the run's checkpoint, so "
-                "it was edited; train in a new run directory"
+        self.missing = start - len(kept)
+        if self.missing:
+            lacks = f"{run_dir / 'metrics.jsonl'} has only {len(kept)} of the {start} steps of the run's checkpoint"
+            require(
+                not whole,
+                f"{lacks}, and a result is made from all of them: bring the file back, or remove {run_dir} to train again",
             )
+            log.warning("%s; the run goes on from the checkpoint, without the others in its log", lacks)
         self._cut("timing.jsonl", start)
         self._cut("validation.jsonl", start)
         self.validation: dict[str, float] = {}
@@ -88,11 +96,11 @@ class RunLog:
             self.tensorboard = TensorBoardWriter(run_dir / "tensorboard", start + 1)
 
     def _cut(self, name: str, step: int) -> list[dict[str, Any]]:
-        """Drops what comes after `step`, and a torn line. Returns the records kept."""
+        """Drops what comes after `step`, and torn lines. Returns the records kept."""
         path = self.run_dir / name
         if not path.exists():
             return []
-        before = path.read_text()
+        before = path.read_text(errors="replace")
         kept = _read_until(before, step)
         after = "".join(json.dumps(record) + "\n" for record in kept)
         if after != before:
@@ -114,7 +122,7 @@ class RunLog:
 
     def write_start(self, record: Mapping[str, Any]) -> None:
         """A line of execution.jsonl: every start of the run, never cut."""
-        self._append("execution.jsonl", record)
+        self._append("execution.jsonl", {**record, **({"steps_missing_in_log": self.missing} if self.missing else {})})
         self.flush()
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
@@ -185,14 +193,14 @@ class RunLog:
 
 
 def _read_until(text: str, step: int) -> list[dict[str, Any]]:
-    """The records of JSON lines up to `step`; the last line may be torn."""
+    """The records of JSON lines up to `step`, without lines that are none: the last may be torn by a kill, after all
+    that was flushed before the checkpoint."""
     kept: list[dict[str, Any]] = []
-    for line in text.splitlines():
+    for line in text.split("\n"):
         try:
             record = json.loads(line)
-        except json.JSONDecodeError:
-            break  # torn by a kill; everything up to the checkpoint was flushed before it
-        if record["step"] > step:
-            break
-        kept.append(record)
+            if record["step"] <= step:
+                kept.append(record)
+        except (ValueError, TypeError, KeyError):
+            continue
     return kept

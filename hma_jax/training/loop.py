@@ -66,6 +66,7 @@ class LoopOptions:
     keep_every: int = 0  # steps: saved after every so many too, and kept
     skip_damaged: bool = False  # go on from the newest checkpoint that is whole
     log_every: int = 10  # steps between lines of timing.jsonl
+    whole_log: bool = False  # refuse to go on where metrics.jsonl lacks steps: a result is made from all of them
     trace_steps: int = 0  # so many steps after a start are profiled
     flops_per_step: float = 0.0  # by formula, for achieved FLOP/s; 0: unknown
     peak_flops: float | None = None  # of all devices together, for MFU
@@ -104,7 +105,7 @@ class RunInfo:
 @dataclass(frozen=True)
 class FitResult:
     state: Any = field(repr=False)
-    losses: list[float]  # one per step, from the first step of the run (processes but 0: of this start)
+    losses: list[float]  # one per step that the log has, from the run's first (processes but 0: of this start)
     seconds: float  # spent in steps by this process, without compiling, validating and writing a profile
     compile_seconds: float
     resumed_from: int
@@ -162,6 +163,7 @@ def fit(
             peak_flops=options.peak_flops,
             clock=clock,
             progress=progress,
+            whole=options.whole_log,
         )
         traced = options.trace_steps if is_writer() else 0
         with closing(log), StepTrace(run_dir / PROFILE, traced, start, steps) as trace:

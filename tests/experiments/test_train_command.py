@@ -370,11 +370,21 @@ def test_robots_are_added_to_the_averaged_weights_of_a_run_that_keeps_them(tmp_p
         patch.setattr(model_training, "make_train_step", lambda *_: step)
         averaged = ("--set", "train.ema_decay=0.5")
         assert main(["train", *SMOKE, "--out", str(tmp_path / "a"), "--data", str(known), *averaged]) == 0
-    assert main(["adapt", str(source), *SMOKE, "--out", str(tmp_path / "b"), "--data", str(new)]) == 0
+    adapt = ["adapt", str(source), *SMOKE, "--out", str(tmp_path / "b"), "--data", str(new)]
+    adapt += ["--set", "train.optimizer.schedule=constant", "--set"]
+    assert main([*adapt, "train.steps=1"]) == 0
     assert load_run(adapted).table.names == (ARM.name, BASE.name)
     tables = [load_run(*which).params["embed"]["tables"] for which in ((adapted,), (source, "ema"), (source, "last"))]
     np.testing.assert_array_equal(tables[0], tables[1])
     assert not np.array_equal(tables[1], tables[2])
+
+    shutil.rmtree(tmp_path / "a")
+    before = load_run(adapted)
+    assert main([*adapt, "train.steps=2", "--everything"]) == 2  # not as it began
+    assert main([*adapt, "train.steps=2"]) == 0
+    after = load_run(adapted)
+    assert (after.step, after.provenance, after.train.only) == (2, before.provenance, (BASE.name,))
+    assert after.table == before.table
 
 
 def make_released(root: Path, *robots: tuple[str, int, int]) -> Path:

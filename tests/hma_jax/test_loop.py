@@ -9,6 +9,7 @@ import math
 import multiprocessing
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -224,7 +225,7 @@ def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path)
 
 
 def test_a_log_that_is_cut_is_on_the_disk_before_the_old_one_is_gone(tmp_path: Path, monkeypatch):
-    """Otherwise a loss of power leaves it empty, and a run without its log is refused."""
+    """Otherwise a loss of power leaves it empty."""
     fit_toy(tmp_path, 3, options=EVERY_STEP)
     log = tmp_path / "metrics.jsonl"
     whole, place = log.read_bytes(), log.stat().st_ino
@@ -238,6 +239,23 @@ def test_a_log_that_is_cut_is_on_the_disk_before_the_old_one_is_gone(tmp_path: P
     fit_toy(tmp_path, 3)
     assert log.read_bytes() == whole
     assert [inode for inode, new in renamed if new == log] and {inode for inode, _ in renamed} <= set(synced)
+
+
+def test_a_run_whose_log_is_lost_or_damaged_goes_on_from_its_checkpoint(tmp_path: Path, caplog):
+    fit_toy(tmp_path, 6, options=EVERY_STEP)
+    log = tmp_path / "metrics.jsonl"
+    content = log.read_bytes()
+    log.write_bytes(content[:30] + bytes(60) + content[90:])  # a page of zeros
+    kept = sum(b"\0" not in line for line in log.read_bytes().splitlines())
+    with pytest.raises(ConfigError, match=f"has only {kept} of the 6 steps .*bring the file back, or remove"):
+        fit_toy(tmp_path, 8, options=replace(EVERY_STEP, whole_log=True))
+    assert fit_toy(tmp_path, 8, options=EVERY_STEP).resumed_from == 6
+    assert f"metrics.jsonl has only {kept} of the 6 steps" in caplog.text
+    assert [line["step"] for line in lines(log)][-2:] == [7, 8] and len(lines(log)) == kept + 2
+    assert lines(tmp_path / "execution.jsonl")[-1]["steps_missing_in_log"] == 6 - kept
+
+    log.unlink()
+    assert len(fit_toy(tmp_path, 9, options=EVERY_STEP).losses) == 1
 
 
 # --- One process at a time -------------------------------------------------------------------
