@@ -87,7 +87,8 @@ class StoreConfig:
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """The grid of the learning-rate sweep (`transfer_lr`), on a smaller trial if so declared."""
+    """The grid of the axis `lr`, which asks whether the best learning rate transfers over widths; on a smaller trial if
+    so declared. The axis `transfer`, from robots to others, is set by `DesignConfig`."""
 
     rates: int = 5  # number of learning rates per width; odd, so that one is in the middle
     factor: float = 2.0  # ratio of neighbouring learning rates

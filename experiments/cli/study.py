@@ -73,6 +73,11 @@ def _run(
     setting = make_setting(arguments)
     axes = axes or setting.study.axes
     require(bool(axes), "axes is empty: the study has no sweep to run; set some, such as --set axes=width,datasets")
+    grid = [name for name in arguments.chosen() if name.startswith("transfer.")]
+    require(
+        not grid or any(axis == "lr" or axis.endswith(".py") for axis in axes),
+        f"{', '.join(grid)} would have no effect: it sets the grid of the axis lr, which is not among {', '.join(axes)}",
+    )
     if running.workers is not None and running.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launcher_options = LauncherOptions(running.launcher, running.workers, running.launcher_set)

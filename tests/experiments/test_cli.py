@@ -51,6 +51,7 @@ def test_help_needs_no_jax():
     ("arguments", "code", "message"),
     [
         (["study", "--preset", "smoke", "--set", "model.frame=4"], 2, "did you mean model.frames"),
+        (["sweep", "transfer", "--preset", "smoke", "--set", "transfer.rates=7"], 2, "sets the grid of the axis lr"),
         (["study", "--preset", "paper"], 2, "--data"),
         (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot write to {file}/out: {file} is a file"),
         (["tokenize", "--preset", "smoke", "--out", "/proc/x/y"], 2, "nothing can be written in /proc (No such file"),
