@@ -89,8 +89,8 @@ def image_metrics(
         "finite": _finite(tokens[:, :made], real) & _finite(predicted.random_last, None),
     }
     if lpips_params is not None:
-        found["lpips"] = mean_over_frames(lpips(lpips_params, shown, future), real)
-        found["lpips_copy"] = mean_over_frames(lpips(lpips_params, copied, future), real)
+        for name, of_frames in zip(("lpips", "lpips_copy"), lpips(lpips_params, [shown, before], future), strict=True):
+            found[name] = mean_over_frames(of_frames, real)
     if predicted.other is not None:
         truth, seen = others
         found["finite"] &= _finite(predicted.other, real)

