@@ -13,7 +13,7 @@ from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.progress import TidyTable, console, step, tidy_table
-from experiments.running.attempts import JOB
+from experiments.running.attempts import EVALUATING, JOB
 from experiments.running.sealed import SAMPLES
 from experiments.setting import UNSET, Setting, make_setting, require_local, short, under_another_name
 from experiments.words import few, plus_minus
@@ -87,7 +87,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     import jax
 
     from experiments.running.provenance import closure_hash, trial_closure
-    from experiments.running.run_trial import EVALUATING, evaluate_on, open_prepared_data, write_evaluation
+    from experiments.running.run_trial import evaluate_on, open_prepared_data, write_evaluation
     from hma_jax.evaluation.parts import Parts
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer

@@ -34,7 +34,7 @@ from hma_jax.training.run_lock import CHECKPOINTS, list_steps
 
 JOB, STARTED, PROGRESS = "job.json", "started.json", "progress.json"
 RESULT, FAILURE, OUTPUT = "result.json", "failure.json", "output.txt"
-RUN = "run"
+RUN, EVALUATING = "run", "evaluating"
 """The training run, with its checkpoints."""
 
 CRASHES = (signal.SIGABRT, signal.SIGBUS, signal.SIGSEGV)
@@ -86,8 +86,9 @@ def newest_step(run: Path) -> int:
 
 
 def reached(directory: Path) -> int:
-    """How far a trial has got, of what the next attempt need not do again: its newest checkpoint's step."""
-    return newest_step(directory / RUN)
+    """How far a trial has got, of what the next attempt need not do again: its newest checkpoint's step, and how many
+    batches of its evaluation are measured."""
+    return newest_step(directory / RUN) + len(list((directory / EVALUATING).glob("*.npz")))
 
 
 def is_alive(directory: Path) -> bool:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.running.attempts import RUN
+from experiments.running.attempts import EVALUATING, RUN
 from experiments.running.machine import describe_machine
 from experiments.running.provenance import read_record, record_end
 from experiments.running.run_options import UNWATCHED, RunOptions
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(phase, done, total)."""
-
-EVALUATING = "evaluating"
 
 LAST = 0.1
 """The part of a run's steps over which its training loss is averaged."""

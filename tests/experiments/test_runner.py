@@ -19,7 +19,7 @@ import pytest
 from jax.errors import JaxRuntimeError
 
 from experiments.running import attempts, ledger, runner, shared_disk, trial_main
-from experiments.running.attempts import AttemptEnd, attempt, outcome, read_states
+from experiments.running.attempts import EVALUATING, AttemptEnd, attempt, outcome, reached, read_states
 from experiments.running.children import child_environment
 from experiments.running.launchers import local
 from experiments.running.launchers.base import Launcher
@@ -118,6 +118,14 @@ def test_a_trial_that_gets_further_each_time_is_never_given_up(tmp_path, end):
     """A long one on machines that are taken away every few hours."""
     state = run(tmp_path, [job("long", end, times=TRIES + 1, checkpoints=True)])["long"]
     assert state.event == "finished" and len(starts(tmp_path, "long")) == TRIES + 2
+
+
+def test_windows_that_were_measured_are_progress_too(tmp_path):
+    """An evaluation may take longer than a job."""
+    before = reached(tmp_path)
+    (tmp_path / EVALUATING).mkdir()
+    (tmp_path / EVALUATING / "0.npz").touch()
+    assert reached(tmp_path) > before
 
 
 class Requeueing(Launcher):
