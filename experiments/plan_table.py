@@ -12,13 +12,13 @@ from rich.table import Table
 from experiments.cost import TrialPlan, checkpoint_bytes, plan_trials
 from experiments.done import NOTHING, Done
 from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
-from experiments.progress import tidy_table
 from experiments.running.ledger import FAILED
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial
-from experiments.words import counted, in_thousands
+from experiments.terminal.progress import tidy_table
+from experiments.terminal.words import counted, in_thousands
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
-from experiments.progress import SweepMonitor, console, say
 from experiments.report.draw import draw
 from experiments.running.apart import call_apart
 from experiments.running.attempts import RESULT, RUN, State, newest_step, read_states
@@ -24,11 +23,12 @@ from experiments.running.slots import find_accelerators
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
-from experiments.setting import Setting, short
+from experiments.setting import Setting
 from experiments.study import Study
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
-from experiments.words import few
+from experiments.terminal.progress import SweepMonitor, console, say, short
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.exits import Exit

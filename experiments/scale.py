@@ -7,14 +7,14 @@ from collections.abc import Iterable, Sequence
 
 from experiments.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, get_preset
-from experiments.progress import say
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import find_accelerators
 from experiments.running.trial import Trial
 from experiments.setting import Setting
 from experiments.study import Study, count_trained_on, most_trajectories
 from experiments.sweeps.sweep import Sweep
-from experiments.words import counted, few, in_thousands
+from experiments.terminal.progress import say
+from experiments.terminal.words import counted, few, in_thousands
 from hma_jax.config import TrainConfig
 
 PROCESSOR = 1e12

@@ -18,12 +18,12 @@ from tyro.conf import UseAppendAction, arg
 
 from experiments.override import override
 from experiments.presets import get_preset
-from experiments.program import PROGRAM
-from experiments.progress import say
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace, find_record
 from experiments.study import Study, on_tokenizer, on_user_data, without_equal_caps
-from experiments.words import few
+from experiments.terminal.program import PROGRAM
+from experiments.terminal.progress import say, short
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.run_lock import is_address
 
@@ -244,14 +244,6 @@ def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, .
             "directories that contain <name>/<version>"
         )
     return tuple(str(found[n]) for n in names)
-
-
-def short(path: Path) -> str:
-    """A path as a user would write it here."""
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
 
 
 def _word(value: Any) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 from rich.markup import escape
 
-from experiments.progress import console, tidy_table
+from experiments.terminal.progress import console, tidy_table
 from hma_jax.config.json import to_dict
 
 

@@ -11,7 +11,7 @@ from experiments.done import UNKNOWN
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
-from experiments.words import few
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, MeshConfig, TrainConfig, require
 
 

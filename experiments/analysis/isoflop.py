@@ -23,7 +23,7 @@ from scipy.special import fdtrc  # not scipy.stats, which takes most of a second
 
 from experiments.analysis.fits import DRAWS, LACK_OF_FIT_P, OPEN_SHARE, Coefficient, interval
 from experiments.analysis.measured import Measurements
-from experiments.words import counted
+from experiments.terminal.words import counted
 
 TOLERANCE = 0.1
 """By which share of a budget a size's nearest measured FLOPs may miss it, beyond the first or last of them."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.words import few
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import WindowTable
 

@@ -18,7 +18,7 @@ from data_pipelines.windows.evalset import EvalManifest, eval_batches, subsample
 from experiments.running.run_trial import PreparedData, open_prepared_data
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
-from experiments.words import few
+from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.evaluation.effects import MIN_EPISODES, Effect, find_effects, make_loss
 from hma_jax.runtime.files import write_file

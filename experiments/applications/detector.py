@@ -36,10 +36,8 @@ from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.settings_file import FILE, pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
-from experiments.boundary import guarded
-from experiments.progress import say, step
-from experiments.setting import short
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import say, short, step, wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.kernels.random import key_of
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
@@ -284,4 +282,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main))
+    sys.exit(exit_code_of(main))

@@ -37,9 +37,8 @@ from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.applications.tables import write_rows
-from experiments.boundary import guarded
-from experiments.progress import console, step
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
@@ -140,4 +139,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main, resumes=False, keeps="what there is of the detector"))
+    sys.exit(exit_code_of(main, resumes=False, keeps="what there is of the detector"))

@@ -49,9 +49,8 @@ from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
-from experiments.boundary import guarded
-from experiments.progress import step
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import step, wrote
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
@@ -260,4 +259,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main))
+    sys.exit(exit_code_of(main))

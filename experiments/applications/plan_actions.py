@@ -56,9 +56,8 @@ from experiments.applications.policies.tasks import Task, find_task, held, world
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
-from experiments.boundary import guarded
-from experiments.progress import Eta, say, step
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_decode
@@ -322,4 +321,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main))
+    sys.exit(exit_code_of(main))

@@ -33,8 +33,8 @@ from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.applications.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
 from experiments.bench.simulate import time_simulator
-from experiments.boundary import guarded
 from experiments.running.machine import describe_machine
+from experiments.terminal.exit_code import exit_code_of
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params
@@ -210,4 +210,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main, resumes=False))
+    sys.exit(exit_code_of(main, resumes=False))

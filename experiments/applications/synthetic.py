@@ -78,11 +78,10 @@ from experiments.applications.policies.policy import Policy
 from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
-from experiments.boundary import guarded
-from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.setting import use_entries
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.files import write_file
@@ -323,4 +322,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main))
+    sys.exit(exit_code_of(main))

@@ -7,9 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import say
-from experiments.setting import UNSET, short
-from experiments.wrote import wrote
+from experiments.setting import UNSET
+from experiments.terminal.progress import say, short, wrote
 
 
 def branch(

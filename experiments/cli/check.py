@@ -7,10 +7,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, say, step, tidy_table
 from experiments.running.workspace import Workspace
 from experiments.setting import UNSET, require_local
-from experiments.words import plus_minus
+from experiments.terminal.progress import console, say, step, tidy_table
+from experiments.terminal.words import plus_minus
 from hma_jax.config import require
 
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from rich.markup import escape
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, tidy_table
-from experiments.words import few, plus_minus
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, tidy_table, wrote
+from experiments.terminal.words import few, plus_minus
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory

@@ -11,8 +11,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli.command_line import Commands
 from experiments.presets import get_preset
-from experiments.progress import say
-from experiments.wrote import wrote
+from experiments.terminal.progress import say, wrote
 from hma_jax.config import DecodeConfig, Dtype, SamplerConfig, Weights
 from hma_jax.config.evaluation import SamplerKind
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from experiments.cli.arguments import StudyOptions
-from experiments.progress import console, say, step, tidy_table
 from experiments.setting import make_setting
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, say, step, tidy_table, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:

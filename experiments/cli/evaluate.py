@@ -12,12 +12,11 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
-from experiments.progress import TidyTable, console, step, tidy_table
 from experiments.running.attempts import EVALUATING, JOB
 from experiments.running.sealed import SAMPLES
-from experiments.setting import UNSET, Setting, make_setting, require_local, short, under_another_name
-from experiments.words import few, plus_minus
-from experiments.wrote import wrote
+from experiments.setting import UNSET, Setting, make_setting, require_local, under_another_name
+from experiments.terminal.progress import TidyTable, console, short, step, tidy_table, wrote
+from experiments.terminal.words import few, plus_minus
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict, to_dict, to_strict_json
 from hma_jax.runtime.files import write_file

@@ -10,10 +10,9 @@ from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
-from experiments.progress import console, say
 from experiments.running.workspace import Workspace, load_record
-from experiments.setting import UNSET, short
-from experiments.wrote import wrote
+from experiments.setting import UNSET
+from experiments.terminal.progress import console, say, short, wrote
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import Eta, console, say, step
 from experiments.setting import UNSET, command, require_local, use_entries
-from experiments.wrote import wrote
+from experiments.terminal.progress import Eta, console, say, step, wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.config.base import require_seed
 

@@ -51,7 +51,7 @@ class Hosts:
         if not settings.several:
             return
         start(settings)
-        from experiments.progress import console
+        from experiments.terminal.progress import console
         from hma_jax.runtime.processes import is_writer
 
         console.quiet = not is_writer()

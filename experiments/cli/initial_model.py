@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from experiments.cli.evaluate import check_tokenizer, tokenizer_mismatch
 from experiments.running.workspace import Workspace
-from experiments.setting import Setting, StudyArguments, make_setting, short
-from experiments.words import few
+from experiments.setting import Setting, StudyArguments, make_setting
+from experiments.terminal.progress import short
+from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.config.json import diff
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, command, use_entries
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, say, step, tidy_table, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from experiments.boundary import guarded
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
 from experiments.cli.branch import branch
@@ -25,7 +24,8 @@ from experiments.cli.play import play
 from experiments.cli.status import status
 from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
-from experiments.program import PROGRAM
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.program import PROGRAM
 from hma_jax.config import ConfigError
 
 BEGIN_ANEW = tuple("compare report status fit convert bench plan coord-check play check branch".split())
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
 
     resumes = not set(arguments[:1]) & set(BEGIN_ANEW)
-    return guarded(work, debug, own_process, resumes=resumes, skipping="--set store.corrupt=skip")
+    return exit_code_of(work, debug, own_process, resumes=resumes, skipping="--set store.corrupt=skip")
 
 
 def _require_utf8(arguments: Sequence[str]) -> None:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from experiments.cli.bench.arguments import Model
-from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, Preset, StudyArguments, make_setting
-from experiments.words import counted
+from experiments.terminal.progress import console, say, step, tidy_table
+from experiments.terminal.words import counted
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
 

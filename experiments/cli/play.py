@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.applications import DRIVEN
-from experiments.progress import console, say
 from experiments.setting import UNSET
-from experiments.words import few
+from experiments.terminal.progress import console, say
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, ExecutionConfig, require
 from hma_jax.runtime.exits import raise_pending_stop
 

@@ -11,9 +11,9 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from experiments.progress import console
-from experiments.setting import UNSET, short
-from experiments.words import counted
+from experiments.setting import UNSET
+from experiments.terminal.progress import console, short
+from experiments.terminal.words import counted
 from hma_jax.config import require
 
 if TYPE_CHECKING:

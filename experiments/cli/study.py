@@ -8,10 +8,10 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningArguments, StudyOptions
-from experiments.progress import console
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.setting import StudyArguments, make_setting
 from experiments.sweeps.registry import AXES, is_file, plan_asked
+from experiments.terminal.progress import console
 from hma_jax.config import ConfigError, require
 
 

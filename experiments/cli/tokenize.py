@@ -14,11 +14,10 @@ from tyro.conf import arg
 from data_pipelines.errors import MAX_LISTED
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.preparing.made_from import Step
-from experiments.progress import console, tidy_table
 from experiments.running.workspace import Busy, Workspace
-from experiments.setting import Setting, make_setting, short
+from experiments.setting import Setting, make_setting
 from experiments.sweeps.sweep import reference_trial
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, short, tidy_table, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:

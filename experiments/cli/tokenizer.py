@@ -10,9 +10,8 @@ from tyro.conf import Positional, arg
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
-from experiments.progress import console, step
-from experiments.setting import Setting, command, make_setting, short
-from experiments.wrote import wrote
+from experiments.setting import Setting, command, make_setting
+from experiments.terminal.progress import console, short, step, wrote
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.shared import BaseTokenizer

@@ -20,14 +20,13 @@ from experiments.cli.initial_model import (
     setting_of,
 )
 from experiments.preparing.made_from import Step, may_replace
-from experiments.progress import console, say, step
 from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
 from experiments.running.workspace import Workspace
-from experiments.setting import UNSET, Setting, StudyArguments, make_setting, short
+from experiments.setting import UNSET, Setting, StudyArguments, make_setting
 from experiments.sweeps.sweep import reference_trial
-from experiments.words import counted, few
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, say, short, step, wrote
+from experiments.terminal.words import counted, few
 from hma_jax.config import require
 from hma_jax.config.json import diff
 from hma_jax.training.run_lock import CHECKPOINTS, require_plain

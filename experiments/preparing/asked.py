@@ -11,9 +11,9 @@ from typing import Any
 
 from data_pipelines.publishing.output_lock import backoff
 from experiments.preparing.sources import Source, check_sources
-from experiments.progress import say
 from experiments.running.workspace import Busy, Workspace
 from experiments.study import Study
+from experiments.terminal.progress import say
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.progress import step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
+from experiments.terminal.progress import step
 
 if TYPE_CHECKING:
     from data_pipelines.suite.spec import EmbodimentSpec

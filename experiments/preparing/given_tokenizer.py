@@ -13,10 +13,10 @@ from data_pipelines.publishing.files import publish
 from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, read_stamp, require_same
 from experiments.preparing.sources import Source, open_source
 from experiments.preparing.tokenizer import HELD_OUT, OF_FRAMES, TRAINED, require_same_trained
-from experiments.progress import say
 from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.words import few
+from experiments.terminal.progress import say
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 

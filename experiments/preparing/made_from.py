@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from experiments.progress import say
-from experiments.words import few
+from experiments.terminal.progress import say
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from experiments.progress import say
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
-from experiments.words import few
+from experiments.terminal.progress import say
+from experiments.terminal.words import few
 from hma_jax.config import require
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from experiments.preparing.sources import (
     say_unreached_rates,
     source_of,
 )
-from experiments.progress import Eta, say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.words import few
+from experiments.terminal.progress import Eta, say, step
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
 

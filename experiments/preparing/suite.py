@@ -7,10 +7,10 @@ from pathlib import Path
 
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source
-from experiments.progress import say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study, SuiteConfig
-from experiments.words import few
+from experiments.terminal.progress import say, step
+from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.runtime.cores import usable_cores
 

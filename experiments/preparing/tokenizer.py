@@ -23,13 +23,13 @@ from experiments.preparing.made_from import (
     say_recorded,
 )
 from experiments.preparing.sources import Source, open_source
-from experiments.progress import console, step
 from experiments.running.closure import closure_hash, trace
 from experiments.running.machine import describe_machine
 from experiments.running.run_options import CHECKPOINTS
 from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.words import plus_minus
+from experiments.terminal.progress import console, step
+from experiments.terminal.words import plus_minus
 from hma_jax.config import TokenizerConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.runtime.files import write_file

@@ -7,11 +7,11 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, dataset_differences, require_same
-from experiments.progress import console, say
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
-from experiments.words import few
+from experiments.terminal.progress import console, say
+from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.config.json import diff
 from hma_jax.runtime.files import write_file

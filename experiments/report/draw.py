@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_pipelines.publishing.output_lock import backoff
-from experiments.progress import console, say
 from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Busy, Record, Workspace, load_record
-from experiments.setting import short
 from experiments.sweeps.registry import AXES, KEPT, plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
-from experiments.words import few
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, say, short, wrote
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.runtime.outputs import make_directory
 

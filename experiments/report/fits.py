@@ -13,7 +13,7 @@ from experiments.analysis.powerlaw import FLOOR
 from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import CurveFit
 from experiments.report.pieces import table
-from experiments.words import counted
+from experiments.terminal.words import counted
 
 VERDICTS = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}
 

@@ -42,7 +42,7 @@ from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, reference_trial, titles
-from experiments.words import counted
+from experiments.terminal.words import counted
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_json
 from hma_jax.runtime.files import write_file

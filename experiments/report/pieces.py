@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from experiments import words
 from experiments.rows import CurvePoint
+from experiments.terminal import words
 
 STILL = (
     "<p class=pause><input type=checkbox id=pause> <label for=pause>clips stand still, at their last frame</label></p>"

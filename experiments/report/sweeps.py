@@ -18,7 +18,7 @@ from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import OVER, USUAL, choose_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
-from experiments.words import counted
+from experiments.terminal.words import counted
 
 HEADINGS = {
     HELD_OUT_LOSS: "nats per token", "perplexity": "perplexity", "diffusion_loss": "diffusion loss",

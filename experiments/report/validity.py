@@ -25,7 +25,7 @@ from experiments.rows import OVERALL, TRAINING_LOSS, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
-from experiments.words import counted
+from experiments.terminal.words import counted
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.controllability import OPTIONAL_METRICS
 from hma_jax.evaluation.summary import Summary, summarise

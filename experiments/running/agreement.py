@@ -13,7 +13,7 @@ from experiments.running.job import read_job
 from experiments.running.provenance import CodeChanged, inputs_of, read_record
 from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
-from experiments.words import few
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.training.run_lock import CHECKPOINTS
 

@@ -20,7 +20,7 @@ from typing import Any
 from experiments.running.closure import Closure, changed, closure_hash, imported_modules, trace
 from experiments.running.machine import describe_machine
 from experiments.running.results_version import RESULTS_VERSION
-from experiments.words import few
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file

@@ -9,10 +9,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.program import PROGRAM
 from experiments.running.migration import migrate
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
+from experiments.terminal.program import PROGRAM
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file

@@ -16,10 +16,10 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, make_ablation
+from experiments.terminal.program import run_sweep
 from hma_jax.config import Conditioning
 
 BOTH: Conditioning = "concat+modulate"

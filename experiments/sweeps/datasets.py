@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.sweep import Sweep, make_sweep
+from experiments.terminal.program import run_sweep
 from hma_jax.config import require
 
 

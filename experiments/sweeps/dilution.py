@@ -10,10 +10,10 @@ Expected outcome: the judged robots lose by as much as their share of the window
 
 from __future__ import annotations
 
-from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.robots import plan_robots
 from experiments.sweeps.sweep import Sweep
+from experiments.terminal.program import run_sweep
 
 
 def plan(study: Study) -> Sweep:

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.study import Study, count_trained_on
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
-from experiments.words import counted, few
+from experiments.terminal.program import run_sweep
+from experiments.terminal.words import counted, few
 from hma_jax.config import require
 
 

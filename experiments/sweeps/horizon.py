@@ -10,9 +10,9 @@ Expected outcome: perplexity falls, and rises again on robots with few trajector
 
 from __future__ import annotations
 
-from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
+from experiments.terminal.program import run_sweep
 
 
 def plan(study: Study) -> Sweep:

@@ -19,11 +19,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, make_ablation, reference_trial
-from experiments.words import counted
+from experiments.terminal.program import run_sweep
+from experiments.terminal.words import counted
 
 REFERENCE, RECALL, MUON, BEST = "reference", "recall", "Muon", "recall, Muon"
 CHAINED, WEIGHED, TENFOLD = f"{BEST}, chained", f"{BEST}, changes thrice", f"{BEST}, changes tenfold"

@@ -17,10 +17,10 @@ import itertools
 import math
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import POINT, STANDARD, Point, Sweep, reference_trial
+from experiments.terminal.program import run_sweep
 from hma_jax.config import MupConfig, require
 
 

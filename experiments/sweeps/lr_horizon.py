@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
-from experiments.words import counted
+from experiments.terminal.program import run_sweep
+from experiments.terminal.words import counted
 from hma_jax.config import require
 
 

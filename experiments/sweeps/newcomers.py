@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.draws import draw_judged
 from experiments.sweeps.robots import require_uniform, robots_trial
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of
+from experiments.terminal.program import run_sweep
 from hma_jax.config import require
 
 

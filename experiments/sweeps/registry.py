@@ -18,8 +18,8 @@ from typing import Any
 from experiments.running.trial import Trial
 from experiments.study import SCALING, Study
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, limit_other_actions
+from experiments.terminal.words import few
 from experiments.user_file import find_function, naming_line
-from experiments.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file

@@ -14,7 +14,7 @@ import numpy as np
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, training_of, trial_id
 from experiments.study import Study
-from experiments.words import counted
+from experiments.terminal.words import counted
 from hma_jax.config import require
 from hma_jax.config.json import diff, stable_hash
 

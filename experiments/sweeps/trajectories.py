@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, make_sweep
+from experiments.terminal.program import run_sweep
 
 
 def plan(study: Study) -> Sweep:

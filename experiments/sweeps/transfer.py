@@ -11,10 +11,10 @@ Expected outcome: flat without transfer, falling perplexity with it. More steps 
 
 from __future__ import annotations
 
-from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.robots import plan_robots, require_uniform
 from experiments.sweeps.sweep import Sweep
+from experiments.terminal.program import run_sweep
 
 
 def plan(study: Study) -> Sweep:

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from experiments import run_study as study_runs
-from experiments.boundary import guarded
 from experiments.cli.main import main
 from experiments.preparing import pipeline, windows
 from experiments.presets import get_preset
@@ -22,6 +21,7 @@ from experiments.running.runner import Job
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.setting import StudyArguments, make_setting
 from experiments.sweeps.draws import draw_judged
+from experiments.terminal.exit_code import exit_code_of
 from hma_jax.config import ConfigError
 from hma_jax.runtime import outputs
 from hma_jax.runtime.exits import Exit
@@ -278,7 +278,7 @@ def test_trials_that_diverged_are_final(capsys):
 
     def ends(*events: str) -> int:
         states = {job.id: State(event) for job, event in zip(jobs, events, strict=True)}
-        return guarded(lambda: study_runs.require_results(jobs, states, "hma study --retry-failed", False))
+        return exit_code_of(lambda: study_runs.require_results(jobs, states, "hma study --retry-failed", False))
 
     assert ends("finished", "diverged", "diverged") == Exit.DIVERGED
     assert capsys.readouterr().err.endswith("  diverged: trial c\n2 diverged, which is final: from the same seed they "

@@ -7,10 +7,10 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments import progress
-from experiments.progress import SweepMonitor, tidy_table
 from experiments.running.attempts import State
 from experiments.running.runner import Job
+from experiments.terminal import progress
+from experiments.terminal.progress import SweepMonitor, tidy_table
 
 METRICS = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval")
 

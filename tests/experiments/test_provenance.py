@@ -160,8 +160,8 @@ def test_a_comment_in_mid_sweep_is_no_change(checkout):
 
 
 def test_all_that_a_trial_runs_is_imported_before_it_works(monkeypatch):
-    before = {"experiments.running.trial": "1", "experiments.words": "2"}
-    found = iter([before, before | {"experiments.words": "3"}])
+    before = {"experiments.running.trial": "1", "experiments.terminal.words": "2"}
+    found = iter([before, before | {"experiments.terminal.words": "3"}])
     monkeypatch.setattr(provenance, "trial_closure", lambda: next(found))
     with pytest.raises(CodeChanged, match=r"experiments\.words"):  # changed while it was imported
         load_sources(before)
@@ -181,7 +181,10 @@ def test_a_start_is_recorded_once(tmp_path):
         closure_hash({"experiments.running.trial": str(i)}) for i in (1, 2)
     ]
     assert record.code == record.starts[-1].code and len(record.closures) == 2
-    assert record.besides["experiments.words"] == trace(["experiments.words"])["experiments.words"]
+    assert (
+        record.besides["experiments.terminal.words"]
+        == trace(["experiments.terminal.words"])["experiments.terminal.words"]
+    )
     machine = record.starts[0].machine
     assert {"jax", "jaxlib", "numpy"} <= machine["packages"].keys() and {
         "processor",

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from experiments.presets import CPU_FULL, SMOKE
-from experiments.progress import console
 from experiments.run_study import make_jobs, say_trained
 from experiments.running import trial as trial_module
 from experiments.running.attempts import RUN
@@ -21,6 +20,7 @@ from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
+from experiments.terminal.progress import console
 from hma_jax.config import DiffusionConfig
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from tests.experiments import fakes

@@ -28,9 +28,9 @@ from experiments.preparing import asked, pipeline, sources
 from experiments.preparing.asked import write_asked
 from experiments.preparing.sources import say_unreached_rates
 from experiments.preparing.store import say_other_rates
-from experiments.progress import Eta
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting
+from experiments.terminal.progress import Eta
 from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
 from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.fakes import STUDY

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from experiments.report.pieces import pm
-from experiments.words import counted, plus_minus
+from experiments.terminal.words import counted, plus_minus
 
 
 @pytest.mark.parametrize(

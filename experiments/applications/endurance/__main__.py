@@ -26,9 +26,8 @@ from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
-from experiments.boundary import guarded
-from experiments.progress import Update, console, step
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import Update, console, step, wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.folder import find_decode
 from hma_jax.simulator.robots import Robot
@@ -149,4 +148,4 @@ def print_rows(rows: list[Row]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main))
+    sys.exit(exit_code_of(main))

@@ -34,9 +34,8 @@ from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import VISIBLE_SHARE, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows
-from experiments.boundary import guarded
-from experiments.progress import console, step
-from experiments.wrote import wrote
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -177,4 +176,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main))
+    sys.exit(exit_code_of(main))

@@ -13,7 +13,7 @@ from experiments.applications.policies.tasks import AnyTask
 from hma_jax.config import require
 
 OpenProgress = Callable[[str], AbstractContextManager[Report]]
-"""Opens a progress bar with a title: `experiments.progress.step`."""
+"""Opens a progress bar with a title: `experiments.terminal.progress.step`."""
 
 
 @dataclass(frozen=True)

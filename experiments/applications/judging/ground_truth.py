@@ -17,7 +17,7 @@ from experiments.applications.judging.rollouts import make_starts
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
 from experiments.applications.policies.tasks import OWN, Task
 from experiments.applications.simulators import has_truth, true_simulator
-from experiments.progress import say
+from experiments.terminal.progress import say
 from hma_jax.config import require
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot

@@ -9,8 +9,8 @@ from tyro.conf import OmitArgPrefixes
 
 from experiments.cli.bench.arguments import Bench, Decode
 from experiments.cli.bench.record import write
-from experiments.progress import step
 from experiments.setting import UNSET
+from experiments.terminal.progress import step
 from hma_jax.config import ConfigError
 from hma_jax.config.execution import Remat
 

@@ -10,8 +10,8 @@ from tyro.conf import Positional, arg
 
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.bench.record import write
-from experiments.progress import console, step, tidy_table
 from experiments.setting import UNSET, make_setting
+from experiments.terminal.progress import console, step, tidy_table
 from hma_jax.config import ConfigError, require
 from hma_jax.config.execution import Dtype
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from experiments.program import PROGRAM, command_line
-from experiments.progress import console, tidy_table
+from experiments.terminal.program import PROGRAM, command_line
+from experiments.terminal.progress import console, tidy_table
 
 if TYPE_CHECKING:
     from experiments.bench.record import BenchRecord, Stage

@@ -7,7 +7,7 @@ from experiments.cli.command_line import Commands
 from experiments.cli.data import convert, registry, sim
 from experiments.cli.data.view import view
 from experiments.setting import make_setting
-from experiments.wrote import wrote
+from experiments.terminal.progress import wrote
 
 HELP = "List, inspect, view, convert and simulate datasets."
 

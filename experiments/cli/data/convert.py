@@ -16,9 +16,8 @@ from data_pipelines.sources.settings import (
     LeRobotSettings,
     RobomimicSettings,
 )
-from experiments.progress import say, step
 from experiments.setting import UNSET, command
-from experiments.wrote import wrote
+from experiments.terminal.progress import say, step, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from experiments.presets import ON_ACCELERATORS, get_preset
-from experiments.program import PROGRAM
-from experiments.progress import console
 from experiments.setting import Preset, StudyArguments, command
+from experiments.terminal.program import PROGRAM
+from experiments.terminal.progress import console
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts

@@ -16,10 +16,9 @@ from tyro.conf import Positional, arg
 
 from data_pipelines.errors import MAX_LISTED
 from experiments.cli.data.next_command import no_window, other_rate, print_next, say_next
-from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, say_unmatched, use_entries
-from experiments.words import few
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, say, step, tidy_table, wrote
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, to_strict_json
 from hma_jax.runtime.files import write_file

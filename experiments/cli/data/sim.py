@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, say, step
 from experiments.setting import UNSET, command, command_words
-from experiments.words import few
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, say, step, wrote
+from experiments.terminal.words import few
 
 if TYPE_CHECKING:
     from data_pipelines.simulators import SimSpec

@@ -12,9 +12,8 @@ from rich.markup import escape
 from tyro.conf import Positional, arg
 
 from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, print_next, say_next
-from experiments.progress import console, step
 from experiments.setting import UNSET, command, say_unmatched, use_entries
-from experiments.wrote import wrote
+from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory

@@ -24,7 +24,7 @@ from experiments.applications.policies import find_task
 from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.network import EncoderConfig
 from experiments.cli.main import main
-from experiments.progress import step
+from experiments.terminal.progress import step
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable

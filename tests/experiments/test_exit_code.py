@@ -7,8 +7,8 @@ import os
 import jax
 import pytest
 
-from experiments.boundary import guarded
-from experiments.progress import console
+from experiments.terminal.exit_code import exit_code_of
+from experiments.terminal.progress import console
 from hma_jax.runtime.exits import Exit
 from hma_jax.training.checkpoints import SaveError
 
@@ -19,7 +19,7 @@ def test_an_output_that_nobody_reads_ends_the_program_as_sigpipe_would(say, capf
     os.close(ours)
     with os.fdopen(theirs, "w") as pipe, monkeypatch.context() as patch:
         patch.setattr("sys.stdout", pipe)
-        assert guarded(lambda: say("a line")) == Exit.UNREAD == 141
+        assert exit_code_of(lambda: say("a line")) == Exit.UNREAD == 141
     assert capfd.readouterr().err == ""
 
 
@@ -27,7 +27,7 @@ def test_another_pipe_that_breaks_is_an_error(capsys):
     ours, theirs = os.pipe()
     os.close(ours)
     with open(theirs, "wb", buffering=0) as pipe:
-        assert guarded(lambda: pipe.write(b"x")) == Exit.FAILED
+        assert exit_code_of(lambda: pipe.write(b"x")) == Exit.FAILED
     assert capsys.readouterr().err.startswith("error: Broken pipe")
 
 
@@ -35,7 +35,7 @@ def test_too_little_memory_is_one_line_that_says_what_needs_less(capsys):
     def work() -> None:
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 7 bytes.\nBacktrace:\n 0x0")
 
-    assert guarded(work) == Exit.REFUSED
+    assert exit_code_of(work) == Exit.REFUSED
     error = capsys.readouterr().err
     assert error.startswith("error: RESOURCE_EXHAUSTED: Out of memory allocating 7 bytes. (") and error.count("\n") == 1
     assert "execution.accumulate=2" in error and "`hma plan` says" in error
@@ -46,7 +46,7 @@ def test_another_error_of_the_runtime_is_a_bug():
         raise jax.errors.JaxRuntimeError("INTERNAL: of the compiler")
 
     with pytest.raises(jax.errors.JaxRuntimeError):
-        guarded(work)
+        exit_code_of(work)
 
 
 @pytest.mark.parametrize(("passing", "code"), [(True, Exit.LOST), (False, Exit.FAILED)])
@@ -54,4 +54,4 @@ def test_a_disk_that_does_not_answer_is_worth_another_start_and_a_full_one_is_no
     def work() -> None:
         raise SaveError("the checkpoint of step 4 could not be written", passing)
 
-    assert guarded(work) == code
+    assert exit_code_of(work) == code

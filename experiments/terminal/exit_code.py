@@ -7,9 +7,9 @@ import select
 import sys
 from collections.abc import Callable
 
-from experiments.progress import errors
 from experiments.run_study import TrialsFailed
 from experiments.running.children import silence_background
+from experiments.terminal.progress import errors
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
 
@@ -22,7 +22,7 @@ OUT_OF_MEMORY = (
 """Added to what the compiler or a device says."""
 
 
-def guarded(
+def exit_code_of(
     work: Callable[[], None],
     debug: bool = False,
     own_process: bool = True,

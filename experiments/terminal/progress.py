@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -13,6 +14,7 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
+from rich.text import Text
 
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
@@ -42,6 +44,24 @@ Update = Callable[[int, int, str], None]
 def say(message: str) -> None:
     """Prints a message as it is: without markup, and without line breaks besides the terminal's own."""
     console.print(message, markup=False, soft_wrap=True)
+
+
+def short(path: Path) -> str:
+    """A path as a user would write it here."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def wrote(*paths: Path, then: str = "", about: str = "") -> None:
+    """Says what was written, the whole command that comes `then`, and a remark `about` it all."""
+    for path in paths:
+        console.print("wrote", Text(short(path), "bold"), soft_wrap=True)
+    if then:
+        console.print(Text(f"next: {then}"), soft_wrap=True)
+    if about:
+        say(f"note: {about}")
 
 
 def _bars() -> Progress:
