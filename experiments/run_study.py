@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.report.draw import draw
-from experiments.running.apart import call_apart
 from experiments.running.attempts import RESULT, RUN, State, newest_step, read_states
 from experiments.running.children import require_accelerator
 from experiments.running.closure import Closure
@@ -20,6 +19,7 @@ from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import latest_common, share_runs
 from experiments.running.slots import find_accelerators
+from experiments.running.subprocess_call import call_in_subprocess
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
@@ -64,11 +64,11 @@ def run_study(
     trial, if one that is finished was changed, or if trials ran other sources than today's and `accept_code` is not
     given.
     """
+    from experiments.dry_run.notes import say_average, say_points, say_prepared_here, say_scale, say_unused
+    from experiments.dry_run.trainable import require_trainable
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
-    from experiments.scale import say_average, say_points, say_prepared_here, say_scale, say_unused
-    from experiments.trainable import require_trainable
 
     study, workspace = setting.study, setting.workspace
     if not setting.data:
@@ -137,7 +137,7 @@ def prepare_apart(setting: Setting, replace: Step | None) -> Provenance:
 
     specs = [find_spec(name) for name in setting.study.all_names()]
     own = [spec for spec in specs if spec is not None]
-    return call_apart("prepares the data", _prepare, setting, replace, own, accelerators.kind)
+    return call_in_subprocess("prepares the data", _prepare, setting, replace, own, accelerators.kind)
 
 
 def _prepare(
@@ -201,7 +201,7 @@ def require_agreement(
 ) -> None:
     """Raises ConfigError if a finished trial among `shown`, all trials of the study, was changed, or if they and those
     still to be run of `requested` ran different sources and `accept_code` is not given. Both are ids."""
-    from experiments.running.agreement import check_finished, require_one_closure
+    from experiments.running.trial_checks import check_finished, require_one_closure
 
     check_finished(workspace.trials, shown)
     complete = all((workspace.trials / id / RESULT).exists() for id in requested)

@@ -16,7 +16,6 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
-from experiments.override import override
 from experiments.presets import get_preset
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace, find_record
@@ -24,6 +23,7 @@ from experiments.study import Study, on_tokenizer, on_user_data, without_equal_c
 from experiments.terminal.program import PROGRAM
 from experiments.terminal.progress import say, short
 from experiments.terminal.words import few
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.run_lock import is_address
 

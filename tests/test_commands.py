@@ -21,8 +21,8 @@ import pytest
 from tyro.extras import SubcommandApp
 
 from experiments.cli import main as program
-from experiments.override import override
 from experiments.presets import get_preset
+from experiments.user_input.override import override
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

@@ -16,10 +16,10 @@ from data_pipelines.suite.world import World
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.compare import Difference, Side, compare
 from experiments.analysis.intervals import Interval
+from experiments.analysis.rows import OVERALL, Row, curve, read_csv
 from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
-from experiments.rows import OVERALL, Row, curve, read_csv
 from hma_jax.config import EvalConfig
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable

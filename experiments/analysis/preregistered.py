@@ -15,7 +15,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
-from experiments.rows import OVERALL, Row, curve, difference
+from experiments.analysis.rows import OVERALL, Row, curve, difference
 from experiments.sweeps.registry import AXES
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.config import ConfigError, require

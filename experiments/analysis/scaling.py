@@ -150,7 +150,7 @@ def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Prove
 @lru_cache
 def trunk_parameters(config: ModelConfig) -> int:
     """Parameters of the trunk that all robots share, counted on the declared model; no array is made."""
-    from experiments.cost import ONE_ROBOT
+    from experiments.dry_run.cost import ONE_ROBOT
     from hma_jax.model.hma import declare_model
 
     leaves = declare_model(config, ONE_ROBOT).leaves()

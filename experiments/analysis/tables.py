@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from experiments.analysis.compare import Side
-from experiments.evaluated import STAMP
+from experiments.preparing.evaluation_stamp import STAMP
 from experiments.preparing.made_from import read_stamp
 from experiments.running.attempts import JOB, RESULT
 from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of
-from experiments.running.sealed import read_result
+from experiments.running.result_file import read_result
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.sweep import reference_trial

@@ -46,8 +46,8 @@ def compare(
         to: CSV file to write. An existing file is replaced; the default file only by the same comparison.
     """
     from experiments.analysis import compare as analysis
+    from experiments.analysis.rows import csv_text
     from experiments.analysis.tables import read_side
-    from experiments.rows import csv_text
 
     place = to or DEFAULT
     require(not place.is_dir(), f"--to {place} is a directory; name a file, such as --to {place / DEFAULT}")

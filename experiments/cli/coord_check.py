@@ -44,7 +44,7 @@ def coord_check(
     require(seeds >= 1, f"--seeds must be at least 1, got {seeds}")
     setting = make_setting(arguments)
 
-    from experiments.coord_check import choose_widths, measure_widths, write_sizes
+    from experiments.bench.coord_check import choose_widths, measure_widths, write_sizes
     from experiments.report.plot_coords import plot_coords
 
     study, out = setting.study, setting.workspace.root

@@ -11,9 +11,9 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
-from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
+from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
 from experiments.running.attempts import EVALUATING, JOB
-from experiments.running.sealed import SAMPLES
+from experiments.running.result_file import SAMPLES
 from experiments.setting import UNSET, Setting, make_setting, require_local, under_another_name
 from experiments.terminal.progress import TidyTable, console, short, step, tidy_table, wrote
 from experiments.terminal.words import few, plus_minus

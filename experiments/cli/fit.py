@@ -92,12 +92,12 @@ def _words(fitted: CurveFit) -> tuple[str, str, str]:
 
 def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...]) -> None:
     from experiments.analysis.predictions import predict, save_prediction
-    from experiments.override import override
     from experiments.report.numbers import read_results, result_hashes
     from experiments.running.attempts import read_states
     from experiments.running.ledger import MISSING, Ledger
     from experiments.sweeps.registry import is_file, plan_sweeps
     from experiments.sweeps.sweep import unique_trials
+    from experiments.user_input.override import override
 
     workspace = Workspace(root.absolute())
     record = load_record(workspace)

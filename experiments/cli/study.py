@@ -82,11 +82,11 @@ def _run(
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launcher_options = LauncherOptions(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
-        from experiments.done import find_done
-        from experiments.plan_table import Devices, plan_table
+        from experiments.dry_run.done import find_done
+        from experiments.dry_run.notes import say_average, say_points, say_prepared_here, say_scale, say_unused
+        from experiments.dry_run.plan_table import Devices, plan_table
+        from experiments.dry_run.trainable import check_launched
         from experiments.preparing.sources import check_entries
-        from experiments.scale import say_average, say_points, say_prepared_here, say_scale, say_unused
-        from experiments.trainable import check_launched
 
         sweeps = plan_asked(setting.study, axes, setting.workspace.root)
         given, trained = bool(setting.data), setting.tokenizer is None

@@ -55,7 +55,7 @@ def prepare_together(
     for option, value in (("--batch", batch), ("--threads", threads)):  # before a tokenizer is trained for hours
         require(value is None or value >= 1, f"{option} must be at least 1, got {value}")
     if setting.data:
-        from experiments.scale import say_scale
+        from experiments.dry_run.notes import say_scale
 
         whole = reference_trial(setting.study, setting.study.seeds[0])
         say_scale(setting, [dataclasses.replace(whole, max_trajectories=None)])

@@ -162,9 +162,9 @@ def adapt_model(
     replace: Step | None = None,
 ) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
+    from experiments.dry_run.trainable import require_only
     from experiments.running.initial_model import add_robots
     from experiments.running.run_trial import open_prepared_data
-    from experiments.trainable import require_only
 
     run = run or arguments.anywhere().out / "model"
     trained, gone = _load_initial(source, run), not source.exists()
@@ -203,7 +203,7 @@ def _check(
 ) -> dict[str, Any] | None:
     """The origin of the run (`_origin_of`). Raises ConfigError, before any work, for invalid options and for a run that
     was not trained here, or began with another model."""
-    from experiments.trainable import require_only
+    from experiments.dry_run.trainable import require_only
     from hma_jax.training.optimizer import check_schedule
 
     options.check()
@@ -352,14 +352,14 @@ def _say_swept(setting: Setting) -> None:
 
 
 def _say_scale(setting: Setting, trajectories: int | None) -> None:
-    from experiments.scale import say_scale
+    from experiments.dry_run.notes import say_scale
 
     if setting.data:
         say_scale(setting, [_single_trial(setting, trajectories)])
 
 
 def _say_average(setting: Setting) -> None:
-    from experiments.scale import say_average
+    from experiments.dry_run.notes import say_average
 
     say_average([setting.study.train])
 
@@ -373,13 +373,13 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> None:
     """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so
     many `processes` as this one."""
-    from experiments.done import UNKNOWN, find_prepared
-    from experiments.plan_table import Devices, plan_table
+    from experiments.dry_run.done import UNKNOWN, find_prepared
+    from experiments.dry_run.plan_table import Devices, plan_table
+    from experiments.dry_run.trainable import check_trials
     from experiments.running.attempts import newest_step
     from experiments.running.launchers.registry import LauncherOptions
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import Point, Sweep
-    from experiments.trainable import check_trials
 
     mesh, own = setting.study.execution.mesh, LauncherOptions().share()
     share = own * processes if own else float(max(processes, mesh.min_devices))

@@ -19,8 +19,8 @@ from hma_jax.config import ConfigError
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
+    from experiments.analysis.rows import Row
     from experiments.report.numbers import Numbers
-    from experiments.rows import Row
 
 
 def draw(workspace: Workspace, record: Record) -> None:
@@ -38,7 +38,8 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.analysis.best_steps import BestSteps, judge_at_best
     from experiments.analysis.changes import Change, find_changes, find_differences
     from experiments.analysis.growth import Growth, find_growth
-    from experiments.optima import Optimum, find_optima
+    from experiments.analysis.optima import Optimum, find_optima
+    from experiments.analysis.rows import collect, read_rows, write_csv, write_rows
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers, find_fewer, find_other_x
     from experiments.report.page import write_report
@@ -46,7 +47,6 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.sweeps import AxisStatistics
     from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
-    from experiments.rows import collect, read_rows, write_csv, write_rows
 
     provenance = record.provenance
     if provenance is None:
@@ -122,7 +122,7 @@ def draw_again(out: Path) -> None:
     Where its trials are not, as with results that are kept for the record, its figures are drawn from its table,
     and table and page stay as they are.
     """
-    from experiments.rows import read_rows
+    from experiments.analysis.rows import read_rows
 
     workspace = Workspace(out.absolute())
     record = load_record(workspace)

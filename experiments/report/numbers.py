@@ -12,7 +12,7 @@ from experiments.analysis.predictions import Outcome, compare, load_predictions
 from experiments.analysis.scaling import CurveFit, curves_of, fit_budgets, fit_study
 from experiments.running.attempts import RESULT
 from experiments.running.provenance import Provenance
-from experiments.running.sealed import read_result
+from experiments.running.result_file import read_result
 from experiments.running.trial import Trial, trajectories_of, trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps

@@ -17,9 +17,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from experiments.analysis.optima import Optimum
 from experiments.analysis.preregistered import FILE as PREREGISTERED
 from experiments.analysis.preregistered import ExpectationOutcome, compare_expected, read_expected
-from experiments.optima import Optimum
+from experiments.analysis.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
 from experiments.preparing.tokenizer import QUALITY
 from experiments.report.clips import describe_clips
 from experiments.report.findings import Findings, describe_expected, read_findings
@@ -31,14 +32,13 @@ from experiments.report.robots import Robot, are_sorted, describe_robots, robots
 from experiments.report.style import CSS
 from experiments.report.sweeps import TWO_PERPLEXITIES, AxisStatistics, describe
 from experiments.report.validity import EACH, Check, check_study, draw_box
-from experiments.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
-from experiments.running.agreement import describe as describe_sources
-from experiments.running.agreement import group_by_sources
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED, name_within
 from experiments.running.provenance import Provenance
-from experiments.running.sealed import SAMPLES
+from experiments.running.result_file import SAMPLES
 from experiments.running.trial import Trial, trial_id
+from experiments.running.trial_checks import describe as describe_sources
+from experiments.running.trial_checks import group_by_sources
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, reference_trial, titles

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from experiments.rows import CurvePoint
+from experiments.analysis.rows import CurvePoint
 from experiments.terminal import words
 
 STILL = (

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-from experiments.optima import diverged, ends, lowest
+from experiments.analysis.optima import diverged, ends, lowest
+from experiments.analysis.rows import OVERALL, TRAINING, TRAINING_LOSS, CurvePoint, Row, all_series
 from experiments.report.plot_style import (
     EXP_OF,
     LABELS,
@@ -29,7 +30,6 @@ from experiments.report.plot_style import (
     show_tally,
     style_of,
 )
-from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, CurvePoint, Row, all_series
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Sweep
 
 ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
+from experiments.analysis.rows import CurvePoint, Row
 from experiments.report.plot_style import (
     CONTROL_LINE,
     DEFAULT,
@@ -23,7 +24,6 @@ from experiments.report.plot_style import (
     show_nothing,
     show_tally,
 )
-from experiments.rows import CurvePoint, Row
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 CAPTION = (

@@ -20,7 +20,7 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 
 from experiments.analysis.intervals import HELD_OUT_LOSS
-from experiments.rows import OVERALL, CurvePoint, Row, curve, tally
+from experiments.analysis.rows import OVERALL, CurvePoint, Row, curve, tally
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.runtime.files import write_file
 

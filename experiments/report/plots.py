@@ -12,6 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
+from experiments.analysis.rows import UNTRAINED, CurvePoint, Row, of_sweep
 from experiments.analysis.scaling import trunk_parameters
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
@@ -37,7 +38,6 @@ from experiments.report.plot_style import (
     show_nothing,
     show_tally,
 )
-from experiments.rows import UNTRAINED, CurvePoint, Row, of_sweep
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from experiments.analysis.controllability import Controllability, controllability, count_following, expected_by_chance
+from experiments.analysis.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.report.pieces import pm, table
-from experiments.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.sweep import POINT, Sweep

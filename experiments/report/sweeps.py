@@ -12,11 +12,11 @@ from experiments.analysis.best_steps import BestSteps
 from experiments.analysis.changes import Change
 from experiments.analysis.growth import GROWS, Growth
 from experiments.analysis.intervals import HELD_OUT_LOSS
-from experiments.optima import Optimum
+from experiments.analysis.optima import Optimum
+from experiments.analysis.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.report.pieces import pm, table
 from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import OVER, USUAL, choose_metrics
-from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.terminal.words import counted
 

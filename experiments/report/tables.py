@@ -28,9 +28,9 @@ def write_tables(
     """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
     and of their controls."""
     from experiments.analysis.controllability import Controllability, controllability
+    from experiments.analysis.rows import training_loss, write_csv
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
-    from experiments.rows import training_loss, write_csv
     from hma_jax.evaluation.windows import FILE
 
     names, rows = titles(sweeps, provenance), []

@@ -17,11 +17,11 @@ import numpy as np
 from experiments.analysis.compare import lacks_numbers
 from experiments.analysis.controllability import ROUNDING
 from experiments.analysis.intervals import HELD_OUT_LOSS, standard_errors
+from experiments.analysis.optima import Optimum, ends
 from experiments.analysis.predictions import Outcome
-from experiments.optima import Optimum, ends
+from experiments.analysis.rows import OVERALL, TRAINING_LOSS, UNTRAINED, Row
 from experiments.report.pieces import section
 from experiments.report.robots import Robot
-from experiments.rows import OVERALL, TRAINING_LOSS, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep

@@ -26,7 +26,7 @@ from typing import Any
 
 from data_pipelines.publishing.output_lock import OutputLock, find_held_lock, lock_output
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
-from experiments.running.shared_disk import patient
+from experiments.running.shared_disk import retry_io
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import EXPIRES, RENEWED_EVERY
@@ -156,8 +156,8 @@ def _signal(code: int) -> int:
 
 def read_states(ids: Sequence[str], trials: Path, ledger: Ledger) -> dict[str, State]:
     """The state of each trial. A result on disk is the truth; the ledger may lag behind it."""
-    recorded = patient(ledger.states)
-    return {id: patient(_state, trials / id, recorded.get(id)) for id in ids}
+    recorded = retry_io(ledger.states)
+    return {id: retry_io(_state, trials / id, recorded.get(id)) for id in ids}
 
 
 def _state(directory: Path, record: dict[str, Any] | None) -> State:

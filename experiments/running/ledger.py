@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments.running.shared_disk import patient
+from experiments.running.shared_disk import retry_io
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.files import naming
 
@@ -74,7 +74,7 @@ class Ledger:
         if "message" in details:
             details["message"] = name_within(self.path.parent, details["message"])
         line = json.dumps({"time": round(self.clock(), 3), "trial": trial, "event": event, **details})
-        patient(self._write, line.encode())
+        retry_io(self._write, line.encode())
 
     def _write(self, line: bytes) -> None:
         with naming(self.path), open(self.path, "ab+") as file:

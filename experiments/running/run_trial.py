@@ -7,7 +7,7 @@ A trial's directory holds
     evaluating/     of an evaluation that has not ended: what was measured, from which the next attempt goes on
     windows.parquet every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
     provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
-    result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
+    result.json     written last, sealed (`experiments.running.result_file`): a trial with this file is finished
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 from experiments.running.attempts import EVALUATING, RUN
 from experiments.running.machine import describe_machine
 from experiments.running.provenance import read_record, record_end
+from experiments.running.result_file import SAMPLES
 from experiments.running.run_options import UNWATCHED, RunOptions
-from experiments.running.sealed import SAMPLES
 from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
@@ -244,7 +244,7 @@ def run_trial(
     import jax
 
     from data_pipelines.loading.selection import count_trajectories, training_table
-    from experiments.running.sealed import write_result
+    from experiments.running.result_file import write_result
     from hma_jax.evaluation.parts import Parts
     from hma_jax.model.flops import train_flops_per_step
     from hma_jax.model.hma import declare_model

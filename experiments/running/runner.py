@@ -35,7 +35,7 @@ from experiments.running.attempts import (
 )
 from experiments.running.launchers.base import Launcher
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
-from experiments.running.shared_disk import patient
+from experiments.running.shared_disk import retry_io
 from hma_jax.config import ConfigError
 from hma_jax.runtime.files import IO_ERRNOS, write_file
 from hma_jax.runtime.locks import EXPIRES, RENEWED_EVERY
@@ -175,7 +175,7 @@ class _Run:
         chosen = self._runnable()[:room]
         if not chosen or time.monotonic() < self.relaunch_at:
             return
-        directories = [patient(self._prepare, job) for job, _ in chosen]
+        directories = [retry_io(self._prepare, job) for job, _ in chosen]
         now = time.monotonic()
         try:
             handles = self.launcher.launch(directories)
@@ -189,7 +189,7 @@ class _Run:
         self.launched = True
         self.waiting = [entry for entry in self.waiting if entry not in chosen]
         for (job, state), directory, handle in zip(chosen, directories, handles, strict=True):
-            self.running.append(_Attempt(job, directory, handle, now, patient(reached, directory), now))
+            self.running.append(_Attempt(job, directory, handle, now, retry_io(reached, directory), now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
     def _runnable(self) -> list[tuple[Job, str]]:
@@ -261,7 +261,7 @@ class _Run:
 
     def _count(self, attempt: _Attempt) -> None:
         """What an attempt that is over has achieved decides whether it counts."""
-        before, attempt.reached = attempt.reached, patient(reached, attempt.directory)
+        before, attempt.reached = attempt.reached, retry_io(reached, attempt.directory)
         self.fruitless[attempt.job.id] = 0 if attempt.reached > before else self.fruitless[attempt.job.id] + 1
 
     def _try_again(self, attempt: _Attempt, state: State) -> bool:

@@ -17,7 +17,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
-def patient(act: Callable[..., T], *arguments: object) -> T:
+def retry_io(act: Callable[..., T], *arguments: object) -> T:
     """What `act` returns, which may be done twice. Raises OSError: that of a disk that fails, such as ESTALE, after the
     last try only."""
     for wait in WAITS:

@@ -19,7 +19,7 @@ from experiments.running.trial import Trial
 from experiments.study import SCALING, Study
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, limit_other_actions
 from experiments.terminal.words import few
-from experiments.user_file import find_function, naming_line
+from experiments.user_input.user_file import find_function, naming_line
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from data_pipelines.suite.embodiments import TRAINED
 from experiments.analysis.compare import Difference, Side, overall_difference
+from experiments.analysis.rows import Row, read_rows
 from experiments.report.robots import Robot, robots_of
-from experiments.rows import Row, read_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps

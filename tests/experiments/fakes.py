@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.analysis.rows import Row, collect
 from experiments.presets import SMOKE
 from experiments.report.numbers import read_results
-from experiments.rows import Row, collect
 from experiments.running.attempts import OUTPUT, read_states
 from experiments.running.ledger import Ledger
 from experiments.running.provenance import Provenance, Start, TrialRecord
+from experiments.running.result_file import write_result
 from experiments.running.run_trial import last_loss, write_samples
-from experiments.running.sealed import write_result
 from experiments.running.trial import Trial
 from experiments.running.workspace import Record, Workspace
 from experiments.study import SCALING, Study, TransferConfig

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running.ledger import Ledger
+from experiments.running.result_file import write_result
 from experiments.running.run_trial import write_samples
-from experiments.running.sealed import write_result
 from experiments.running.trial import Trial
 from experiments.running.workspace import Record, Workspace, save_record
 from experiments.study import Study

@@ -7,9 +7,9 @@ from typing import get_args
 
 import pytest
 
+from experiments.analysis.rows import curve, difference, read_csv
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
-from experiments.rows import curve, difference, read_csv
 from experiments.running.trial import training_of, trial_id
 from experiments.sweeps import conditioning as conditioning_axis
 from experiments.sweeps import ladder as ladder_axis

@@ -12,12 +12,12 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from experiments.analysis.rows import TRAINING
 from experiments.applications import DRIVEN
 from experiments.presets import PRESETS
 from experiments.report.draw import draw_again
-from experiments.rows import TRAINING
 from experiments.running.ledger import FINISHED
-from experiments.running.sealed import read_result
+from experiments.running.result_file import read_result
 from experiments.running.workspace import Workspace
 from hma_jax.evaluation.summary import METRICS
 from hma_jax.training.runs import load_run

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from experiments import coord_check
+from experiments.bench import coord_check
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.report.plot_coords import plot_coords

@@ -8,15 +8,21 @@ import numpy as np
 import pytest
 
 from experiments.cli.main import main
-from experiments.cost import checkpoint_bytes, declared_table, estimate, evaluation_flops_per_window, plan_trials
-from experiments.preparing_cost import describe, estimate_preparing
+from experiments.dry_run.cost import (
+    checkpoint_bytes,
+    declared_table,
+    estimate,
+    evaluation_flops_per_window,
+    plan_trials,
+)
+from experiments.dry_run.preparing_cost import describe, estimate_preparing
+from experiments.dry_run.trainable import devices_of
 from experiments.presets import ACCELERATOR, CPU_FULL, PAPER, SMOKE, SMOKE_CONTINUOUS
 from experiments.running.launchers import local, registry
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import Accelerators
 from experiments.sweeps.registry import find_axis, plan_sweeps
 from experiments.sweeps.sweep import POINT, reference_trial
-from experiments.trainable import devices_of
 from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MaskingConfig, MeshConfig
 from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model

@@ -11,15 +11,15 @@ import pytest
 from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
 from data_pipelines.suite.generate import episode_count
 from experiments.analysis.scaling import surface_of, trunk_parameters
-from experiments.cost import plan_trials
-from experiments.override import override
-from experiments.preparing_cost import estimate_preparing
+from experiments.dry_run.cost import plan_trials
+from experiments.dry_run.preparing_cost import estimate_preparing
 from experiments.presets import ACCELERATOR, CPU_FULL, PAPER
 from experiments.running.trial import training_of, trial_id
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.registry import AXES, find_axis, plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT, reference_trial, unique_trials
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError
 from hma_jax.training.optimizer import check_schedule
 from tests.experiments.fakes import PROVENANCE

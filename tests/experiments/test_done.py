@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.cost import plan_trials
-from experiments.done import NOTHING, find_done
-from experiments.plan_table import plan_table
+from experiments.dry_run.cost import plan_trials
+from experiments.dry_run.done import NOTHING, find_done
+from experiments.dry_run.plan_table import plan_table
 from experiments.running.attempts import RESULT
 from experiments.running.ledger import DIVERGED, FAILED, Ledger
 from experiments.running.workspace import save_record

@@ -13,8 +13,8 @@ from experiments.analysis.preregistered import (
     find_unplanned,
     read_expected,
 )
+from experiments.analysis.rows import curve, difference, read_rows
 from experiments.report.draw import draw
-from experiments.rows import curve, difference, read_rows
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting

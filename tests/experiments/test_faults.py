@@ -18,7 +18,7 @@ from data_pipelines.tokens import part_maker
 from experiments.analysis.tables import read_side
 from experiments.cli.evaluate import MEANS
 from experiments.cli.main import main
-from experiments.evaluated import STAMP
+from experiments.preparing.evaluation_stamp import STAMP
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
 from experiments.running.attempts import AttemptEnd, State, outcome

@@ -14,11 +14,11 @@ from scipy import stats
 
 from experiments.analysis.compare import Side, overall_difference
 from experiments.analysis.preregistered import FILE, Expected, read_expected
+from experiments.analysis.rows import OVERALL, CurvePoint, all_series, curve, difference
 from experiments.applications.detector import CLOSE_PX
 from experiments.applications.in_place import in_place
 from experiments.report.findings import read_findings
-from experiments.rows import OVERALL, CurvePoint, all_series, curve, difference
-from experiments.running.sealed import read_result
+from experiments.running.result_file import read_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps

@@ -8,8 +8,8 @@ import pytest
 
 from experiments.analysis.compare import Side, compare
 from experiments.analysis.preregistered import FILE, compare_expected, read_expected
+from experiments.analysis.rows import OVERALL, curve, difference
 from experiments.applications.in_place import in_place
-from experiments.rows import OVERALL, curve, difference
 from experiments.sweeps.sweep import CONTROL
 from hma_jax.evaluation.windows import FILE as WINDOWS
 from hma_jax.evaluation.windows import WindowTable

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.override import override
 from experiments.presets import CPU, SMOKE
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError
 
 

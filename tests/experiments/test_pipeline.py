@@ -11,12 +11,12 @@ from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.suite import counterfactual as simulator
 from data_pipelines.windows.evalset import eval_batches
 from data_pipelines.windows.other_actions import OtherWindows
-from experiments.override import override
 from experiments.preparing import counterfactual, windows
 from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
 from experiments.running.run_trial import open_prepared_data
 from experiments.running.workspace import Workspace
+from experiments.user_input.override import override
 
 
 def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeypatch):

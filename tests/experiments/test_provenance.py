@@ -11,11 +11,10 @@ import pytest
 
 import experiments
 from experiments import run_study as study_runs
+from experiments.analysis.rows import Row, read_csv, write_csv
 from experiments.report.draw import draw_again
 from experiments.report.page import _origin
-from experiments.rows import Row, read_csv, write_csv
 from experiments.running import provenance
-from experiments.running.agreement import check_finished, group_by_sources, require_one_closure
 from experiments.running.attempts import read_states
 from experiments.running.closure import ROOT, closure_hash, trace
 from experiments.running.launchers.local import LocalLauncher
@@ -23,9 +22,10 @@ from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.machine import commit_of
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
+from experiments.running.result_file import read_result, write_result
 from experiments.running.runner import Job, run_missing
-from experiments.running.sealed import read_result, write_result
 from experiments.running.trial import trial_id
+from experiments.running.trial_checks import check_finished, group_by_sources, require_one_closure
 from experiments.running.workspace import Workspace, find_record, save_record
 from experiments.setting import StudyArguments, make_setting
 from experiments.study import SCALING
@@ -163,7 +163,7 @@ def test_all_that_a_trial_runs_is_imported_before_it_works(monkeypatch):
     before = {"experiments.running.trial": "1", "experiments.terminal.words": "2"}
     found = iter([before, before | {"experiments.terminal.words": "3"}])
     monkeypatch.setattr(provenance, "trial_closure", lambda: next(found))
-    with pytest.raises(CodeChanged, match=r"experiments\.words"):  # changed while it was imported
+    with pytest.raises(CodeChanged, match=r"experiments\.terminal\.words"):  # changed while it was imported
         load_sources(before)
     monkeypatch.setattr(provenance, "trial_closure", lambda: before)
     assert load_sources(before) == load_sources(None) == before

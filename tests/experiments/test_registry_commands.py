@@ -21,9 +21,9 @@ from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments import run_study
 from experiments.cli.data import registry as registry_commands
+from experiments.cli.data.contact_sheet import TILE, draw_sheet
 from experiments.cli.data.registry import _write_entry
 from experiments.cli.main import main
-from experiments.contact_sheet import TILE, draw_sheet
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.workspace import Workspace, load_record
 from experiments.setting import Setting, StudyArguments, find_directories, make_setting, use_entries
@@ -367,7 +367,7 @@ def test_a_full_disk_is_said_of_the_contact_sheet(robot, tmp_path, capsys, monke
         monkeypatch.setattr(os, "fsync", fsync)  # from here on
         return draw_sheet(*arguments)
 
-    monkeypatch.setattr("experiments.contact_sheet.draw_sheet", draw)
+    monkeypatch.setattr("experiments.cli.data.contact_sheet.draw_sheet", draw)
     assert main(["data", "inspect", str(robot), "--hz", "4", "--out", str(tmp_path / "sheets")]) != 0
     assert f"error: {tmp_path / 'sheets' / 'contact_sheet.png'}: No space left" in capsys.readouterr().err
     assert not list((tmp_path / "sheets").iterdir())

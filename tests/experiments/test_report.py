@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from experiments.analysis.changes import find_changes
+from experiments.analysis.optima import find_optima
+from experiments.analysis.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.analysis.scaling import curves_of, fit_curve, trunk_parameters
-from experiments.optima import find_optima
 from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
@@ -24,7 +25,6 @@ from experiments.report.robots import describe_robots, read_data, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.report.validity import Check, check_study
-from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.conditioning import plan as plan_conditioning

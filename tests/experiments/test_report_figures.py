@@ -12,6 +12,7 @@ from experiments.analysis.changes import find_differences
 from experiments.analysis.compare import Side, overall_difference
 from experiments.analysis.fits import Coefficient, PowerFit, fit_power
 from experiments.analysis.isoflop import Budget, IsoFlop
+from experiments.analysis.rows import TRAINING, TRAINING_LOSS, Row, curve
 from experiments.analysis.scaling import Curve, CurveFit
 from experiments.presets import CPU_FULL
 from experiments.report import plot_fits
@@ -22,7 +23,6 @@ from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, dodge, style_of
 from experiments.report.plots import _draw
 from experiments.report.sweeps import AxisStatistics, describe
-from experiments.rows import TRAINING, TRAINING_LOSS, Row, curve
 from experiments.running.trial import trial_id
 from experiments.sweeps.conditioning import plan as plan_conditioning
 from experiments.sweeps.episodes import plan as plan_episodes

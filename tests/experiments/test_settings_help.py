@@ -10,7 +10,7 @@ import pytest
 
 from experiments.cli.main import main
 from experiments.presets import get_preset
-from experiments.settings_help import SettingHelp, describe_settings
+from experiments.user_input.settings_help import SettingHelp, describe_settings
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.cost import ONE_ROBOT, declared_table, estimate
-from experiments.override import override
+from experiments.dry_run.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import ACCELERATOR, CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
@@ -17,6 +16,7 @@ from experiments.setting import Preset
 from experiments.study import on_user_data, without_equal_caps
 from experiments.sweeps import datasets, trajectories, width
 from experiments.sweeps.sweep import reference_trial, unique_trials
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError, MeshConfig
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.hma import declare_model

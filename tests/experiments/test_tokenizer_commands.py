@@ -11,11 +11,11 @@ import pytest
 from data_pipelines.registry import get_spec
 from data_pipelines.windows.evalset import eval_batches
 from experiments.cli.main import main
-from experiments.override import override
 from experiments.presets import get_preset
 from experiments.running.run_trial import open_prepared_data
 from experiments.running.workspace import Workspace
 from experiments.study import on_tokenizer
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
 from hma_jax.config.json import from_dict, to_json, to_strict_json
 from hma_jax.evaluation.summary import summarise

@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.optima import Optimum, as_good, cross_validated_penalties, find_optima
-from experiments.override import override
+from experiments.analysis.optima import Optimum, as_good, cross_validated_penalties, find_optima
+from experiments.analysis.rows import TRAINING, TRAINING_LOSS, CurvePoint, curve, read_csv
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
 from experiments.report.plots import plot_sweep
 from experiments.report.sweeps import _transfer
 from experiments.report.validity import _optima
-from experiments.rows import TRAINING, TRAINING_LOSS, CurvePoint, curve, read_csv
 from experiments.study import TransferConfig
 from experiments.sweeps import lr
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import POINT, STANDARD, unique_trials
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
 from hma_jax.model.attention import attention_scale

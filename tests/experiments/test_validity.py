@@ -10,7 +10,7 @@ import pytest
 
 from experiments.report.draw import draw
 from experiments.running.attempts import RESULT
-from experiments.running.sealed import write_result
+from experiments.running.result_file import write_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps

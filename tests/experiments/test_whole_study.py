@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import experiments
-from experiments.rows import curve, read_csv
+from experiments.analysis.rows import curve, read_csv
 from experiments.running.closure import closure_hash
 from experiments.running.provenance import read_record, trial_closure
 

@@ -35,7 +35,7 @@ from experiments.applications.settings_file import pin_settings, short_hash
 from experiments.applications.simulators import load_simulator
 from experiments.running.workspace import Workspace
 from experiments.terminal.words import few
-from experiments.user_file import naming_line
+from experiments.user_input.user_file import naming_line
 from hma_jax.config import require
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.protocol import predicts_actions

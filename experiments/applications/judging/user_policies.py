@@ -17,7 +17,7 @@ from experiments.applications.judging.user_success import PAGE, UserSuccess, suc
 from experiments.applications.policies.cloning import ClonedPolicy
 from experiments.applications.policies.diffusion import DiffusionPolicy
 from experiments.applications.policies.policy import Policy
-from experiments.user_file import function_of, naming_line, run_file
+from experiments.user_input.user_file import function_of, naming_line, run_file
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 

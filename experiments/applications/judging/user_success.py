@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from experiments.applications.judging.head import PIECE, HeadConfig
-from experiments.user_file import function_of
+from experiments.user_input.user_file import function_of
 from hma_jax.config import ConfigError, require
 
 PAGE, NAME = "docs/judging.md", "success"

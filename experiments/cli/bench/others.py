@@ -38,9 +38,9 @@ def quality(
     from dataclasses import replace
 
     from data_pipelines.windows.evalset import eval_batches, freeze_manifest
+    from experiments.analysis.rows import write_csv
     from experiments.bench.quality import DecodingQuality, decodings, judge, plot_quality, subject_of
     from experiments.cli.evaluate import check_fits, require_prepared
-    from experiments.rows import write_csv
     from experiments.running.run_trial import open_prepared_data
     from hma_jax.training.runs import load_model, require_frames
 
@@ -170,8 +170,8 @@ def load(
     import tempfile
 
     from data_pipelines.tokens.store import TokenStore
+    from experiments.analysis.rows import write_csv
     from experiments.bench.load import MemoryPoint, make_store, plot_memory, time_shards, time_windows
-    from experiments.rows import write_csv
 
     with tempfile.TemporaryDirectory() as scratch:
         with step("open the token store"):

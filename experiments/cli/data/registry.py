@@ -211,7 +211,7 @@ def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetS
 
 def _draw_contact_sheet(sample: Sample, folder: Path) -> None:
     """Writes FOLDER/contact_sheet.png."""
-    from experiments.contact_sheet import draw_sheet
+    from experiments.cli.data.contact_sheet import draw_sheet
 
     facts = sample.facts
     folder.mkdir(exist_ok=True)

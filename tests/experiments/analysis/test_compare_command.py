@@ -10,7 +10,7 @@ from experiments.analysis.compare import Side, compare
 from experiments.analysis.intervals import OVERALL
 from experiments.cli.compare import _table
 from experiments.cli.main import main
-from experiments.evaluated import STAMP
+from experiments.preparing.evaluation_stamp import STAMP
 from experiments.preparing.made_from import MadeFrom
 from experiments.running.workspace import Workspace, save_record
 from experiments.sweeps.sweep import reference_trial

@@ -18,7 +18,6 @@ from experiments.analysis.measured import Position
 from experiments.analysis.predictions import Outcome, Prediction, compare, load_predictions, save_prediction
 from experiments.analysis.scaling import Curve
 from experiments.cli.main import main
-from experiments.override import override
 from experiments.presets import CPU
 from experiments.report import numbers
 from experiments.report.draw import draw
@@ -27,11 +26,12 @@ from experiments.report.numbers import read_numbers
 from experiments.report.validity import _prediction
 from experiments.running.attempts import RESULT
 from experiments.running.ledger import FINISHED, Ledger
-from experiments.running.sealed import write_result
+from experiments.running.result_file import write_result
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import POINT, unique_trials
 from experiments.sweeps.width import plan as plan_width
+from experiments.user_input.override import override
 from tests.experiments.analysis.test_measured import windows_of
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, finish, judged_study

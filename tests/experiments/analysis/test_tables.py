@@ -8,7 +8,7 @@ import pytest
 
 from experiments.analysis.tables import read_trial, read_trials
 from experiments.analysis.trials import trial_row, write_trials
-from experiments.running.sealed import read_result
+from experiments.running.result_file import read_result
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.running.result_file import write_result
 from experiments.running.run_trial import last_loss
-from experiments.running.sealed import write_result
 from experiments.running.trial import Trial, trial_id
 from hma_jax.config import ExecutionConfig
 from hma_jax.config.json import to_dict

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from experiments.cost import declared_table
-from experiments.done import UNKNOWN
+from experiments.dry_run.cost import declared_table
+from experiments.dry_run.done import UNKNOWN
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from experiments.done import NOTHING, Done
+from experiments.dry_run.done import NOTHING, Done
 from experiments.running.run_options import UNWATCHED
 from experiments.running.shared_runs import share_runs
 from experiments.running.trial import Trial

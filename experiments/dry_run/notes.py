@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from experiments.cost import count_parameters
+from experiments.dry_run.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import find_accelerators

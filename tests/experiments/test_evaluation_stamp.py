@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from experiments.cli.evaluate import table_of, trained_on_other_tokens
-from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
+from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
+from experiments.running.result_file import SAMPLES
 from experiments.running.run_trial import write_evaluation
-from experiments.running.sealed import SAMPLES
 from hma_jax.config import ConfigError, EvalConfig, TrainConfig
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.evaluate import Evaluation

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from rich.markup import escape
 from rich.table import Table
 
-from experiments.cost import TrialPlan, checkpoint_bytes, plan_trials
-from experiments.done import NOTHING, Done
-from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
+from experiments.dry_run.cost import TrialPlan, checkpoint_bytes, plan_trials
+from experiments.dry_run.done import NOTHING, Done
+from experiments.dry_run.preparing_cost import PreparingCost, describe, estimate_preparing
 from experiments.running.ledger import FAILED
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id

@@ -13,8 +13,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import is_dataclass
 from typing import Any, Literal
 
-from experiments.settings_help import describe_settings, show_settings
 from experiments.study import Study
+from experiments.user_input.settings_help import describe_settings, show_settings
 from hma_jax.config import ConfigError, ModelConfig, require
 from hma_jax.config.json import from_dict, to_dict
 

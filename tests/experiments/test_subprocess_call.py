@@ -17,8 +17,8 @@ from data_pipelines.registry import table as registry_table
 from data_pipelines.sources.convertible import UnitError
 from experiments import run_study
 from experiments.cli.main import main
-from experiments.running.apart import _portable, call_apart
 from experiments.running.slots import Accelerators
+from experiments.running.subprocess_call import _portable, call_in_subprocess
 from experiments.running.workspace import Busy
 from experiments.setting import StudyArguments, make_setting
 from hma_jax.config import ConfigError
@@ -29,11 +29,11 @@ from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted
 from hma_jax.training.reading import CheckpointError
 from tests.data_pipelines.fakes import make_spec
-from tests.experiments.called_apart import end_by, fail, work_until_asked
+from tests.experiments.called_in_subprocess import end_by, fail, work_until_asked
 
 
 def test_the_process_has_ended_when_its_answer_is_there():
-    process = call_apart("asks", os.getpid)
+    process = call_in_subprocess("asks", os.getpid)
     assert process != os.getpid()
     with pytest.raises(ProcessLookupError):
         os.kill(process, 0)
@@ -57,7 +57,7 @@ def test_errors_are_sent_as_they_are():
 
 def test_an_error_that_cannot_be_sent_keeps_its_words_and_its_traceback():
     with pytest.raises(RuntimeError) as raised:
-        call_apart("fails", fail)
+        call_in_subprocess("fails", fail)
     assert str(raised.value) == "Unsendable: three 3"
     (note,) = raised.value.__notes__
     assert "in fail" in note
@@ -65,7 +65,7 @@ def test_an_error_that_cannot_be_sent_keeps_its_words_and_its_traceback():
 
 def test_a_process_that_is_killed_is_an_error_that_says_so():
     with pytest.raises(ChildProcessError, match="the process that counts was ended by SIGKILL, perhaps for lack of"):
-        call_apart("counts", end_by, signal.SIGKILL)
+        call_in_subprocess("counts", end_by, signal.SIGKILL)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_request_to_stop_is_passed_on_and_nothing_is_left(number, saves, kind,
 
     threading.Thread(target=ask, daemon=True).start()
     with sigterm_as_interrupt(), pytest.raises(kind) as raised:
-        call_apart("waits", work_until_asked, started, saves)
+        call_in_subprocess("waits", work_until_asked, started, saves)
     assert raised.type is kind and (not saves or raised.value.exit == Exit.STOPPED)
     with pytest.raises(ProcessLookupError):
         os.kill(int(started.read_text()), 0)
@@ -148,7 +148,7 @@ def test_entries_of_the_user_are_known_where_a_study_is_prepared(tmp_path, monke
     calls, mine = [], make_spec("mine", (4,))
     register([mine])
     monkeypatch.setattr(run_study, "find_accelerators", lambda: Accelerators("tpu", ("0",)))
-    monkeypatch.setattr(run_study, "call_apart", lambda what, *call: calls.append(call))
+    monkeypatch.setattr(run_study, "call_in_subprocess", lambda what, *call: calls.append(call))
     setting = make_setting(StudyArguments("smoke", tmp_path, set=("datasets=mine", "dataset_counts=1")))
     monkeypatch.setattr(run_study, "require_accelerator", lambda kind: calls.append(kind))
     run_study.prepare_apart(setting, None)

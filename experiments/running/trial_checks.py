@@ -11,7 +11,7 @@ from experiments.running.attempts import JOB, RESULT, RUN
 from experiments.running.closure import Closure, changed, closure_hash
 from experiments.running.job import read_job
 from experiments.running.provenance import CodeChanged, inputs_of, read_record
-from experiments.running.sealed import read_result
+from experiments.running.result_file import read_result
 from experiments.running.trial import trial_id
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError, require

@@ -11,11 +11,11 @@ import pytest
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
-from experiments.cost import count_parameters
+from experiments.dry_run.cost import count_parameters
+from experiments.dry_run.notes import say_scale
 from experiments.presets import ON_ACCELERATORS, PRESETS
 from experiments.running.slots import Accelerators
 from experiments.running.workspace import Workspace
-from experiments.scale import say_scale
 from experiments.setting import Setting, StudyArguments
 from experiments.study import on_user_data
 from experiments.sweeps.sweep import reference_trial
@@ -138,7 +138,7 @@ def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):
 
 
 def test_what_is_made_for_an_accelerator_names_no_other(data, capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.plan_table.plan_table", lambda *_, **__: "")
+    monkeypatch.setattr("experiments.dry_run.plan_table.plan_table", lambda *_, **__: "")
     first, *_ = said_by(capsys, "study", "--dry-run", "--preset", "accelerator", *data, "--out", str(tmp_path))
     assert "for 20,000 steps of 64 windows, with at most 1,000 trajectories" in first and first.endswith("each dataset")
 
@@ -147,8 +147,8 @@ def test_a_tokenizer_that_would_be_trained_without_the_accelerators_of_the_trial
     data, capsys, tmp_path, monkeypatch
 ):
     """`--launcher slurm` on a login node: the dry run prices hours of the processor as minutes of a GPU."""
-    monkeypatch.setattr("experiments.plan_table.plan_table", lambda *_, **__: "")
-    monkeypatch.setattr("experiments.scale.find_accelerators", lambda: None)
+    monkeypatch.setattr("experiments.dry_run.plan_table.plan_table", lambda *_, **__: "")
+    monkeypatch.setattr("experiments.dry_run.notes.find_accelerators", lambda: None)
     out = tmp_path / "out"
 
     def told(preset: str, launcher: str) -> list[str]:
@@ -165,7 +165,7 @@ def test_a_tokenizer_that_would_be_trained_without_the_accelerators_of_the_trial
     (out / "tokenizer").mkdir(parents=True)
     assert not told("accelerator", "slurm")
     out = tmp_path / "other"
-    monkeypatch.setattr("experiments.scale.find_accelerators", lambda: Accelerators("gpu", ("0",)))
+    monkeypatch.setattr("experiments.dry_run.notes.find_accelerators", lambda: Accelerators("gpu", ("0",)))
     assert not told("accelerator", "slurm")
 
 

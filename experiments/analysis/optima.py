@@ -16,7 +16,17 @@ from dataclasses import dataclass
 from scipy.special import stdtrit  # not scipy.stats, which takes most of a second to import
 
 from experiments.analysis.intervals import HELD_OUT_LOSS
-from experiments.rows import OVERALL, TRAINING, TRAINING_LOSS, CurvePoint, Row, all_series, curve, difference, of_sweep
+from experiments.analysis.rows import (
+    OVERALL,
+    TRAINING,
+    TRAINING_LOSS,
+    CurvePoint,
+    Row,
+    all_series,
+    curve,
+    difference,
+    of_sweep,
+)
 from experiments.running.ledger import DIVERGED, FINISHED
 from experiments.sweeps.sweep import Sweep
 from hma_jax.evaluation.sums import add_up

@@ -20,7 +20,7 @@ from hma_jax.runtime.exits import Terminated, sigterm_as_interrupt
 T = TypeVar("T")
 
 
-def call_apart(what: str, function: Callable[..., T], *arguments: Any) -> T:
+def call_in_subprocess(what: str, function: Callable[..., T], *arguments: Any) -> T:
     """What function(*arguments) returns or raises in a new process, which has ended when this returns.
 
     All are pickled. Ctrl-C and SIGTERM are passed on, and what the function makes of them is raised here. Raises

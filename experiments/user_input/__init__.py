@@ -1,0 +1,1 @@
+"""What a user gives besides options: settings (`--set`) and Python files."""
