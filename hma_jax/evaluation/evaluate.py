@@ -8,8 +8,9 @@ of one batch are read while the devices work on the next.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import jax
@@ -17,7 +18,7 @@ import numpy as np
 from einops import rearrange
 from jax.sharding import Mesh, PartitionSpec
 
-from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ExecutionConfig, MeshConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.images import Decoder, Sample, ToImages, image_metrics, make_clips
 from hma_jax.evaluation.lpips import load_lpips
 from hma_jax.evaluation.parts import Part, Parts
@@ -29,14 +30,17 @@ from hma_jax.model.given import require_known
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, inference_params, require_params
 from hma_jax.runtime.audit import param_shardings
-from hma_jax.runtime.mesh import make_mesh
-from hma_jax.runtime.processes import compiled_by_all
+from hma_jax.runtime.mesh import make_mesh, mesh_sizes
+from hma_jax.runtime.processes import broadcast_from_writer, compiled_by_all
 from hma_jax.runtime.rows import lay_out
 from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain, replicated
 
 T = TypeVar("T")
 REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
 """Arrays of a batch that go to the devices."""
+
+WHOLE = 1 / 8
+"""Parameters that take at most this share of a device's memory are not split along `fsdp` (`evaluation_mesh`)."""
 
 STATISTICS = ("action_mean", "action_std")
 """Further ones, by default the table's."""
@@ -85,13 +89,14 @@ def evaluate(
     batches, unknown ids or robots and parameters of another model, for a model whose predictions are not finite, or as
     `make_predictor` and `lpips.load_lpips`.
     """
-    mesh = make_mesh(execution.mesh)
     # The robots' statistics are no constants of the program, so that models trained on other episodes share it.
     known, means, stds = table.standardised(), *table.statistics()
-    evaluator = make_evaluator(model, known, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     declared = declare_model(model, known, execution)
     require_params(declared, params, "these parameters are not those of the model")
     params = inference_params(declared, params, execution.dtype)  # once, and not in every pass
+    execution = replace(execution, mesh=evaluation_mesh(execution.mesh, params))
+    mesh = make_mesh(execution.mesh)
+    evaluator = make_evaluator(model, known, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
     metric_params, units = lay_out((metric_params, table.scale()), replicated(mesh))
@@ -138,6 +143,17 @@ def evaluate(
     windows = join(tables)
     require(len(windows) > 0, "the evaluation has no windows: all rows of its batches are padding")
     return Evaluation(windows, summarise(windows, config.perplexity_group), make_clips(tokenizer, samples))
+
+
+def evaluation_mesh(config: MeshConfig, params: Params) -> MeshConfig:
+    """The mesh to evaluate on: that of `config`, with the devices along `fsdp` along `data` instead if each can hold
+    all parameters. Otherwise every layer of every pass over a frame would gather its own again. Both split the
+    windows alike. Called by all processes."""
+    data, fsdp, tensor = mesh_sizes(config, jax.device_count())
+    size = sum(x.nbytes for x in jax.tree.leaves(params)) / tensor
+    memory = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", math.inf)  # CPUs do not say
+    whole = broadcast_from_writer("evaluation_mesh", "whole" if size <= WHOLE * memory else "")
+    return replace(config, data=data * fsdp, fsdp=1, tensor=tensor) if whole else config
 
 
 @functools.lru_cache(maxsize=4)  # a second evaluation of the same shapes compiles nothing

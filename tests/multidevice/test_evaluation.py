@@ -13,25 +13,31 @@ import pytest
 from hma_jax.evaluation.windows import WindowTable
 
 
-def run_on(devices: int, mesh: str, path: Path) -> WindowTable:
+def run_on(devices: int, mesh: str, path: Path, *stored: str) -> tuple[WindowTable, int]:
+    """(the windows' numbers, gathers of parameters in loops)"""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     done = subprocess.run(
-        [sys.executable, "-m", "tests.multidevice.evaluate_on_mesh", mesh, str(path)],
+        [sys.executable, "-m", "tests.multidevice.evaluate_on_mesh", mesh, str(path), *stored],
         env=os.environ | {"XLA_FLAGS": flags},
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert int(done.stdout) == devices
-    return WindowTable.load(path)
+    there, gathers = map(int, done.stdout.split())
+    assert there == devices
+    return WindowTable.load(path), gathers
 
 
 @pytest.mark.slow
 def test_numbers_do_not_depend_on_the_number_of_devices(tmp_path: Path):
     """Batches of 5 windows: with 8 devices, padded; in groups of 1 and of 4 windows."""
-    one = run_on(1, "1,1,1", tmp_path / "one.csv.gz")
-    eight = run_on(8, "2,2,2", tmp_path / "eight.csv.gz")
-    assert eight.names == one.names and len(one) == 14
-    for metric, column in one.metrics.items():
-        np.testing.assert_allclose(eight.metrics[metric], column, rtol=1e-5, atol=1e-5, err_msg=metric)
+    one, _ = run_on(1, "1,1,1", tmp_path / "one.csv.gz")
+    # Parameters whole along `fsdp`, or gathered in every pass.
+    for mesh, *stored in (("2,2,2",), ("2,2,2", "stored"), ("1,8,1",)):
+        eight, gathers = run_on(8, mesh, tmp_path / "eight.csv.gz", *stored)
+        assert gathers > 0 or not stored
+        assert gathers == 0 or mesh != "1,8,1"
+        assert eight.names == one.names and len(one) == 14
+        for metric, column in one.metrics.items():
+            np.testing.assert_allclose(eight.metrics[metric], column, rtol=1e-5, atol=1e-5, err_msg=metric)

@@ -1,13 +1,14 @@
 """The protocol over batches: what is measured, on which windows, where, and with how much memory."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig, SamplerConfig
+from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig, MeshConfig, SamplerConfig
 from hma_jax.evaluation import evaluate as module
 from hma_jax.evaluation import protocol
 from hma_jax.evaluation.evaluate import Evaluation, evaluate, in_groups, make_evaluator, one_ahead, plan_groups
@@ -91,6 +92,17 @@ def test_parameters_are_cast_once_not_in_every_pass(params, monkeypatch):
     want = inference_params(declare_model(CONFIG, TABLE), params, "bfloat16")
     assert jax.tree.map(lambda x: x.dtype, given[0]) == jax.tree.map(lambda x: x.dtype, want)
     assert given[0]["trunk"]["blocks"]["mlp_in"]["kernel"].dtype == "bfloat16"
+
+
+@pytest.mark.parametrize(("memory", "whole"), [(800, True), (799, False), (None, True)], ids=["fit", "do not", "CPU"])
+def test_parameters_that_fit_are_not_gathered_again_in_every_pass(memory, whole, monkeypatch):
+    """An eighth of a device's memory, split along `tensor` alone."""
+    stats = None if memory is None else {"bytes_limit": memory}
+    monkeypatch.setattr(jax, "device_count", lambda: 8)
+    monkeypatch.setattr(jax, "local_devices", lambda: [SimpleNamespace(memory_stats=lambda: stats)])
+    config = MeshConfig(1, -1, 2, min_shard_size=5)
+    want = MeshConfig(4, 1, 2, min_shard_size=5) if whole else config
+    assert module.evaluation_mesh(config, {"w": np.zeros(50, np.float32)}) == want
 
 
 def test_images_are_compared_as_the_host_would(params):
