@@ -56,7 +56,7 @@ UNFINISHED, REMOVED = ".unfinished", ".removed"
 """Ends of the names of a checkpoint that is being written, or removed."""
 
 TRIES = 10
-"""A save is given up once so many in a row have failed because their disk did not answer: after about five minutes."""
+"""A save is given up once so many in a row have failed because their disk did not answer: after about four minutes."""
 
 LONGEST_PAUSE = 60.0
 """Seconds, at most, before a save is repeated; the first pauses are 1, 2, 4, ... seconds."""
