@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections import Counter
@@ -28,6 +29,12 @@ ARRAY = re.compile(r"\b(?:pred|[a-z]+?(?P<bits>\d+)\w*)\[(?P<shape>[\d,]*)\]")
 PART = r"(?:\([^()]*\)|[^(),]+\[[\d,]*\])"
 SECOND = re.compile(rf"\({PART}, ({PART})")
 """In a tuple of arrays, or of tuples of arrays."""
+COMPUTATION = re.compile(r"(?:ENTRY )?%?(?P<name>[\w.-]+) \(.*\{$")
+CALL = re.compile(
+    r"\b(?:body|condition|calls|to_apply|true_computation|false_computation)=%?(?P<one>[\w.-]+)"
+    r"|\bbranch_computations=\{(?P<many>[^}]*)\}"
+)
+TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 SMALL = 2**16
 """Bytes of what is called numbers and flags below."""
 
@@ -46,6 +53,7 @@ class Collective:
 class Sent:
     count: int  # as they stand in the program's text
     bytes: int  # that one device receives, once through the text
+    whole: int  # the same in a step: in a loop as often as it runs, where the compiler knows that
 
 
 def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sent]:
@@ -54,8 +62,11 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
     devices = math.prod(mesh.values())
     counts: Counter[Collective] = Counter()
     received: Counter[Collective] = Counter()
+    whole: Counter[Collective] = Counter()
+    runs, computation = count_runs(text), ""
     channels: set[tuple[str, str]] = set()
     for line in text.splitlines():
+        computation = begun[1] if (begun := COMPUTATION.match(line)) else computation
         if (match := LINE.search(line)) is None:
             continue
         label = re.search(r'op_name="([^"]*)"', line)
@@ -73,9 +84,35 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
         over = "" if group is None else find_axes(group, mesh)
         collective = Collective(kind, over, name.count("while/body"), explain(kind, name, over, size))
         counts[collective] += 1
-        received[collective] += round(size * RECEIVED[kind](len(group or range(devices))))
+        size = round(size * RECEIVED[kind](len(group or range(devices))))
+        received[collective] += size
+        whole[collective] += size * runs.get(computation, 1)
     order = sorted(counts, key=lambda c: (-received[c], str(c)))
-    return {collective: Sent(counts[collective], received[collective]) for collective in order}
+    return {collective: Sent(counts[collective], received[collective], whole[collective]) for collective in order}
+
+
+def count_runs(text: str) -> dict[str, int]:
+    """How often each computation of a program runs. A loop counts once if the compiler does not know how often it runs;
+    of a conditional every branch counts."""
+    callers: dict[str, list[tuple[str, int]]] = {}
+    computation = ""
+    for line in text.splitlines():
+        if begun := COMPUTATION.match(line):
+            computation = begun[1]
+            callers.setdefault(computation, [])
+            continue
+        trips = TRIPS.search(line)
+        for call in CALL.finditer(line):
+            for name in (call["one"] or call["many"]).split(","):
+                callers.setdefault(name.strip().removeprefix("%"), []).append(
+                    (computation, int(trips[1]) if trips else 1)
+                )
+
+    @functools.cache
+    def runs(name: str) -> int:
+        return sum(times * runs(caller) for caller, times in callers[name]) if callers.get(name) else 1
+
+    return {name: runs(name) for name in callers}
 
 
 def count_kinds(collectives: Mapping[Collective, Sent]) -> dict[str, int]:

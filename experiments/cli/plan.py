@@ -172,6 +172,9 @@ def _print_sent(name: str, made: Plan, accumulate: int) -> None:
         f"over {c.over or 'groups not told'}: {c.purpose}"
         for c, sent in made.collectives.items()
     ]
+    if lines:
+        whole = sum(sent.whole for sent in made.collectives.values())
+        lines.append(f"in a step {size_of(whole)}: loops counted as often as they run")
     title = f"{name}: collectives, and what one device receives through those of a line, each time"
     _print_lines(title, "\n".join(lines) or "nothing")
 

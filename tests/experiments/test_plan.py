@@ -89,11 +89,11 @@ def test_collectives_are_counted_once_with_what_is_sent_over_which_axes():
         "collective-permute": 1,
     }
     to_examples = Collective("all-to-all", "fsdp", 0, "robots' parameters, to their examples")
-    assert found[to_examples] == Sent(1, 8 * 4096 * 4 // 2)
+    assert found[to_examples] == Sent(1, 8 * 4096 * 4 // 2, 8 * 4096 * 4 // 2)
     shared_out = Collective("all-to-all", "tensor", 0, "Muon's matrices, to one device each and back")
-    assert found[shared_out] == Sent(2, 2 * 4 * 4 // 2)
+    assert found[shared_out] == Sent(2, 2 * 4 * 4 // 2, 2 * 4 * 4 // 2)
     gathered = Collective("all-gather", "fsdp+tensor", 1, "parameters, from storage to compute")
-    assert found[gathered] == Sent(1, 2 * 128 * 3 // 4)
+    assert found[gathered] == Sent(1, 2 * 128 * 3 // 4, 2 * 128 * 3 // 4)
     by_axes = {c.kind: c.over for c in found}
     assert by_axes["all-reduce"] == "data" and by_axes["collective-permute"] == "fsdp"
     assert by_axes["reduce-scatter"] == "data+fsdp"
@@ -117,7 +117,27 @@ def test_a_device_receives_the_parts_of_the_others(instruction, received):
     (sent,) = find_collectives(
         f"  %a = {instruction}, replica_groups={{}}", {"data": 1, "fsdp": 8, "tensor": 1}
     ).values()
-    assert sent == Sent(1, received)
+    assert sent == Sent(1, received, received)
+
+
+NESTED = """
+%layer (p: f32[8]) -> f32[8] {
+  %a = f32[8]{0} all-reduce(%p), replica_groups={}, metadata={op_name="while/body/while/body/x"}
+}
+%micro_batch (p: f32[8]) -> f32[8] {
+  %w = f32[8]{0} while(%p), condition=%less, body=%layer, backend_config={"known_trip_count":{"n":"5"}}
+}
+ENTRY %main (p: f32[8]) -> f32[8] {
+  %b = f32[8]{0} all-reduce(%p), replica_groups={}, metadata={op_name="y"}
+  %w = f32[8]{0} while(%p), condition=%less, body=%micro_batch, backend_config={"known_trip_count":{"n":"4"}}
+}
+"""
+
+
+def test_what_is_sent_in_a_loop_counts_as_often_as_the_loop_runs():
+    """Four micro-batches sent as much as one in the sum, which counted the text."""
+    found = find_collectives(NESTED, {"data": 8, "fsdp": 1, "tensor": 1})
+    assert {c.loops: sent for c, sent in found.items()} == {2: Sent(1, 56, 20 * 56), 0: Sent(1, 56, 56)}
 
 
 @pytest.mark.parametrize(
