@@ -16,6 +16,7 @@ from experiments.applications.judging.true_rates import draw_rates, noise_of_sta
 from experiments.applications.policies import find_task, record
 from experiments.applications.policies.tasks import held, world_of
 from experiments.applications.simulators import true_worlds
+from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode
 from hma_jax.simulator.robots import Robot
 from tests.pages import rows_below, table
 
@@ -169,6 +170,23 @@ def test_a_gripper_that_keeps_still_carries_the_puck_from_no_start():
         reached.append(world.success())
     assert not held(np.stack(reached, 1), task.hold).any()
     assert "a gripper that keeps still succeeds from none" in " ".join(PAGE.read_text().split())
+
+
+def test_how_each_model_is_decoded_is_as_the_page_says():
+    decoded = {
+        name: find_decode(ROOT / "experiments" / "results" / name)
+        for name in ("simulator", "simulator_weighed", "simulator_grown")
+    }
+    assert {name: decode.temperature for name, decode in decoded.items()} == {
+        "simulator": 0.7, "simulator_weighed": 0.7, "simulator_grown": 0.0,
+    }  # fmt: skip
+    assert {decode.unmask_steps for decode in decoded.values()} == {8}
+    assert (DEFAULT_DECODE.temperature, DEFAULT_DECODE.unmask_steps) == (0.0, 2)
+    page = " ".join(PAGE.read_text().split())
+    assert "greedily unless its row says otherwise, first and weighed at temperature 0.7, all with 8 unmasking" in page
+    assert (
+        "Models without a decode.json, as `hma train` leaves them, are decoded greedily with 2 unmasking steps" in page
+    )
 
 
 ROBOTS = "pusher_sand", "arm_chalk"
