@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
@@ -26,7 +24,6 @@ from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.program import PROGRAM
-from hma_jax.config import ConfigError
 
 BEGIN_ANEW = tuple("compare report status fit convert bench plan coord-check play check branch".split())
 """Commands that keep nothing of what they had begun when they are stopped."""
@@ -67,7 +64,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments.remove("--debug")
 
     def work() -> None:
-        _require_utf8(arguments)
         app.run(
             PROGRAM,
             arguments or ["--help"],
@@ -75,20 +71,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
 
     resumes = not set(arguments[:1]) & set(BEGIN_ANEW)
-    return exit_code_of(work, debug, own_process, resumes=resumes, skipping="--set store.corrupt=skip")
-
-
-def _require_utf8(arguments: Sequence[str]) -> None:
-    """Raises ConfigError for a path that is not UTF-8, also of the working directory: checkpoints cannot lie there."""
-    here = ""
-    with suppress(OSError):  # the working directory was removed
-        here = os.getcwd()
-    for text in (*arguments, here):
-        try:
-            text.encode()
-        except UnicodeEncodeError as error:
-            shown = os.fsencode(text).decode(errors="backslashreplace")
-            raise ConfigError(
-                f"{shown} is not UTF-8, and checkpoints cannot be written or read under such a name; rename the "
-                "directory, or give another one"
-            ) from error
+    return exit_code_of(
+        work, debug, own_process, arguments=arguments, resumes=resumes, skipping="--set store.corrupt=skip"
+    )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from experiments.run_study import TrialsFailed
 from experiments.running.children import silence_background
@@ -27,20 +28,23 @@ def exit_code_of(
     debug: bool = False,
     own_process: bool = True,
     *,
+    arguments: Sequence[str] | None = None,
     resumes: bool = True,
     keeps: str = "",
     skipping: str = "",
 ) -> int:
     """Does `work` and returns the exit code; what a user can mend is one message on stderr, with `debug` or HMA_DEBUG=1
-    a traceback, as of a bug. `own_process`: the process has nothing else to do; `resumes`: after a stop the same
-    command goes on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves
-    out records that cannot be read."""
+    a traceback, as of a bug. `own_process`: the process has nothing else to do; `arguments`: the program's, of which
+    none may be a path that is not UTF-8, by default those of the process; `resumes`: after a stop the same command goes
+    on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves out records
+    that cannot be read."""
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
         silence_background()
     try:
         with sigterm_as_interrupt():
             try:
+                _require_utf8(sys.argv[1:] if arguments is None else arguments)
                 work()
             except SystemExit:  # of --help
                 sys.stdout.flush()
@@ -63,6 +67,22 @@ def exit_code_of(
         return code
     except Exception as error:  # the boundary of the program
         return _failed(error, debug, skipping)
+
+
+def _require_utf8(arguments: Sequence[str]) -> None:
+    """Raises ConfigError for a path that is not UTF-8, also of the working directory: checkpoints cannot lie there."""
+    here = ""
+    with suppress(OSError):  # the working directory was removed
+        here = os.getcwd()
+    for text in (*arguments, here):
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            shown = os.fsencode(text).decode(errors="backslashreplace")
+            raise ConfigError(
+                f"{shown} is not UTF-8, and checkpoints cannot be written or read under such a name; rename the "
+                "directory, or use another one"
+            ) from error
 
 
 def _failed(error: Exception, debug: bool, skipping: str) -> int:

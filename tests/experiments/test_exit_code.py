@@ -55,3 +55,11 @@ def test_a_disk_that_does_not_answer_is_worth_another_start_and_a_full_one_is_no
         raise SaveError("the checkpoint of step 4 could not be written", passing)
 
     assert exit_code_of(work) == code
+
+
+def test_every_program_refuses_a_path_that_is_not_utf8_before_its_work(monkeypatch, capsys):
+    """`python -m experiments.applications.ship` ended in a traceback, and called it a lack of space."""
+    monkeypatch.setattr("sys.argv", ["ship", "run", "--out", os.fsdecode(b"caf\xe9")])
+    assert exit_code_of(lambda: 1 / 0) == Exit.REFUSED
+    assert capsys.readouterr().err.startswith("error: caf\\xe9 is not UTF-8")
+    assert exit_code_of(lambda: None, arguments=["run"]) == Exit.DONE
