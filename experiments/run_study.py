@@ -23,8 +23,8 @@ from experiments.running.subprocess_call import call_in_subprocess
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
-from experiments.setting import Setting
 from experiments.study import Study
+from experiments.study_setup import StudySetup
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from experiments.terminal.progress import SweepMonitor, console, say, short
@@ -48,7 +48,7 @@ class TrialsFailed(Exception):
 
 
 def run_study(
-    setting: Setting,
+    setup: StudySetup,
     axes: Sequence[str],
     *,
     again: str,
@@ -70,18 +70,18 @@ def run_study(
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
 
-    study, workspace = setting.study, setting.workspace
-    if not setting.data:
+    study, workspace = setup.study, setup.workspace
+    if not setup.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps = plan_asked(study, axes, workspace.root)
     sources = trial_closure()  # a later change is refused by the trials
     require_trainable(study, sweeps, launcher_options)
-    if setting.data:
-        say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
+    if setup.data:
+        say_scale(setup, [point.trial for sweep in sweeps for point in sweep.points])
         say_unused(study)
-        say_points(setting, sweeps)
+        say_points(setup, sweeps)
     say_average(point.trial.train for sweep in sweeps for point in sweep.points)
-    say_prepared_here(setting, launcher_options)
+    say_prepared_here(setup, launcher_options)
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
         require_same_windows(study, workspace, replace)
@@ -89,7 +89,7 @@ def run_study(
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
         planned = plan_sweeps(study, tuple(every.values()))
         say_unplanned(workspace, planned)
-        provenance = prepare_apart(setting, replace)
+        provenance = prepare_apart(setup, replace)
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
             what = (
@@ -100,11 +100,11 @@ def run_study(
         trials = unique_trials(sweeps, provenance)
         require_agreement(workspace, shown, trials, sources, accept_code)
         kept = keep_axes(every, workspace.root)
-        if setting.arguments.registry:  # some axes are planned with it
-            write_file(workspace.registry, setting.arguments.registry.read_bytes())
+        if setup.arguments.registry:  # some axes are planned with it
+            write_file(workspace.registry, setup.arguments.registry.read_bytes())
         else:  # there may be that of a study that this one replaces
             workspace.registry.unlink(missing_ok=True)
-        record = Record(study, setting.data, kept, whole_command(setting, kept), provenance)
+        record = Record(study, setup.data, kept, whole_command(setup, kept), provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
         former = find_trained(workspace.trials, trials, provenance, None if accept_code else sources)
@@ -127,21 +127,21 @@ def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
         say(f"note: {path.name} predicts what this study does not plan: {few(lines)}. The page says so")
 
 
-def prepare_apart(setting: Setting, replace: Step | None) -> Provenance:
+def prepare_apart(setup: StudySetup, replace: Step | None) -> Provenance:
     """Prepares the study. Where there are accelerators, in a process of its own: JAX keeps them for the process that it
     computes in, and the trials need them."""
     accelerators = find_accelerators()
     if accelerators is None:
-        return _prepare(setting, replace)
+        return _prepare(setup, replace)
     from data_pipelines.registry import find_spec
 
-    specs = [find_spec(name) for name in setting.study.all_names()]
+    specs = [find_spec(name) for name in setup.study.all_names()]
     own = [spec for spec in specs if spec is not None]
-    return call_in_subprocess("prepares the data", _prepare, setting, replace, own, accelerators.kind)
+    return call_in_subprocess("prepares the data", _prepare, setup, replace, own, accelerators.kind)
 
 
 def _prepare(
-    setting: Setting, replace: Step | None, specs: Sequence[DatasetSpec] = (), accelerator: str = ""
+    setup: StudySetup, replace: Step | None, specs: Sequence[DatasetSpec] = (), accelerator: str = ""
 ) -> Provenance:
     """`specs`: registry entries, of which a new process lacks the user's own; `accelerator`: the kind that is here."""
     require_accelerator(accelerator)
@@ -149,7 +149,7 @@ def _prepare(
     from experiments.preparing.pipeline import prepare
 
     register(specs)
-    return prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
+    return prepare(setup.study, setup.workspace, setup.data, setup.tokenizer, replace=replace)
 
 
 def make_jobs(
@@ -184,14 +184,14 @@ def say_trained(jobs: Sequence[Job], former: Collection[str], workspace: Workspa
         console.print(f"{count} of {len(missing)} trials to be run {what}")
 
 
-def whole_command(setting: Setting, axes: Sequence[str]) -> str:
+def whole_command(setup: StudySetup, axes: Sequence[str]) -> str:
     """The command line that runs all `axes` of the study anew, whichever commands ran them; files of axes are relative
     to its directory."""
-    paths = [short(setting.workspace.root / axis) if is_file(axis) else axis for axis in axes]
-    settings = [one for one in setting.arguments.set if one.partition("=")[0].strip() != "axes"]
-    if tuple(axes) != get_preset(setting.arguments.preset).axes:
+    paths = [short(setup.workspace.root / axis) if is_file(axis) else axis for axis in axes]
+    settings = [one for one in setup.arguments.set if one.partition("=")[0].strip() != "axes"]
+    if tuple(axes) != get_preset(setup.arguments.preset).axes:
         settings.append(f"axes={','.join(paths)}")
-    return dataclasses.replace(setting, arguments=dataclasses.replace(setting.arguments, set=tuple(settings))).command(
+    return dataclasses.replace(setup, arguments=dataclasses.replace(setup.arguments, set=tuple(settings))).command(
         "study"
     )
 

@@ -17,7 +17,7 @@ from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches, subsample_windows
 from experiments.running.run_trial import PreparedData, open_prepared_data
 from experiments.running.workspace import Workspace
-from experiments.setting import command_words
+from experiments.study_setup import command_words
 from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.evaluation.effects import MIN_EPISODES, Effect, find_effects, make_loss

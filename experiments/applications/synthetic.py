@@ -79,7 +79,7 @@ from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.running.workspace import Workspace
-from experiments.setting import use_entries
+from experiments.study_setup import use_entries
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import DecodeConfig, require

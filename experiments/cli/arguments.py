@@ -11,7 +11,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, UseAppendAction, arg
 from experiments.preparing.made_from import Step
 from experiments.running.launchers.registry import LAUNCHERS
 from experiments.running.run_options import RunOptions
-from experiments.setting import UNSET, StudyArguments, require_local
+from experiments.study_setup import UNSET, StudyArguments, require_local
 
 
 @dataclass(frozen=True)

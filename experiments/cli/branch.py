@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 from experiments.terminal.progress import say, short, wrote
 
 

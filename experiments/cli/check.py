@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from experiments.running.workspace import Workspace
-from experiments.setting import UNSET, require_local
+from experiments.study_setup import UNSET, require_local
 from experiments.terminal.progress import console, say, step, tidy_table
 from experiments.terminal.words import plus_minus
 from hma_jax.config import require

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from experiments.cli.arguments import StudyOptions
-from experiments.setting import make_setting
+from experiments.study_setup import make_setup
 from experiments.terminal.progress import console, say, step, tidy_table, wrote
 from hma_jax.config import require
 
@@ -42,12 +42,12 @@ def coord_check(
     """
     require(steps >= 1, f"--steps must be at least 1, got {steps}")
     require(seeds >= 1, f"--seeds must be at least 1, got {seeds}")
-    setting = make_setting(arguments)
+    setup = make_setup(arguments)
 
     from experiments.bench.coord_check import choose_widths, measure_widths, write_sizes
     from experiments.report.plot_coords import plot_coords
 
-    study, out = setting.study, setting.workspace.root
+    study, out = setup.study, setup.workspace.root
     rate = study.train.optimizer.learning_rate if learning_rate is None else learning_rate
     chosen = choose_widths(study.model, widths)
     with step(f"train {study.name} at widths {', '.join(map(str, chosen))}") as update:

@@ -14,7 +14,7 @@ from experiments.cli.hosts import Hosts
 from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
 from experiments.running.attempts import EVALUATING, JOB
 from experiments.running.result_file import SAMPLES
-from experiments.setting import UNSET, Setting, make_setting, require_local, under_another_name
+from experiments.study_setup import UNSET, StudySetup, make_setup, require_local, under_another_name
 from experiments.terminal.progress import TidyTable, console, short, step, tidy_table, wrote
 from experiments.terminal.words import few, plus_minus
 from hma_jax.config import ConfigError, Weights, require
@@ -59,11 +59,11 @@ def evaluate(
             Without it they are kept, and the command is refused.
     """
     hosts.join()
-    evaluate_model(make_setting(arguments), run, weights, to, replace)
+    evaluate_model(make_setup(arguments), run, weights, to, replace)
 
 
 def evaluate_model(
-    setting: Setting, run: Path, weights: Weights, to: Path | None = None, replace: bool = False
+    setup: StudySetup, run: Path, weights: Weights, to: Path | None = None, replace: bool = False
 ) -> None:
     """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may
     be replaced."""
@@ -79,10 +79,10 @@ def evaluate_model(
     trained = load_run(run, weights)  # into memory of the host: it may be too large for one device
     # Before the work: its results can be written, and by no other process.
     with locked_run(to or run, EVALUATION) if is_writer() else nullcontext():
-        _evaluate(setting, run, trained, to or run, replace)
+        _evaluate(setup, run, trained, to or run, replace)
 
 
-def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: bool) -> None:
+def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: bool) -> None:
     import jax
 
     from experiments.running.provenance import closure_hash, trial_closure
@@ -91,9 +91,9 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
 
-    _require_known_data(setting, trained)
-    require_prepared(setting)
-    prepared = open_prepared_data(setting.workspace)
+    _require_known_data(setup, trained)
+    require_prepared(setup)
+    prepared = open_prepared_data(setup.workspace)
     check_fits(trained, prepared)
     frozen, untrained = set(prepared.manifest.names), _not_trained_on(trained, prepared)
     masking = trained.train.masking
@@ -113,19 +113,19 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             f"note: not evaluated, because the model was not trained on them: {', '.join(unseen)}", soft_wrap=True
         )
     names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
-    besides = [name for name in names if setting.data and name not in setting.study.dataset_names()]
+    besides = [name for name in names if setup.data and name not in setup.study.dataset_names()]
     if besides:
         console.print(
-            f"note: all windows that are frozen in {short(setting.workspace.root)} are evaluated, also those of "
+            f"note: all windows that are frozen in {short(setup.workspace.root)} are evaluated, also those of "
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
-    _note_other_data(setting, prepared)
+    _note_other_data(setup, prepared)
     note_possible_leakage(trained, names, prepared.store)
-    made_from = describe_evaluation(trained, names, prepared, setting.study.eval)
+    made_from = describe_evaluation(trained, names, prepared, setup.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)
-    execution = setting.study.execution
+    execution = setup.study.execution
     depends = lambda: [made_from.identity(), to_dict(execution), closure_hash(trial_closure())]
     parts = Parts(place / EVALUATING, depends) if jax.process_count() == 1 else None
     with step(f"evaluate {short(run)}") as update:
@@ -135,7 +135,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             trained.model,
             trained.table,
             prepared,
-            setting.study.eval,
+            setup.study.eval,
             masking.setting,
             execution=execution,
             progress=lambda phase, done, total: update(done, total, phase),
@@ -170,13 +170,13 @@ def table_of(summary: Summary, title: str) -> TidyTable:
     return table
 
 
-def _note_other_data(setting: Setting, prepared: PreparedData) -> None:
+def _note_other_data(setup: StudySetup, prepared: PreparedData) -> None:
     """Prints a note where the windows were frozen on other recordings than those that --data and --registry give."""
     from experiments.preparing.store import data_differences
 
-    if lines := data_differences(setting.study, setting.workspace, setting.data, prepared.tokenizer):
+    if lines := data_differences(setup.study, setup.workspace, setup.data, prepared.tokenizer):
         console.print(
-            f"note: the windows that are frozen in {short(setting.workspace.root)} are evaluated, whose tokens were made "
+            f"note: the windows that are frozen in {short(setup.workspace.root)} are evaluated, whose tokens were made "
             f"from other data than --data and the registry give (there -> given): {'; '.join(lines)}",
             soft_wrap=True,
         )
@@ -220,18 +220,18 @@ def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStor
     return found
 
 
-def require_prepared(setting: Setting) -> None:
+def require_prepared(setup: StudySetup) -> None:
     """Raises ConfigError, with the command that makes it, unless everything is there that evaluation reads."""
-    workspace = setting.workspace
+    workspace = setup.workspace
     missing = [str(p) for p in (workspace.store, workspace.tokenizer, workspace.manifest) if not p.exists()]
-    require(not missing, f"{', '.join(missing)}: not made yet; run `{setting.command('tokenize')}`")
+    require(not missing, f"{', '.join(missing)}: not made yet; run `{setup.command('tokenize')}`")
 
 
-def _require_known_data(setting: Setting, trained: Run) -> None:
+def _require_known_data(setup: StudySetup, trained: Run) -> None:
     """Raises ConfigError where tokens are still to be made, of datasets of which the model knows none."""
-    known, given = trained.table.names, setting.study.dataset_names()
+    known, given = trained.table.names, setup.study.dataset_names()
     require(
-        not setting.data or setting.workspace.manifest.exists() or bool(set(known) & set(given)),
+        not setup.data or setup.workspace.manifest.exists() or bool(set(known) & set(given)),
         f"the model knows {few(known)}, but --data has {few(given)}. {under_another_name(given)}",
     )
 

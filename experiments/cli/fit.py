@@ -11,7 +11,7 @@ from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.running.workspace import Workspace, load_record
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, say, short, wrote
 from hma_jax.config import ConfigError, require
 

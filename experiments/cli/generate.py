@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.setting import UNSET, command, require_local, use_entries
+from experiments.study_setup import UNSET, command, require_local, use_entries
 from experiments.terminal.progress import Eta, console, say, step, wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.config.base import require_seed

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 
 if TYPE_CHECKING:
     from hma_jax.runtime.processes import Processes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from experiments.cli.evaluate import check_tokenizer, tokenizer_mismatch
 from experiments.running.workspace import Workspace
-from experiments.setting import Setting, StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, StudySetup, make_setup
 from experiments.terminal.progress import short
 from experiments.terminal.words import few
 from hma_jax.config import require
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 
-def setting_of(source: Path, trained: Run, arguments: StudyArguments) -> Setting:
+def setup_of(source: Path, trained: Run, arguments: StudyArguments) -> StudySetup:
     """The study that goes on from the model `trained`, which is in the directory `source`. Writes nothing.
 
     Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
@@ -29,35 +29,35 @@ def setting_of(source: Path, trained: Run, arguments: StudyArguments) -> Setting
 
     arguments = arguments.anywhere()
     arguments = dataclasses.replace(arguments, tokenizer=_find_tokenizer(source, trained, arguments))
-    setting = make_setting(arguments, trained.model)
-    lines = diff(trained.model, setting.study.model, "model")
+    setup = make_setup(arguments, trained.model)
+    lines = diff(trained.model, setup.study.model, "model")
     require(
         not lines,
         f"{short(source)} is another model than --set asks for (there -> asked for): {'; '.join(lines)}. Leave out "
         "settings of the model: they are taken from there",
     )
-    for name in known_datasets(trained, setting):
-        get_spec(name).check_compatible(trained.table.entries[trained.table.index(name)], setting.study.rate)
-    return setting
+    for name in known_datasets(trained, setup):
+        get_spec(name).check_compatible(trained.table.entries[trained.table.index(name)], setup.study.rate)
+    return setup
 
 
-def known_datasets(trained: Run, setting: Setting) -> list[str]:
+def known_datasets(trained: Run, setup: StudySetup) -> list[str]:
     """The datasets of a study whose robots a model knows."""
-    return [name for name in setting.study.dataset_names() if name in trained.table.names]
+    return [name for name in setup.study.dataset_names() if name in trained.table.names]
 
 
-def new_datasets(trained: Run, setting: Setting) -> list[str]:
+def new_datasets(trained: Run, setup: StudySetup) -> list[str]:
     """The datasets of a study whose robots a model does not know."""
-    return [name for name in setting.study.dataset_names() if name not in trained.table.names]
+    return [name for name in setup.study.dataset_names() if name not in trained.table.names]
 
 
-def require_known(source: Path, trained: Run, setting: Setting) -> None:
+def require_known(source: Path, trained: Run, setup: StudySetup) -> None:
     """Raises ConfigError unless a model knows every robot of the study."""
-    new = new_datasets(trained, setting)
+    new = new_datasets(trained, setup)
     require(
         not new,
         f"{short(source)} knows {few(trained.table.names)}, not {few(new)}. To add them: "
-        f"{setting.command('adapt', source)} --run NEW",
+        f"{setup.command('adapt', source)} --run NEW",
     )
 
 

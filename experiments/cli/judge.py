@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.setting import UNSET, command, use_entries
+from experiments.study_setup import UNSET, command, use_entries
 from experiments.terminal.progress import console, say, step, tidy_table, wrote
 from hma_jax.config import require
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from experiments.cli.bench.arguments import Model
-from experiments.setting import UNSET, Preset, StudyArguments, make_setting
+from experiments.study_setup import UNSET, Preset, StudyArguments, make_setup
 from experiments.terminal.progress import console, say, step, tidy_table
 from experiments.terminal.words import counted
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
@@ -147,7 +147,7 @@ def _choose_model(
         "--model, --batch, --robots, --dtype and --remat cannot be used with --preset; set model.*, train.batch, "
         "datasets, execution.dtype and execution.remat with --set",
     )
-    study = make_setting(arguments).study
+    study = make_setup(arguments).study
     trial = reference_trial(study, study.seeds[0])
     table = declared_table(trial.datasets, trial.rate)
     what = f"{study.name}, width {study.model.width}, {counted(table.size, 'robot')}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.applications import DRIVEN
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, say
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError, ExecutionConfig, require

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, short
 from experiments.terminal.words import counted
 from hma_jax.config import require

@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningArguments, StudyOptions
 from experiments.running.launchers.registry import LauncherOptions
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import AXES, is_file, plan_asked
 from experiments.terminal.progress import console
 from hma_jax.config import ConfigError, require
@@ -70,8 +70,8 @@ def _run(
     axes: tuple[str, ...] = (),
 ) -> None:
     """`axes`: () for those of the study."""
-    setting = make_setting(arguments)
-    axes = axes or setting.study.axes
+    setup = make_setup(arguments)
+    axes = axes or setup.study.axes
     require(bool(axes), "axes is empty: the study has no sweep to run; set some, such as --set axes=width,datasets")
     grid = [name for name in arguments.chosen() if name.startswith("transfer.")]
     require(
@@ -88,27 +88,27 @@ def _run(
         from experiments.dry_run.trainable import check_launched
         from experiments.preparing.sources import check_entries
 
-        sweeps = plan_asked(setting.study, axes, setting.workspace.root)
-        given, trained = bool(setting.data), setting.tokenizer is None
+        sweeps = plan_asked(setup.study, axes, setup.workspace.root)
+        given, trained = bool(setup.data), setup.tokenizer is None
         if given:
-            check_entries(setting.study, setting.data)
-        each = check_launched(setting.study, sweeps, launcher_options) * launcher_options.cores_each()
+            check_entries(setup.study, setup.data)
+        each = check_launched(setup.study, sweeps, launcher_options) * launcher_options.cores_each()
         devices = Devices(each, launcher_options.at_once)
-        done = find_done(setting, sweeps, running.retry_failed, running.accept_code)
-        console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))
+        done = find_done(setup, sweeps, running.retry_failed, running.accept_code)
+        console.print(plan_table(setup.study, sweeps, devices, given=given, trained=trained, done=done))
         if given:
-            say_scale(setting, [point.trial for sweep in sweeps for point in sweep.points])
-            say_unused(setting.study)
-            say_points(setting, sweeps)
+            say_scale(setup, [point.trial for sweep in sweeps for point in sweep.points])
+            say_unused(setup.study)
+            say_points(setup, sweeps)
         say_average(point.trial.train for sweep in sweeps for point in sweep.points)
-        say_prepared_here(setting, launcher_options)
+        say_prepared_here(setup, launcher_options)
         return
     from experiments.run_study import run_study
 
     run_study(
-        setting,
+        setup,
         axes,
-        again=setting.command(*words, *running.words(), "--retry-failed", *["--accept-code"] * running.accept_code),
+        again=setup.command(*words, *running.words(), "--retry-failed", *["--accept-code"] * running.accept_code),
         launcher_options=launcher_options,
         retry_failed=running.retry_failed,
         accept_code=running.accept_code,

@@ -15,7 +15,7 @@ from data_pipelines.errors import MAX_LISTED
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.running.workspace import Busy, Workspace
-from experiments.setting import Setting, make_setting
+from experiments.study_setup import StudySetup, make_setup
 from experiments.sweeps.sweep import reference_trial
 from experiments.terminal.progress import console, short, tidy_table, wrote
 from hma_jax.config import require
@@ -43,36 +43,36 @@ def tokenize(
         batch: Frames encoded at a time, at least: rounded up to what fills all devices. Does not change any token.
         threads: Threads that decode frames, to train a tokenizer as well.
     """
-    prepare_together(make_setting(arguments), batch, threads, replacement.replace)
+    prepare_together(make_setup(arguments), batch, threads, replacement.replace)
 
 
 def prepare_together(
-    setting: Setting, batch: int | None = None, threads: int | None = None, replace: Step | None = None
+    setup: StudySetup, batch: int | None = None, threads: int | None = None, replace: Step | None = None
 ) -> None:
     """Everything up to training. If another command prepares the same directory, takes part in its tokenising."""
     from experiments.preparing.pipeline import prepare
 
     for option, value in (("--batch", batch), ("--threads", threads)):  # before a tokenizer is trained for hours
         require(value is None or value >= 1, f"{option} must be at least 1, got {value}")
-    if setting.data:
+    if setup.data:
         from experiments.dry_run.notes import say_scale
 
-        whole = reference_trial(setting.study, setting.study.seeds[0])
-        say_scale(setting, [dataclasses.replace(whole, max_trajectories=None)])
+        whole = reference_trial(setup.study, setup.study.seeds[0])
+        say_scale(setup, [dataclasses.replace(whole, max_trajectories=None)])
     with ExitStack() as stack:
         try:
-            stack.enter_context(setting.workspace.locked())
+            stack.enter_context(setup.workspace.locked())
         except Busy as busy:
-            _take_part(setting, busy, batch, threads, replace)
+            _take_part(setup, busy, batch, threads, replace)
         else:
             prepare(
-                setting.study, setting.workspace, setting.data, setting.tokenizer,
+                setup.study, setup.workspace, setup.data, setup.tokenizer,
                 replace=replace, batch=batch, threads=threads,
             )  # fmt: skip
-    _finish(setting)
+    _finish(setup)
 
 
-def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
+def _take_part(setup: StudySetup, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
     """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
     from experiments.preparing.asked import require_same_asked
     from experiments.preparing.given_tokenizer import require_same_tokenizer
@@ -80,38 +80,38 @@ def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | N
     from experiments.preparing.store import make_store
     from experiments.preparing.windows import require_same_windows
 
-    study, workspace = setting.study, setting.workspace
+    study, workspace = setup.study, setup.workspace
     if replace is not None:
         raise Busy(f"{busy}; with --replace no other command may use the directory", busy.holder)
-    tokenizer = setting.tokenizer or workspace.tokenizer
+    tokenizer = setup.tokenizer or workspace.tokenizer
     if not tokenizer.is_dir():
-        advice = f"Start this again when the tokenizer exists, or train it first: {setting.command('tokenizer train')}"
+        advice = f"Start this again when the tokenizer exists, or train it first: {setup.command('tokenizer train')}"
         raise Busy(f"{tokenizer}: no tokenizer yet, and {busy}. {advice}", busy.holder)
     require_same_windows(study, workspace, None)
-    if setting.data:
-        sources = find_sources(study, setting.data)
+    if setup.data:
+        sources = find_sources(study, setup.data)
     else:
-        advice = f"Start this again when they exist, or make them first: {setting.command('data suite')}"
+        advice = f"Start this again when they exist, or make them first: {setup.command('data suite')}"
         sources = find_suite(study, workspace, advice)
-    require_same_asked(study, workspace, sources, setting.tokenizer, busy)
-    require_same_tokenizer(setting.tokenizer, study, workspace, sources)
+    require_same_asked(study, workspace, sources, setup.tokenizer, busy)
+    require_same_tokenizer(setup.tokenizer, study, workspace, sources)
     console.print(f"sharing the work with {busy.who}, which prepares {short(workspace.root)}", soft_wrap=True)
     make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)
-    _freeze(setting, sources)
+    _freeze(setup, sources)
 
 
-def _freeze(setting: Setting, sources: Sequence[Source]) -> None:
+def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
     """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
     from data_pipelines.publishing.output_lock import backoff
     from experiments.preparing.given_tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
-    study, workspace, announced = setting.study, setting.workspace, False
+    study, workspace, announced = setup.study, setup.workspace, False
     for pause in backoff():
         try:
             with workspace.locked():
-                if setting.tokenizer is not None:
-                    adopt_tokenizer(setting.tokenizer, study, workspace, sources)
+                if setup.tokenizer is not None:
+                    adopt_tokenizer(setup.tokenizer, study, workspace, sources)
                 freeze_windows(study, workspace)
             return
         except Busy as busy:
@@ -124,10 +124,10 @@ def _freeze(setting: Setting, sources: Sequence[Source]) -> None:
         time.sleep(pause)
 
 
-def _finish(setting: Setting) -> None:
-    workspace = setting.workspace
-    show_store(workspace, setting.study.rate)
-    wrote(workspace.store, workspace.manifest, then=setting.command("train"))
+def _finish(setup: StudySetup) -> None:
+    workspace = setup.workspace
+    show_store(workspace, setup.study.rate)
+    wrote(workspace.store, workspace.manifest, then=setup.command("train"))
 
 
 def show_store(workspace: Workspace, rate: float | None) -> None:

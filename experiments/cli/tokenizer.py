@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
-from experiments.setting import Setting, command, make_setting
+from experiments.study_setup import StudySetup, command, make_setup
 from experiments.terminal.progress import console, short, step, wrote
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ HELP = "Train an image tokenizer, import published weights, or make one of pixel
 @tokenizer_app.command(name="train")
 def tokenizer_train(arguments: StudyOptions, replacement: ReplaceOptions) -> None:
     """Train the study's image tokenizer on its datasets."""
-    train_tokenizer(make_setting(arguments), replacement.replace)
+    train_tokenizer(make_setup(arguments), replacement.replace)
 
 
 @tokenizer_app.command(name="import")
@@ -78,16 +78,16 @@ def pixels(
     _write(PixelTokenizer(PixelsConfig(image_size=image_size, patch=patch)), out)
 
 
-def train_tokenizer(setting: Setting, replace: Step | None) -> None:
+def train_tokenizer(setup: StudySetup, replace: Step | None) -> None:
     from experiments.preparing.sources import find_sources
     from experiments.preparing.suite import make_suite
     from experiments.preparing.tokenizer import make_tokenizer
 
-    study, workspace = setting.study, setting.workspace
+    study, workspace = setup.study, setup.workspace
     with workspace.locked():
-        sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace, replace)
+        sources = find_sources(study, setup.data) if setup.data else make_suite(study, workspace, replace)
         make_tokenizer(study, workspace, sources, replace)
-    wrote(workspace.tokenizer, then=setting.command("tokenize"))
+    wrote(workspace.tokenizer, then=setup.command("tokenize"))
 
 
 def _write(tokenizer: BaseTokenizer, out: Path) -> None:

@@ -17,13 +17,13 @@ from experiments.cli.initial_model import (
     new_datasets,
     require_known,
     require_other_directory,
-    setting_of,
+    setup_of,
 )
 from experiments.preparing.made_from import Step, may_replace
 from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
 from experiments.running.workspace import Workspace
-from experiments.setting import UNSET, Setting, StudyArguments, make_setting
+from experiments.study_setup import UNSET, StudyArguments, StudySetup, make_setup
 from experiments.sweeps.sweep import reference_trial
 from experiments.terminal.progress import console, say, short, step, wrote
 from experiments.terminal.words import counted, few
@@ -70,23 +70,23 @@ def train(
         hosts.join()
     run = model.directory() or arguments.anywhere().out / "model"
     trained = None if initial is None else _load_initial(initial, run)
-    setting = make_setting(arguments) if trained is None else setting_of(initial, trained, arguments)
-    _say_swept(setting)
-    _say_average(setting)
+    setup = make_setup(arguments) if trained is None else setup_of(initial, trained, arguments)
+    _say_swept(setup)
+    _say_average(setup)
     if trained is not None:
-        require_known(initial, trained, setting)
+        require_known(initial, trained, setup)
         require_other_directory(initial, run)
     if dry_run:
         from experiments.preparing.sources import check_entries
 
-        _check(setting, run, model.trajectories, options, trained)
-        if setting.data:
-            check_entries(setting.study, setting.data)
-        _print_cost(setting, _single_trial(setting, model.trajectories), run, hosts.count())
+        _check(setup, run, model.trajectories, options, trained)
+        if setup.data:
+            check_entries(setup.study, setup.data)
+        _print_cost(setup, _single_trial(setup, model.trajectories), run, hosts.count())
         if trained is None:
-            _say_scale(setting, model.trajectories)
+            _say_scale(setup, model.trajectories)
         return
-    train_model(setting, run, options, trajectories=model.trajectories, replace=replacement.replace, initial=trained)
+    train_model(setup, run, options, trajectories=model.trajectories, replace=replacement.replace, initial=trained)
 
 
 def adapt(
@@ -127,7 +127,7 @@ def adapt(
 
 
 def train_model(
-    setting: Setting,
+    setup: StudySetup,
     run: Path,
     options: RunOptions,
     *,
@@ -137,18 +137,18 @@ def train_model(
 ) -> None:
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
     the run `initial` on where one is given, which knows its robots."""
-    origin = _check(setting, run, trajectories, options, initial)
-    _require_devices(setting)
+    origin = _check(setup, run, trajectories, options, initial)
+    _require_devices(setup)
     if initial is None:
-        _say_scale(setting, trajectories)
-    _prepare(setting, replace)
+        _say_scale(setup, trajectories)
+    _prepare(setup, replace)
     start = {}
     if initial is not None:
-        kept = [name for name in initial.table.names if name not in known_datasets(initial, setting)]
+        kept = [name for name in initial.table.names if name not in known_datasets(initial, setup)]
         if kept:
             console.print(f"note: unchanged, because the study has no data of them: {', '.join(kept)}", soft_wrap=True)
         start = {"table": initial.table, "initial": initial.params, "origin": origin}
-    _train(setting, _single_trial(setting, trajectories), run, options, **start)
+    _train(setup, _single_trial(setup, trajectories), run, options, **start)
 
 
 def adapt_model(
@@ -168,38 +168,38 @@ def adapt_model(
 
     run = run or arguments.anywhere().out / "model"
     trained, gone = _load_initial(source, run), not source.exists()
-    setting = setting_of(source, trained, arguments)
-    study = setting.study
+    setup = setup_of(source, trained, arguments)
+    study = setup.study
     # Of a source that is gone `run` itself is read, which has the new robots already.
-    new = list(trained.train.only) or study.dataset_names() if gone else new_datasets(trained, setting)
+    new = list(trained.train.only) or study.dataset_names() if gone else new_datasets(trained, setup)
     require(
         bool(new),
         f"{short(source)} already knows {few(study.dataset_names())}: there is nothing to add. To train it on: "
-        f"{setting.command('train', '--from', source)} --run NEW",
+        f"{setup.command('train', '--from', source)} --run NEW",
     )
     require(
         not study.train.only,
         "leave out train.only: `hma adapt` trains only the new robots' parameters, or all with --everything",
     )
-    _say_average(setting)
+    _say_average(setup)
     require_other_directory(source, run)
-    origin = _check(setting, run, trajectories, options, trained)
+    origin = _check(setup, run, trajectories, options, trained)
     train = dataclasses.replace(study.train, seed=study.seeds[0], only=() if everything else tuple(new))
     require_only(train, new, study.rate)
-    _require_devices(setting)
-    _prepare(setting, replace)
-    trial = dataclasses.replace(_single_trial(setting, trajectories), train=train)
+    _require_devices(setup)
+    _prepare(setup, replace)
+    trial = dataclasses.replace(_single_trial(setup, trajectories), train=train)
     if gone:
         beginning = {"table": trained.table, "initial": trained.params, "origin": origin}
     else:
-        beginning = add_robots(trained, trial, open_prepared_data(setting.workspace)) | {"origin": origin}
+        beginning = add_robots(trained, trial, open_prepared_data(setup.workspace)) | {"origin": origin}
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
-    _train(setting, trial, run, options, **beginning)
+    _train(setup, trial, run, options, **beginning)
 
 
 def _check(
-    setting: Setting, run: Path, trajectories: int | None, options: RunOptions, initial: Run | None
+    setup: StudySetup, run: Path, trajectories: int | None, options: RunOptions, initial: Run | None
 ) -> dict[str, Any] | None:
     """The origin of the run (`_origin_of`). Raises ConfigError, before any work, for invalid options and for a run that
     was not trained here, or began with another model."""
@@ -208,19 +208,19 @@ def _check(
 
     options.check()
     require_plain(run)
-    _require_free(setting, run)
-    _require_no_trial(setting, run)
-    check_schedule(setting.study.train.optimizer, setting.study.train.steps)
-    require_only(setting.study.train, setting.study.dataset_names(), setting.study.rate)
+    _require_free(setup, run)
+    _require_no_trial(setup, run)
+    check_schedule(setup.study.train.optimizer, setup.study.train.steps)
+    require_only(setup.study.train, setup.study.dataset_names(), setup.study.rate)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
-    _require_trained_here(setting, run)
+    _require_trained_here(setup, run)
     return _origin_of(run, initial)
 
 
-def _require_free(setting: Setting, run: Path) -> None:
+def _require_free(setup: StudySetup, run: Path) -> None:
     """Raises ConfigError for a run that would lie among what a study made: as its own directory, of which no
     application would find tokenizer and tokens beside the run, or in the place of a part of it."""
-    study = setting.workspace
+    study = setup.workspace
     parts = (study.suite, study.tokenizer, study.store, study.trials, study.predictions, study.figures)
     there = run.resolve()
     whole = there == study.root.resolve() or Workspace(run).manifest.exists() or Workspace(run).record.exists()
@@ -231,17 +231,17 @@ def _require_free(setting: Setting, run: Path) -> None:
     )
 
 
-def _require_no_trial(setting: Setting, run: Path) -> None:
+def _require_no_trial(setup: StudySetup, run: Path) -> None:
     """Raises ConfigError for the run of a trial: its result vouches for the log as it is, and its study for the
     steps."""
     require(
         run.name != RUN or not (run.absolute().parent / JOB).is_file(),
         f"{short(run)} is the run of a trial, and its study would refuse what was trained on; to train its model further: "
-        f"{setting.command('train', '--from', run)} --run NEW",
+        f"{setup.command('train', '--from', run)} --run NEW",
     )
 
 
-def _require_trained_here(setting: Setting, run: Path) -> None:
+def _require_trained_here(setup: StudySetup, run: Path) -> None:
     """Raises ConfigError for a run that was converted: it was trained on no data that training could go on with."""
     step, described = _newest(run)
     # What has no table is no model, of which the restoring speaks too. Training saves nothing before its first step:
@@ -249,7 +249,7 @@ def _require_trained_here(setting: Setting, run: Path) -> None:
     require(
         "table" not in described or (step > 0 and "loader" in described["provenance"]),
         f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
-        f"{setting.command('train', '--from', run)} --run NEW",
+        f"{setup.command('train', '--from', run)} --run NEW",
     )
 
 
@@ -306,71 +306,69 @@ def _load_initial(source: Path, run: Path) -> Run:
     return dataclasses.replace(load_run(run), step=origin["step"], provenance=origin["provenance"])
 
 
-def _require_devices(setting: Setting) -> None:
+def _require_devices(setup: StudySetup) -> None:
     """Raises ConfigError, before any work, for a mesh that does not fit the devices here, the batch or the model."""
     from hma_jax.runtime.mesh import check_mesh, make_mesh
 
-    study, execution = setting.study, setting.study.execution
+    study, execution = setup.study, setup.study.execution
     check_mesh(make_mesh(execution.mesh), study.model, study.train.batch, execution.accumulate)
 
 
-def _prepare(setting: Setting, replace: Step | None) -> None:
+def _prepare(setup: StudySetup, replace: Step | None) -> None:
     from experiments.preparing.pipeline import prepare
     from hma_jax.runtime.processes import is_writer, writer_first
 
-    _require_no_tokenizer_training(setting, replace)
+    _require_no_tokenizer_training(setup, replace)
     with writer_first("data"):
         if is_writer():
-            with setting.workspace.locked():
-                prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
+            with setup.workspace.locked():
+                prepare(setup.study, setup.workspace, setup.data, setup.tokenizer, replace=replace)
 
 
-def _require_no_tokenizer_training(setting: Setting, replace: Step | None) -> None:
+def _require_no_tokenizer_training(setup: StudySetup, replace: Step | None) -> None:
     """Raises ConfigError, in all of several processes, where process 0 would train a tokenizer while it prepares alone:
     training waits for all of them."""
     import jax
 
     again = may_replace("tokenizer", replace)
-    there = setting.workspace.tokenizer.exists() and not again
-    first = setting.command("tokenizer train", *(["--replace", replace] if again and replace else []))
+    there = setup.workspace.tokenizer.exists() and not again
+    first = setup.command("tokenizer train", *(["--replace", replace] if again and replace else []))
     require(
-        jax.process_count() == 1 or setting.tokenizer is not None or there,
+        jax.process_count() == 1 or setup.tokenizer is not None or there,
         f"several processes do not train a tokenizer: first run `{first}` in one process, then this command"
         f"{' with --replace tokens' if again else ''}; or give a tokenizer with --tokenizer",
     )
 
 
-def _say_swept(setting: Setting) -> None:
+def _say_swept(setup: StudySetup) -> None:
     """Names the settings that were given and only sweeps have."""
-    first, *more = setting.study.seeds
-    names = {
-        path: "seeds beyond the first" if path == "seeds" and more else path for path in setting.arguments.chosen()
-    }
+    first, *more = setup.study.seeds
+    names = {path: "seeds beyond the first" if path == "seeds" and more else path for path in setup.arguments.chosen()}
     without = [name for path, name in names.items() if name != "seeds" and path.split(".")[0] in SWEPT]
     if without:
         say(f"note: one model is trained, of seed {first}; without effect: {', '.join(without)}")
 
 
-def _say_scale(setting: Setting, trajectories: int | None) -> None:
+def _say_scale(setup: StudySetup, trajectories: int | None) -> None:
     from experiments.dry_run.notes import say_scale
 
-    if setting.data:
-        say_scale(setting, [_single_trial(setting, trajectories)])
+    if setup.data:
+        say_scale(setup, [_single_trial(setup, trajectories)])
 
 
-def _say_average(setting: Setting) -> None:
+def _say_average(setup: StudySetup) -> None:
     from experiments.dry_run.notes import say_average
 
-    say_average([setting.study.train])
+    say_average([setup.study.train])
 
 
-def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
+def _single_trial(setup: StudySetup, trajectories: int | None) -> Trial:
     """The reference trial, but that the largest number of trajectories in a sweep does not bound it."""
-    study = setting.study
+    study = setup.study
     return dataclasses.replace(reference_trial(study, study.seeds[0]), max_trajectories=trajectories)
 
 
-def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> None:
+def _print_cost(setup: StudySetup, trial: Trial, run: Path, processes: int) -> None:
     """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so
     many `processes` as this one."""
     from experiments.dry_run.done import UNKNOWN, find_prepared
@@ -381,24 +379,24 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import Point, Sweep
 
-    mesh, own = setting.study.execution.mesh, LauncherOptions().share()
+    mesh, own = setup.study.execution.mesh, LauncherOptions().share()
     share = own * processes if own else float(max(processes, mesh.min_devices))
     model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
-    devices = Devices(check_trials(setting.study, [model], share))
-    given, trained = bool(setting.data), setting.tokenizer is None
+    devices = Devices(check_trials(setup.study, [model], share))
+    given, trained = bool(setup.data), setup.tokenizer is None
     id, made = trial_id(trial, UNKNOWN), newest_step(run)
-    done = dataclasses.replace(find_prepared(setting), steps={id: made} if made else {})
-    table = plan_table(setting.study, [model], devices, given=given, trained=trained, evaluated=False, done=done)
+    done = dataclasses.replace(find_prepared(setup), steps={id: made} if made else {})
+    table = plan_table(setup.study, [model], devices, given=given, trained=trained, evaluated=False, done=done)
     console.print(table)
 
 
-def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
+def _train(setup: StudySetup, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
     from experiments.running.attempts import newest_step
     from experiments.running.run_trial import open_prepared_data, train_trial
     from experiments.running.shared_runs import common_steps
     from hma_jax.runtime.processes import is_writer
 
-    prepared, optimizer = open_prepared_data(setting.workspace), trial.train.optimizer
+    prepared, optimizer = open_prepared_data(setup.workspace), trial.train.optimizer
     say_data(trial, prepared)
     say(f"logs: {short(run)} (tensorboard --logdir {shlex.quote(short(run))})")
     steps, made = trial.train.steps, newest_step(run)
@@ -409,7 +407,7 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
             trial,
             prepared,
             run,
-            execution=setting.study.execution,
+            execution=setup.study.execution,
             options=options,
             # From before its decay a run can be extended.
             keep=(common_steps(optimizer, steps, 2 * steps),) if optimizer.schedule == "wsd" else (),
@@ -421,7 +419,7 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
     loss = f"{result.losses[-1]:.4f}" if result.losses else "unknown (the log is lost)"
     console.print(f"loss {loss} after {counted(steps, 'step')}")
     profiles = _say_profiled(run, options.trace or 0, result.resumed_from, steps)
-    wrote(run, *profiles, then=setting.command("evaluate", run.absolute()))
+    wrote(run, *profiles, then=setup.command("evaluate", run.absolute()))
 
 
 def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:

@@ -20,8 +20,8 @@ from experiments.running.shared_runs import latest_common, share_runs
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial
 from experiments.running.workspace import Workspace, find_record
-from experiments.setting import Setting
 from experiments.study import Study
+from experiments.study_setup import StudySetup
 from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
@@ -46,20 +46,22 @@ class Done:
 NOTHING = Done()
 
 
-def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = False, accept_code: bool = False) -> Done:
+def find_done(
+    setup: StudySetup, sweeps: Sequence[Sweep], retry_failed: bool = False, accept_code: bool = False
+) -> Done:
     """What there is of the trials of `sweeps` in the study's directory; nothing where another study is.
 
     `retry_failed`: trials that failed are run again; `accept_code`: they may go on from what other sources
     trained. Raises ConfigError for a damaged ledger.
     """
-    study, workspace = setting.study, setting.workspace
+    study, workspace = setup.study, setup.workspace
     try:
         record = find_record(workspace)
         if record is not None and _prepared_by(record.study) != _prepared_by(study):
             return NOTHING
     except ConfigError:  # it cannot be read, of which the study's own command speaks
         return NOTHING
-    done = find_prepared(setting)
+    done = find_prepared(setup)
     if record is None or record.provenance is None:
         return done
     provenance = dataclasses.replace(record.provenance, results=RESULTS_VERSION)
@@ -68,9 +70,9 @@ def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = Fa
     return dataclasses.replace(done, provenance=provenance, **_trials(workspace, trials, former, retry_failed))
 
 
-def find_prepared(setting: Setting) -> Done:
+def find_prepared(setup: StudySetup) -> Done:
     """What is prepared, of the settings that the study has."""
-    return Done(_suite(setting), _tokenizer(setting), _tokens(setting.study, setting.workspace))
+    return Done(_suite(setup), _tokenizer(setup), _tokens(setup.study, setup.workspace))
 
 
 def _trials(
@@ -100,15 +102,15 @@ def _prepared_by(study: Study) -> list[Any]:
     ]  # fmt: skip
 
 
-def _suite(setting: Setting) -> bool:
+def _suite(setup: StudySetup) -> bool:
     from experiments.preparing.suite import suite_is_there
 
-    return not setting.data and suite_is_there(setting.study, setting.workspace)
+    return not setup.data and suite_is_there(setup.study, setup.workspace)
 
 
-def _tokenizer(setting: Setting) -> bool:
-    stamp = read_stamp(setting.workspace.tokenizer)
-    wanted = {name: to_dict(getattr(setting.study, name)) for name in ("tokenizer", "tokenizer_train")}
+def _tokenizer(setup: StudySetup) -> bool:
+    stamp = read_stamp(setup.workspace.tokenizer)
+    wanted = {name: to_dict(getattr(setup.study, name)) for name in ("tokenizer", "tokenizer_train")}
     return stamp is not None and all(stamp.inputs.get(name) == value for name, value in wanted.items())
 
 

@@ -10,8 +10,8 @@ from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import find_accelerators
 from experiments.running.trial import Trial
-from experiments.setting import Setting
 from experiments.study import Study, count_trained_on, most_trajectories
+from experiments.study_setup import StudySetup
 from experiments.sweeps.sweep import Sweep
 from experiments.terminal.progress import say
 from experiments.terminal.words import counted, few, in_thousands
@@ -21,9 +21,9 @@ PROCESSOR = 1e12
 """FLOP/s of one device that no processor sustains: a study with more is made for accelerators."""
 
 
-def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
+def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
     """One line on the largest model of `trials`, and another preset where this one is made for a processor."""
-    height, width = setting.study.tokenizer.image_shape
+    height, width = setup.study.tokenizer.image_shape
     widest = max(trials, key=lambda trial: (trial.model.width, trial.model.layers, len(trial.datasets)))
     caps = [trial.max_trajectories for trial in trials]
     some = any(trial.capped for trial in trials)  # a cap that holds for some datasets leaves the others whole
@@ -31,7 +31,7 @@ def say_scale(setting: Setting, trials: Sequence[Trial]) -> None:
     steps = sorted({trial.train.steps for trial in trials})
     longest = f"{'up to ' * (len(steps) > 1)}{counted(steps[-1], 'step')}"
     models = "a model of" if len({trial.model for trial in trials}) == 1 else "models of up to"
-    name = setting.arguments.preset
+    name = setup.arguments.preset
     instead = ON_ACCELERATORS.get(name)
     advice = f". It is made for a processor: on a GPU or TPU take --preset {instead}" if instead else ""
     say(
@@ -59,25 +59,25 @@ def say_average(configs: Iterable[TrainConfig]) -> None:
         )
 
 
-def say_prepared_here(setting: Setting, launcher_options: LauncherOptions) -> None:
+def say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> None:
     """A line where a study for accelerators trains its tokenizer on this machine without one, while its trials run on
     others."""
-    elsewhere = launcher_options.name != "local" and setting.study.flops_per_second >= PROCESSOR
-    made = setting.tokenizer is not None or setting.workspace.tokenizer.exists()
+    elsewhere = launcher_options.name != "local" and setup.study.flops_per_second >= PROCESSOR
+    made = setup.tokenizer is not None or setup.workspace.tokenizer.exists()
     if elsewhere and not made and find_accelerators() is None:
         say(
             "note: the tokenizer would be trained on this machine, where no accelerator is found, for much longer than a "
-            f"dry run says. First run, on a machine that has one: {setting.command('tokenizer train')}"
+            f"dry run says. First run, on a machine that has one: {setup.command('tokenizer train')}"
         )
 
 
-def say_points(setting: Setting, sweeps: Sequence[Sweep]) -> None:
+def say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
     """A line on the axis trajectories where it has fewer points on the user's datasets than in the preset, and on the
     axis datasets where it has only one; none where the user chose them."""
-    study, planned = setting.study, {sweep.name for sweep in sweeps}
-    chosen = setting.arguments.chosen()
+    study, planned = setup.study, {sweep.name for sweep in sweeps}
+    chosen = setup.arguments.chosen()
     caps, names, most = study.trajectory_counts, study.dataset_names(), most_trajectories(study)
-    dropped = [cap for cap in get_preset(setting.arguments.preset).trajectory_counts if cap not in caps]
+    dropped = [cap for cap in get_preset(setup.arguments.preset).trajectory_counts if cap not in caps]
     if "trajectories" in planned and "trajectory_counts" not in chosen and dropped and most:
         others = f"; for other points: --set trajectory_counts={_parts(most)}" if most > 1 else ""
         say(

@@ -19,7 +19,7 @@ from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job
 from experiments.running.workspace import Workspace, load_record, save_record
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.draws import draw_judged
 from experiments.terminal.exit_code import exit_code_of
 from hma_jax.config import ConfigError
@@ -400,14 +400,14 @@ def test_failed_trials_are_tried_again_by_the_command_that_is_printed(
     printed = capsys.readouterr().err.split("To try them again: ")[1].strip()
     asked = {}
 
-    def run_study(setting, axes, **how):
-        asked.update(how, setting=setting, axes=axes)
+    def run_study(setup, axes, **how):
+        asked.update(how, setup=setup, axes=axes)
 
     monkeypatch.setattr(study_runs, "run_study", run_study)
     assert main(shlex.split(printed)[1:]) == 0
     assert asked["retry_failed"] and asked["axes"] == ("width",)
     assert asked["launcher_options"] == LauncherOptions("slurm", 2, ("gpus=1", "partition=a b"))
-    assert asked["setting"] == make_setting(StudyArguments("smoke", tmp_path, set=("widths=8,32",)))
+    assert asked["setup"] == make_setup(StudyArguments("smoke", tmp_path, set=("widths=8,32",)))
 
 
 def test_sigterm_ends_like_an_interruption_with_a_last_word(tmp_path):

@@ -17,7 +17,7 @@ from experiments.analysis.rows import curve, difference, read_rows
 from experiments.report.draw import draw
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.workspace import Workspace
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import plan_sweeps
 from hma_jax.config import ConfigError
 from tests.experiments.judged import WIDE, judged_study
@@ -136,7 +136,7 @@ def test_a_study_reads_what_is_expected_before_it_prepares_anything(tmp_path, mo
         (workspace.predictions / FILE).write_text(f"{COLUMNS}\n{line}\n")
         with pytest.raises(ConfigError) as refused:
             run_study.run_study(
-                make_setting(StudyArguments("smoke", tmp_path)), ("width",), again="", launcher_options=LauncherOptions(), retry_failed=False,
+                make_setup(StudyArguments("smoke", tmp_path)), ("width",), again="", launcher_options=LauncherOptions(), retry_failed=False,
                 accept_code=False, replace=None,
             )  # fmt: skip
         return str(refused.value)

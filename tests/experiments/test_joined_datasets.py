@@ -20,7 +20,7 @@ from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.tokens.store import TokenStore
 from experiments.applications.generating.trajectories import open_trajectories
 from experiments.cli.main import main
-from experiments.setting import find_directories
+from experiments.study_setup import find_directories
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.convert import sources

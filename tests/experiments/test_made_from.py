@@ -26,7 +26,7 @@ from experiments.preparing.made_from import (
 from experiments.preparing.sources import find_sources
 from experiments.preparing.windows import _differences
 from experiments.running.closure import trace
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
@@ -249,11 +249,11 @@ def test_no_dataset_is_opened_for_a_given_tokenizer_that_knows_none_of_them(made
     there, data = made
     tokenizer = shutil.copytree(there / "tokenizer", tmp_path / "tokenizer")
     (tokenizer / STAMP).unlink()
-    setting = make_setting(StudyArguments("smoke", tmp_path / "new", tuple(data[1:])))
-    found = find_sources(setting.study, setting.data)
+    setup = make_setup(StudyArguments("smoke", tmp_path / "new", tuple(data[1:])))
+    found = find_sources(setup.study, setup.data)
     monkeypatch.setattr(given_tokenizer, "open_source", lambda *_: pytest.fail("opened"))
-    given_tokenizer.adopt_tokenizer(tokenizer, setting.study, setting.workspace, found)
-    assert setting.workspace.tokenizer.is_dir()
+    given_tokenizer.adopt_tokenizer(tokenizer, setup.study, setup.workspace, found)
+    assert setup.workspace.tokenizer.is_dir()
 
 
 def test_threads_of_tokenising_train_the_tokenizer_too(made, tmp_path, monkeypatch):

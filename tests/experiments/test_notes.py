@@ -16,8 +16,8 @@ from experiments.dry_run.notes import say_scale
 from experiments.presets import ON_ACCELERATORS, PRESETS
 from experiments.running.slots import Accelerators
 from experiments.running.workspace import Workspace
-from experiments.setting import Setting, StudyArguments
 from experiments.study import on_user_data
+from experiments.study_setup import StudyArguments, StudySetup
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import make_spec, write_rlds
@@ -204,14 +204,14 @@ def test_presets_for_a_processor_name_one_that_is_larger():
 
 
 def test_of_trials_of_different_lengths_the_longest_is_named(capsys, tmp_path):
-    setting = Setting(StudyArguments("cpu"), PRESETS["cpu"], (), Workspace(tmp_path))
+    setup = StudySetup(StudyArguments("cpu"), PRESETS["cpu"], (), Workspace(tmp_path))
     short = reference_trial(PRESETS["cpu"], 0)
     long = replace(short, train=replace(short.train, steps=32_000))
-    say_scale(setting, [short, long])
+    say_scale(setup, [short, long])
     assert "for up to 32,000 steps of 4 windows, with at most 500 trajectories" in " ".join(
         capsys.readouterr().out.split()
     )
-    say_scale(setting, [long, replace(long, capped=long.datasets[:1])])
+    say_scale(setup, [long, replace(long, capped=long.datasets[:1])])
     assert "for 32,000 steps of 4 windows, with all trajectories" in " ".join(capsys.readouterr().out.split())
 
 

@@ -27,8 +27,8 @@ from experiments.running.runner import Job, run_missing
 from experiments.running.trial import trial_id
 from experiments.running.trial_checks import check_finished, group_by_sources, require_one_closure
 from experiments.running.workspace import Workspace, find_record, save_record
-from experiments.setting import StudyArguments, make_setting
 from experiments.study import SCALING
+from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import unique_trials
 from hma_jax.config import ConfigError
@@ -331,10 +331,10 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
     monkeypatch.setattr(study_runs, "require_results", lambda *_: None)
     save_record(workspace, record_of())
     shutil.rmtree(workspace.trials / ids_of()[-1])
-    setting = replace(make_setting(StudyArguments("smoke", tmp_path)), study=STUDY)
+    setup = replace(make_setup(StudyArguments("smoke", tmp_path)), study=STUDY)
 
     def run():
-        study_runs.run_study(setting, SCALING, again="", launcher_options=LauncherOptions(), retry_failed=False,
+        study_runs.run_study(setup, SCALING, again="", launcher_options=LauncherOptions(), retry_failed=False,
                            accept_code=accept, replace=None)  # fmt: skip
 
     if accept:

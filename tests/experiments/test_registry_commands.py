@@ -26,7 +26,7 @@ from experiments.cli.data.registry import _write_entry
 from experiments.cli.main import main
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.workspace import Workspace, load_record
-from experiments.setting import Setting, StudyArguments, find_directories, make_setting, use_entries
+from experiments.study_setup import StudyArguments, StudySetup, find_directories, make_setup, use_entries
 from experiments.sweeps.registry import plan_sweeps
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
@@ -337,14 +337,14 @@ def test_a_misspelt_heading_of_a_known_dataset_is_told(tmp_path, capsys):
         capsys.readouterr()
         assert main(["data", "inspect", *arguments, "--registry", str(file)]) == 0
         assert (told.format(file) + "bridge_datset" in capsys.readouterr().out) == noted
-        make_setting(StudyArguments("smoke", tmp_path, (str(REAL_DATA),), file))
+        make_setup(StudyArguments("smoke", tmp_path, (str(REAL_DATA),), file))
         said = capsys.readouterr().out
         assert (told.format(file) + "bridge_datset" in said) == noted
         assert ('add joins = ["bridge_dataset"] to its entry' in said) == noted
 
 
 def test_mixture_names_the_datasets_of_a_study(tmp_path, capsys):
-    assert make_setting(StudyArguments("paper", tmp_path, mixture="dataset10")).study.dataset_counts == (5, 10)
+    assert make_setup(StudyArguments("paper", tmp_path, mixture="dataset10")).study.dataset_counts == (5, 10)
     assert main(["study", "--preset", "smoke", "--mixture", "dataset5", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "bridge_data_v2, fractal20220817_data, language_table and others: not simulated" in said
@@ -406,7 +406,7 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
 
     def run(arguments, study, axis, step=None):
         run_study.run_study(
-            Setting(arguments, study, ("somewhere",), workspace), (axis,), again="", launcher_options=LauncherOptions(),
+            StudySetup(arguments, study, ("somewhere",), workspace), (axis,), again="", launcher_options=LauncherOptions(),
             retry_failed=False, accept_code=False, replace=step,
         )  # fmt: skip
 

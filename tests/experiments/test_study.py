@@ -12,8 +12,8 @@ from experiments.dry_run.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import ACCELERATOR, CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
-from experiments.setting import Preset
 from experiments.study import on_user_data, without_equal_caps
+from experiments.study_setup import Preset
 from experiments.sweeps import datasets, trajectories, width
 from experiments.sweeps.sweep import reference_trial, unique_trials
 from experiments.user_input.override import override

@@ -20,7 +20,7 @@ from experiments.cli.main import main
 from experiments.running.slots import Accelerators
 from experiments.running.subprocess_call import _portable, call_in_subprocess
 from experiments.running.workspace import Busy
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, Terminated, sigterm_as_interrupt
 from hma_jax.runtime.locks import Holder
@@ -149,9 +149,9 @@ def test_entries_of_the_user_are_known_where_a_study_is_prepared(tmp_path, monke
     register([mine])
     monkeypatch.setattr(run_study, "find_accelerators", lambda: Accelerators("tpu", ("0",)))
     monkeypatch.setattr(run_study, "call_in_subprocess", lambda what, *call: calls.append(call))
-    setting = make_setting(StudyArguments("smoke", tmp_path, set=("datasets=mine", "dataset_counts=1")))
+    setup = make_setup(StudyArguments("smoke", tmp_path, set=("datasets=mine", "dataset_counts=1")))
     monkeypatch.setattr(run_study, "require_accelerator", lambda kind: calls.append(kind))
-    run_study.prepare_apart(setting, None)
+    run_study.prepare_apart(setup, None)
     ((function, *arguments),) = calls
     registry_table._registered.clear()  # as in another process
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: find_spec("mine"))

@@ -15,7 +15,7 @@ from experiments.report.draw import draw
 from experiments.run_study import whole_command
 from experiments.running.trial import Trial
 from experiments.running.workspace import Workspace, load_record, save_record
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import AXES, find_axis, join_axes, keep_axes, plan_sweeps
 from experiments.sweeps.sweep import CONTROL, titles
 from hma_jax.config import ConfigError
@@ -127,7 +127,7 @@ def test_an_axis_without_its_reference_is_refused_when_asked_for_but_a_recorded_
     axes = keep_axes({"own": str(path)}, root)
     draw(finished_study(root, axes=axes), record_of(axes=axes))
     assert (root / "figures/own.png").exists()
-    command = whole_command(make_setting(StudyArguments("smoke", root)), axes)
+    command = whole_command(make_setup(StudyArguments("smoke", root)), axes)
     assert main([*shlex.split(command)[1:], "--dry-run"]) == 0
 
 

@@ -29,7 +29,7 @@ from experiments.preparing.asked import write_asked
 from experiments.preparing.sources import say_unreached_rates
 from experiments.preparing.store import say_other_rates
 from experiments.running.workspace import Workspace
-from experiments.setting import StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, make_setup
 from experiments.terminal.progress import Eta
 from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
 from tests.data_pipelines.tokens.job_process import contents
@@ -140,14 +140,14 @@ def test_who_would_make_something_else_does_not_join(data, tokenizer, tmp_path, 
     monkeypatch.setattr(cli_tokenize, "_freeze", lambda *_: stop())  # which would wait for the holder
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path)]
     shutil.copytree(tokenizer[1], tmp_path / "tokenizer")  # trained on both datasets
-    setting = make_setting(StudyArguments("smoke", tmp_path, tuple(data[1:])))
-    found = sources.find_sources(setting.study, setting.data)
+    setup = make_setup(StudyArguments("smoke", tmp_path, tuple(data[1:])))
+    found = sources.find_sources(setup.study, setup.data)
     with Workspace(tmp_path).locked():
         assert main([*arguments, *data[:2]]) == 2
         told = capsys.readouterr()
         assert f"datasets: 2 -> 1, without {BASE.name}" in told.err.replace("\n", " ")
         assert told.out.count("waiting until ") == 1, "once for a holder that is at another command"
-        write_asked(setting.study, setting.workspace, found, None)
+        write_asked(setup.study, setup.workspace, found, None)
         assert main([*arguments, *data, *tokenizer, "--set", "store.min_val=1", "--set", "model.frames=3"]) == 2
         message = capsys.readouterr().err
         assert "cannot be shared" in message and "--tokenizer: 'not given' -> '" in message
@@ -214,9 +214,9 @@ def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
             copy = root / "1.0.0" / path.name
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(path.read_bytes())
-        setting = make_setting(StudyArguments("smoke", tmp_path, (str(root),)))
-        assert setting.data == (f"memory://bucket/{ARM.name}",)
-        ((spec, directory),) = sources.find_sources(setting.study, setting.data)
+        setup = make_setup(StudyArguments("smoke", tmp_path, (str(root),)))
+        assert setup.data == (f"memory://bucket/{ARM.name}",)
+        ((spec, directory),) = sources.find_sources(setup.study, setup.data)
         assert spec == ARM and directory == root
         assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), "--data", str(root)]) == 0
         assert f"--data memory://bucket/{ARM.name}" in capsys.readouterr().out.replace("\n", " ")

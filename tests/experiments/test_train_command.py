@@ -14,14 +14,14 @@ import pytest
 from data_pipelines.loading import loader
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.cli.initial_model import new_datasets, setting_of
+from experiments.cli.initial_model import new_datasets, setup_of
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.running import run_trial as trials
 from experiments.running.launchers import local
 from experiments.running.run_options import RunOptions
 from experiments.running.slots import Accelerators
-from experiments.setting import StudyArguments
+from experiments.study_setup import StudyArguments
 from hma_jax.config import ConfigError
 from hma_jax.convert import read_official, write_run
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
@@ -506,11 +506,11 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     said = refused("adapt", str(beside), "--data", *data, "--set", "train.masking.setting=passive")
     assert f"train.only: {BASE.name} would have no parameters to train" in said
     arguments, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
-    setting = setting_of(beside, trained, arguments)
-    assert setting.tokenizer == tokenizer and new_datasets(trained, setting) == [BASE.name]
+    setup = setup_of(beside, trained, arguments)
+    assert setup.tokenizer == tokenizer and new_datasets(trained, setup) == [BASE.name]
     other = replace(trained, provenance={"tokenizer": "another"})
     with pytest.raises(ConfigError, match="trained on tokens of tokenizer another, .*; add --tokenizer"):
-        setting_of(beside, other, arguments)
+        setup_of(beside, other, arguments)
 
 
 def test_held_out_loss_is_of_as_many_episodes_as_a_batch_takes(tmp_path):

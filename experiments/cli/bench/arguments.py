@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 from hma_jax.config.evaluation import SamplerKind
 from hma_jax.config.execution import Dtype
 

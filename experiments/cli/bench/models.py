@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes
 
 from experiments.cli.bench.arguments import Bench, Decode
 from experiments.cli.bench.record import write
-from experiments.setting import UNSET
+from experiments.study_setup import UNSET
 from experiments.terminal.progress import step
 from hma_jax.config import ConfigError
 from hma_jax.config.execution import Remat

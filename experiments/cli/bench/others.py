@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.bench.record import write
-from experiments.setting import UNSET, make_setting
+from experiments.study_setup import UNSET, make_setup
 from experiments.terminal.progress import console, step, tidy_table
 from hma_jax.config import ConfigError, require
 from hma_jax.config.execution import Dtype
@@ -44,13 +44,13 @@ def quality(
     from experiments.running.run_trial import open_prepared_data
     from hma_jax.training.runs import load_model, require_frames
 
-    setting = make_setting(arguments)
+    setup = make_setup(arguments)
     trained = load_model(run).run
     require_frames(trained, "judge")
-    require_prepared(setting)
-    prepared = open_prepared_data(setting.workspace)
+    require_prepared(setup)
+    prepared = open_prepared_data(setup.workspace)
     check_fits(trained, prepared)
-    subject, config = subject_of(trained), setting.study.eval
+    subject, config = subject_of(trained), setup.study.eval
     config = replace(config, batch=min(config.batch, windows))  # no rows of padding
     frames = frames or trained.model.frames
     if frames < trained.model.frames:

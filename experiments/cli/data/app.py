@@ -6,7 +6,7 @@ from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.cli.command_line import Commands
 from experiments.cli.data import convert, registry, sim
 from experiments.cli.data.view import view
-from experiments.setting import make_setting
+from experiments.study_setup import make_setup
 from experiments.terminal.progress import wrote
 
 HELP = "List, inspect, view, convert and simulate datasets."
@@ -22,10 +22,10 @@ def suite(arguments: StudyOptions, replacement: ReplaceOptions) -> None:
     """Write the study's simulated datasets as RLDS directories."""
     from experiments.preparing.suite import make_suite
 
-    setting = make_setting(arguments)
-    with setting.workspace.locked():
-        make_suite(setting.study, setting.workspace, replacement.replace)
-    wrote(setting.workspace.suite, then=setting.command("tokenizer train"))
+    setup = make_setup(arguments)
+    with setup.workspace.locked():
+        make_suite(setup.study, setup.workspace, replacement.replace)
+    wrote(setup.workspace.suite, then=setup.command("tokenizer train"))
 
 
 convert_app = Commands()

@@ -16,7 +16,7 @@ from data_pipelines.sources.settings import (
     LeRobotSettings,
     RobomimicSettings,
 )
-from experiments.setting import UNSET, command
+from experiments.study_setup import UNSET, command
 from experiments.terminal.progress import say, step, wrote
 from hma_jax.config import require
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from experiments.presets import ON_ACCELERATORS, get_preset
-from experiments.setting import Preset, StudyArguments, command
+from experiments.study_setup import Preset, StudyArguments, command
 from experiments.terminal.program import PROGRAM
 from experiments.terminal.progress import console
 

@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 
 from data_pipelines.errors import MAX_LISTED
 from experiments.cli.data.next_command import no_window, other_rate, print_next, say_next
-from experiments.setting import UNSET, say_unmatched, use_entries
+from experiments.study_setup import UNSET, say_unmatched, use_entries
 from experiments.terminal.progress import console, say, step, tidy_table, wrote
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError, require

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.setting import UNSET, command, command_words
+from experiments.study_setup import UNSET, command, command_words
 from experiments.terminal.progress import console, say, step, wrote
 from experiments.terminal.words import few
 

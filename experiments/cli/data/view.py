@@ -12,7 +12,7 @@ from rich.markup import escape
 from tyro.conf import Positional, arg
 
 from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, print_next, say_next
-from experiments.setting import UNSET, command, say_unmatched, use_entries
+from experiments.study_setup import UNSET, command, say_unmatched, use_entries
 from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file

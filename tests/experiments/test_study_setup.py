@@ -1,4 +1,4 @@
-"""A printed command asks for exactly what the user asked for: parsed again, it gives an equal Setting."""
+"""A printed command asks for exactly what the user asked for: parsed again, it gives an equal StudySetup."""
 
 import dataclasses
 import itertools
@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.registry import get_mixture, get_spec
-from experiments import run_study
-from experiments import setting as settings
+from experiments import run_study, study_setup
 from experiments.cli import evaluate, tokenize, tokenizer, train
 from experiments.cli.command_line import Commands
 from experiments.cli.main import main
 from experiments.running.workspace import Record, save_record
-from experiments.setting import Setting, StudyArguments, make_setting
+from experiments.study_setup import StudyArguments, StudySetup, make_setup
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.test_cli_errors import idle_training  # noqa: F401
 
@@ -72,8 +71,8 @@ def combinations() -> list[StudyArguments]:
     return list(found.values())
 
 
-def asked_by(command: str, monkeypatch) -> Setting:
-    """The Setting that a command works on, from its text, through a shell's words and the real parser."""
+def asked_by(command: str, monkeypatch) -> StudySetup:
+    """The StudySetup that a command works on, from its text, through a shell's words and the real parser."""
     seen = []
     for module, name in ((run_study, "run_study"), (tokenize, "prepare_together"), (train, "train_model"),
                          (evaluate, "evaluate_model"), (tokenizer, "train_tokenizer")):  # fmt: skip
@@ -81,20 +80,20 @@ def asked_by(command: str, monkeypatch) -> Setting:
         monkeypatch.setattr(module, name, lambda *args, where=where, **_: seen.append(args[where]))
     program, *words = shlex.split(command)
     assert program == "hma" and main(words) == 0, command
-    (setting,) = seen
-    return setting
+    (setup,) = seen
+    return setup
 
 
 @pytest.fixture
 def anything_goes(monkeypatch):
     """Some combinations make no study (a mixture of data that is not there); what is tested is what is asked."""
 
-    def study_of(where: StudyArguments) -> Setting:
+    def study_of(where: StudyArguments) -> StudySetup:
         arguments = where.anywhere()
-        return Setting(arguments, settings.get_preset(arguments.preset), (), settings.Workspace(arguments.out))
+        return StudySetup(arguments, study_setup.get_preset(arguments.preset), (), study_setup.Workspace(arguments.out))
 
     for module in ("study", "tokenize", "train", "evaluate", "tokenizer"):
-        monkeypatch.setattr(f"experiments.cli.{module}.make_setting", study_of)
+        monkeypatch.setattr(f"experiments.cli.{module}.make_setup", study_of)
     return study_of
 
 
@@ -106,8 +105,8 @@ def test_a_printed_command_asks_for_the_same_again(world, monkeypatch, anything_
     cases = combinations()
     assert len(cases) > 100
     for where in cases:
-        setting = anything_goes(where)
-        assert asked_by(setting.command("tokenize"), monkeypatch) == setting, where
+        setup = anything_goes(where)
+        assert asked_by(setup.command("tokenize"), monkeypatch) == setup, where
 
 
 @pytest.mark.parametrize(
@@ -126,10 +125,10 @@ def test_a_printed_command_asks_for_the_same_again(world, monkeypatch, anything_
 def test_the_study_is_the_same_too(where, world, monkeypatch):
     monkeypatch.chdir(world)
     monkeypatch.setattr("data_pipelines.registry.table._registered", {})
-    setting = make_setting(where)
+    setup = make_setup(where)
     for name in ("tokenize", "train", "study", "sweep width", "tokenizer train"):
-        assert asked_by(setting.command(name), monkeypatch) == setting
-    assert asked_by(setting.command("evaluate", Path("-run").absolute()), monkeypatch) == setting
+        assert asked_by(setup.command(name), monkeypatch) == setup
+    assert asked_by(setup.command("evaluate", Path("-run").absolute()), monkeypatch) == setup
 
 
 def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkeypatch, tmp_path):
@@ -137,13 +136,13 @@ def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkey
     monkeypatch.chdir(world)
     monkeypatch.setattr("experiments.study.most_trajectories", lambda study: 100)
     where = StudyArguments("accelerator", tmp_path, (f"bridge/{ARM.name}",))
-    setting = make_setting(where)
-    caps = setting.study.trajectory_counts
+    setup = make_setup(where)
+    caps = setup.study.trajectory_counts
     for earlier, counts in (((10, 30, 100, 1000), (10, 30, 100, 1000)), ((10, 20, 30, 1000), caps), ((10, 30), caps)):
-        save_record(setting.workspace, Record(dataclasses.replace(setting.study, trajectory_counts=earlier)))
-        assert make_setting(where).study.trajectory_counts == counts
-    setting.workspace.record.write_text("damaged")
-    assert make_setting(where).study.trajectory_counts == caps == (10, 30, 1000)
+        save_record(setup.workspace, Record(dataclasses.replace(setup.study, trajectory_counts=earlier)))
+        assert make_setup(where).study.trajectory_counts == counts
+    setup.workspace.record.write_text("damaged")
+    assert make_setup(where).study.trajectory_counts == caps == (10, 30, 1000)
 
 
 def test_a_file_in_place_of_the_directory_is_named_with_data_too(world, monkeypatch, capsys, tmp_path):
@@ -156,10 +155,10 @@ def test_a_file_in_place_of_the_directory_is_named_with_data_too(world, monkeypa
 
 def test_a_command_means_the_same_in_another_directory(world, monkeypatch, tmp_path):
     monkeypatch.chdir(world)
-    setting = make_setting(StudyArguments("smoke", Path("out"), (f"bridge/{ARM.name}",), tokenizer=None))
+    setup = make_setup(StudyArguments("smoke", Path("out"), (f"bridge/{ARM.name}",), tokenizer=None))
     monkeypatch.chdir(tmp_path)
-    assert asked_by(setting.command("train"), monkeypatch) == setting
-    assert str(world) in setting.command("train")
+    assert asked_by(setup.command("train"), monkeypatch) == setup
+    assert str(world) in setup.command("train")
 
 
 def test_every_step_prints_a_next_one_that_drops_nothing(world, monkeypatch, capsys):

@@ -105,7 +105,7 @@ class StudyArguments:
 
 
 @dataclass(frozen=True)
-class Setting:
+class StudySetup:
     """A study, its data and where it lives: what every command works on."""
 
     arguments: StudyArguments
@@ -142,7 +142,7 @@ def command_words(*arguments: str | Path) -> str:
     return shlex.join(map(_word, arguments))
 
 
-def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Setting:
+def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> StudySetup:
     """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. Of its numbers of
     trajectories those that would be trained on the same are left out, but for points of the study in the directory.
 
@@ -179,7 +179,7 @@ def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Set
         sizes = dict(zip(("data", "fsdp", "tensor"), arguments.mesh, strict=True))
         mesh = replace(study.execution.mesh, **sizes)
         study = replace(study, execution=replace(study.execution, mesh=mesh))
-    return Setting(arguments, study, data, workspace)
+    return StudySetup(arguments, study, data, workspace)
 
 
 def _with_earlier_caps(study: Study, workspace: Workspace) -> Study:
