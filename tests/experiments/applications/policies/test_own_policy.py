@@ -1,5 +1,6 @@
 """A world model that is post-trained to be a policy."""
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -140,6 +141,18 @@ def test_the_page_says_what_came(name):
     table = markdown(summarise(read_trials(root / "experiments/results" / name / "trials.csv")))
     assert table == (root / "experiments/results" / name / "table.md").read_text()
     assert table in (root / "docs/policies.md").read_text()
+
+
+def test_the_page_says_what_predicting_the_clean_chunk_came_to():
+    results, page = Path(__file__).parents[4] / "experiments/results", Path(__file__).parents[4] / "docs/policies.md"
+    ((name, mean, low, high),) = summarise(read_trials(results / "own_policy_chunk/trials.csv"))
+    made = json.loads((results / "own_policy_chunk/settings.json").read_text())
+    noise = json.loads((results / "own_policy/settings.json").read_text())
+    assert name == "Diffusion Policy" and made["predicts"] == "chunk" and made["seed"] == 0
+    assert noise.items() <= made.items(), "all else is as in the table"
+    assert f"succeeds from {mean:.2f} ({low:.2f} to {high:.2f}) of the same starts" in " ".join(
+        page.read_text().split()
+    )
 
 
 def test_the_page_says_what_came_from_starts_that_do_not_begin_at_the_goal():
