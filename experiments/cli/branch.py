@@ -18,8 +18,8 @@ def branch(
 ) -> None:
     """Copy one checkpoint of a run into a run of its own, to go on from there with other settings.
 
-    `hma train --run NEW`, with the arguments that RUN was trained with, goes on with optimiser, masks, seed or number
-    of steps as --set says: with a lower learning rate or another order of data after a spike of the loss, or with more
+    With the arguments that RUN was trained with, `hma train --run NEW` goes on with optimiser, masks, seed or number of
+    steps as --set says: with a lower learning rate or another order of data after a spike of the loss, or with more
     steps from before the learning rate decayed. Checkpoints of NEW remember how it was trained until then. Other
     commands take NEW as any run.
 
