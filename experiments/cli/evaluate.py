@@ -20,6 +20,7 @@ from experiments.terminal.words import few, plus_minus
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict, to_dict, to_strict_json
 from hma_jax.runtime.files import write_file
+from hma_jax.training.run_lock import CHECKPOINTS
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
@@ -90,6 +91,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     from hma_jax.evaluation.parts import Parts
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
+    from hma_jax.training.hashes import read_list
 
     _require_known_data(setup, trained)
     require_prepared(setup)
@@ -122,11 +124,14 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
         )
     _note_other_data(setup, prepared)
     note_possible_leakage(trained, names, prepared.store)
-    made_from = describe_evaluation(trained, names, prepared, setup.study.eval)
+    execution, protocol = setup.study.execution, setup.study.eval
+    made_from = describe_evaluation(trained, names, prepared, protocol)
     if not replace:
         require_same_evaluation(place, made_from)
-    execution = setup.study.execution
-    depends = lambda: [made_from.identity(), to_dict(execution), closure_hash(trial_closure())]
+    # Besides what the stamp names: which windows are in a batch depends on its size, and a run that was trained again
+    # may have other weights at the same step.
+    weights = read_list(run / CHECKPOINTS / str(trained.step))
+    depends = lambda: [made_from.identity(), weights, protocol.batch, to_dict(execution), closure_hash(trial_closure())]
     parts = Parts(place / EVALUATING, depends) if jax.process_count() == 1 else None
     with step(f"evaluate {short(run)}") as update:
         evaluation = evaluate_on(
@@ -135,7 +140,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
             trained.model,
             trained.table,
             prepared,
-            setup.study.eval,
+            protocol,
             masking.setting,
             execution=execution,
             progress=lambda phase, done, total: update(done, total, phase),

@@ -309,11 +309,10 @@ def run_trial(
 
 def _evaluated(trial: Trial, prepared: PreparedData, directory: Path, execution: ExecutionConfig) -> list[Any]:
     """On what the numbers of a trial's evaluation depend: sources, settings, windows and weights."""
-    from hma_jax.training.hashes import NAME as LIST
+    from hma_jax.training.hashes import read_list
 
-    record, weights = read_record(directory), directory / RUN / CHECKPOINTS / str(trial.train.steps) / LIST
-    hashes = weights.read_text() if weights.exists() else ""
-    return [record and record.code, to_dict(trial), to_dict(execution), prepared.manifest.hash(), hashes]
+    record, weights = read_record(directory), read_list(directory / RUN / CHECKPOINTS / str(trial.train.steps))
+    return [record and record.code, to_dict(trial), to_dict(execution), prepared.manifest.hash(), weights]
 
 
 def last_loss(losses: Sequence[float]) -> dict[str, Any]:

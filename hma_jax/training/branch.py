@@ -92,6 +92,10 @@ def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
         f"{source} has no checkpoint of step {step:,}; it has those of {', '.join(f'{n:,}' for n in steps)}. "
         "`hma train --keep-every STEPS` keeps more of them",
     )
+    require(
+        step > 0,
+        f"{source} was converted, so it has nothing to go on with but its weights: `hma train --from` starts with these",
+    )
     described = read_description(source / CHECKPOINTS / str(step))
     require("train" in described, f"{source} is not a run of a model; give the directory of a training run")
     earlier = described["provenance"].get("branched", [])

@@ -2,8 +2,8 @@
 
 Orbax (v1) writes asynchronously. Then what it wrote is flushed to disk and listed with hashes, and only then does
 it get its name, DIRECTORY/<step>: what has that name is complete, and whoever reads it checks the hashes. Earlier
-checkpoints are removed after that. Whatever has another name was left behind by a save that did not come so far, and
-the next one removes it.
+checkpoints are removed after that. What a save left behind that did not come so far has another name (LEFTOVER), and
+the next save removes it.
 
 Each field of a state is an item of its own, so that parameters are read without moments. Beside them every checkpoint
 carries the JSON description of its run (configurations, embodiment table, data provenance); restoring under another
@@ -54,6 +54,9 @@ Load = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
 UNFINISHED, REMOVED = ".unfinished", ".removed"
 """Ends of the names of a checkpoint that is being written, or removed."""
+
+LEFTOVER = re.compile(rf"[0-9]+(\{UNFINISHED}|\{REMOVED}|\.orbax-checkpoint-tmp)")
+"""How the names of these begin, and of what Orbax writes into. Other names are a user's, who set a checkpoint aside."""
 
 TRIES = 10
 """A save is given up once so many in a row have failed because their disk did not answer: after about four minutes."""
@@ -235,7 +238,7 @@ class Checkpoints:
 
     def _remove_leftovers(self) -> None:
         for path in self.directory.iterdir():
-            if re.match(r"[0-9]+\.", path.name):
+            if LEFTOVER.match(path.name):
                 shutil.rmtree(path, ignore_errors=True)
 
     def _unfinished(self, step: int) -> Path:
@@ -244,12 +247,15 @@ class Checkpoints:
     def _failure(self, step: int, error: Exception, agreed: bool = False) -> SaveError:
         """The error of a failed save. Raises it where repeating the save would not help: the disk is full, or other
         processes do not know of it."""
-        latest = self.latest_step
         reason = _reason(error)
-        if latest is None:
-            again = "it starts from step 0, since there is no checkpoint yet"
+        try:
+            latest = self.latest_step
+        except OSError:  # the disk still does not answer
+            again = "it continues from the last complete checkpoint"
         else:
             again = f"it continues from step {latest}, the last complete checkpoint"
+            if latest is None:
+                again = "it starts from step 0, since there is no checkpoint yet"
         failure = SaveError(
             f"the checkpoint of step {step} could not be written to {self.directory}: {reason}. {self._space()}Make "
             f"sure that there is space and permission to write, then run the same command again: {again}",
@@ -333,8 +339,8 @@ def _require_writable(directory: Path) -> None:
     """Raises OSError if nothing can be created in `directory`. Orbax would fail in a thread that others then wait for
     without end."""
     if not os.access(directory, os.W_OK | os.X_OK):
-        read_only = directory.is_dir() and os.statvfs(directory).f_flag & os.ST_RDONLY
-        code = errno.EROFS if read_only else errno.EACCES if directory.is_dir() else errno.ENOENT
+        read_only = os.statvfs(directory).f_flag & os.ST_RDONLY  # raises OSError if it is gone, or does not answer
+        code = errno.EROFS if read_only else errno.EACCES
         raise OSError(code, os.strerror(code), str(directory))
 
 

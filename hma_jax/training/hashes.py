@@ -60,6 +60,12 @@ def write_list(checkpoint: Path, known: Iterable[Row] = ()) -> None:
     write_file(checkpoint / NAME, json.dumps({"sha256": _hash_of(files), "files": files}, indent=0))
 
 
+def read_list(checkpoint: Path) -> str:
+    """The list as it is written, which differs between checkpoints with other contents; '' if there is none."""
+    path = checkpoint / NAME
+    return path.read_text() if path.exists() else ""
+
+
 def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:
     """Compares the `chosen` files with the list. False if there is no list.
 

@@ -27,6 +27,7 @@ from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from data_pipelines.sources.rlds.schema import DATASETS
 from data_pipelines.tokens import tokenize_job
+from data_pipelines.windows.evalset import EvalManifest
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
 from experiments.preparing import tokenizer, windows
@@ -38,6 +39,7 @@ from hma_jax.evaluation.parts import Parts
 from hma_jax.evaluation.windows import WindowTable
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
+from hma_jax.training.hashes import write_list
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.hma_jax.convert.fakes import DISCRETE, make_checkpoint
 
@@ -632,7 +634,8 @@ def test_background_readers_of_a_damaged_checkpoint_stay_silent(study, tmp_path)
     """They complain from threads and destructors, in pages, until the process ends."""
     out, data = study
     run = shutil.copytree(out / "model", tmp_path / "run")
-    (run / "checkpoints" / "3" / "sha256.json").unlink()  # as an earlier version left it: Orbax meets the damage
+    for file in (run / "checkpoints").glob("*/sha256.json"):  # as an earlier version left it: Orbax meets the damage
+        file.unlink()
     for file in (run / "checkpoints" / "3").rglob("array_metadatas/process_0"):
         file.write_bytes(file.read_bytes()[:-30])
     code, said = hma("train", *SMOKE, "--out", out, *data, "--run", run)
@@ -661,17 +664,20 @@ def test_a_path_that_is_not_utf8_is_refused_at_the_start(tmp_path, monkeypatch, 
     assert "caf\\xe9 is not UTF-8" in capsys.readouterr().err and not any(latin.iterdir())
 
 
+class Stopped(Parts):
+    """The parts of an evaluation that is stopped after its first batch."""
+
+    def add(self, n, part):
+        super().add(n, part)
+        raise KeyboardInterrupt
+
+
 def test_an_evaluation_that_was_stopped_goes_on(study, tmp_path, monkeypatch):
     out, data = study
     command = ["evaluate", str(out / "model"), *SMOKE, "--out", str(out), *map(str, data), "--set", "eval.batch=1"]
     assert main([*command, "--to", str(tmp_path / "whole")]) == 0
     to, sent, put = tmp_path / "stopped", [], evaluation._put
     monkeypatch.setattr(evaluation, "_put", lambda *batch: sent.append(batch) or put(*batch))
-
-    class Stopped(Parts):
-        def add(self, n, part):
-            super().add(n, part)
-            raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr("hma_jax.evaluation.parts.Parts", partial(Stopped, every=0))
@@ -682,3 +688,24 @@ def test_an_evaluation_that_was_stopped_goes_on(study, tmp_path, monkeypatch):
     assert len(sent) == len(WindowTable.load(to / "windows.parquet")) - 1, "the first was not measured again"
     for name in ("evaluation.json", "evaluation.made_from.json"):
         assert (to / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+@pytest.mark.parametrize("other", ["size of a batch", "weights"])
+def test_an_evaluation_does_not_go_on_after_what_was_measured_with_another(other, study, tmp_path, monkeypatch):
+    """The stamp of its results is the same."""
+    out, data = study
+    run, size = shutil.copytree(out / "model", tmp_path / "run"), 1
+    command = ["evaluate", str(run), *SMOKE, "--out", str(out), *map(str, data), "--set"]
+    with monkeypatch.context() as patch:
+        patch.setattr("hma_jax.evaluation.parts.Parts", partial(Stopped, every=0))
+        assert main([*command, "eval.batch=1"]) == 130 and (run / "evaluating" / "0.npz").exists()
+    if other == "weights":  # of the same step: it was trained again
+        (run / "checkpoints" / "3" / "other").touch()
+        write_list(run / "checkpoints" / "3")
+    else:
+        size = 2
+    sent, put = [], evaluation._put
+    monkeypatch.setattr(evaluation, "_put", lambda *batch: sent.append(batch) or put(*batch))
+    assert main([*command, f"eval.batch={size}"]) == 0
+    windows = sum(len(d.windows) for d in EvalManifest.load(Workspace(out).manifest).datasets)
+    assert len(WindowTable.load(run / "windows.parquet")) == windows and len(sent) == -(-windows // size)

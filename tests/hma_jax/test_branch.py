@@ -107,6 +107,9 @@ def test_what_cannot_be_branched(tmp_path: Path):
     train(source, 4, keep_every=3)
     with pytest.raises(ConfigError, match="no checkpoint of step 2; it has those of 3, 4. .*keep-every"):
         branch(source, new, 2)
+    shutil.copytree(source / CHECKPOINTS / "4", tmp_path / "converted" / CHECKPOINTS / "0")
+    with pytest.raises(ConfigError, match="was converted, .* `hma train --from`"):
+        branch(tmp_path / "converted", new)
     assert not new.exists()
     assert branch(source, new) == 4
     with pytest.raises(ConfigError, match="is a run already"):

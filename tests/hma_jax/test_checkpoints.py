@@ -320,6 +320,30 @@ def test_the_last_save_is_repeated_until_the_disk_answers_and_given_up_in_the_en
         checkpoints.save(2, toy_state())  # whoever does not repeat it is told
 
 
+def test_a_disk_that_does_not_even_list_its_checkpoints_costs_one_save_too(tmp_path: Path, monkeypatch, caplog):
+    fail(monkeypatch, errno.EIO, 1)
+    asked, real = [], module.list_steps
+
+    def list_steps(directory: Path) -> list[int]:
+        asked.append(directory)
+        if len(asked) == 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(directory))
+        return real(directory)
+
+    monkeypatch.setattr(module, "list_steps", list_steps)
+    fit_toy(tmp_path, 2)
+    assert "step 2 could not be written" in caplog.text and real(tmp_path / "checkpoints") == [2]
+
+
+def test_a_save_removes_what_saves_left_behind_and_nothing_else(run_dir: Path):
+    checkpoints = run_dir / "checkpoints"
+    left = ("5.unfinished", "5.unfinished.orbax-checkpoint-tmp-1", "2.removed", "3.orbax-checkpoint-tmp-1")
+    for name in (*left, "2.before-the-spike"):
+        (checkpoints / name).mkdir()
+    fit_toy(run_dir, 8, options=EVERY_TWO)
+    assert sorted(p.name for p in checkpoints.iterdir()) == ["2.before-the-spike", "6", "8"]
+
+
 def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path):
     """Runs in such directories ended well, and no checkpoint of theirs could be read."""
     with pytest.raises(ConfigError, match=r"a path with \[2\] cannot hold checkpoints.*choose another"):
