@@ -12,14 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from data_pipelines.sampling.splits import (
-    MAX_VAL,
-    MAX_VAL_FRACTION,
-    MIN_VAL,
-    VAL_FRACTION,
-    check_bounds,
-    count_held_out,
-)
+from data_pipelines.sampling.splits import HeldOut
 from hma_jax.config import (
     AnyTokenizerConfig,
     EvalConfig,
@@ -62,11 +55,11 @@ class SuiteConfig:
 class StoreConfig:
     """What the token store keeps (`data_pipelines.tokens.tokenize_job`)."""
 
-    val_fraction: float = VAL_FRACTION  # fraction of episodes that are held out
-    min_val: int = MIN_VAL  # smallest number of held-out episodes per dataset
-    max_val: int = MAX_VAL  # largest number of held-out episodes per dataset
+    val_fraction: float = HeldOut.val_fraction  # fraction of episodes that are held out
+    min_val: int = HeldOut.min_val  # smallest number of held-out episodes per dataset
+    max_val: int = HeldOut.max_val  # largest number of held-out episodes per dataset
     # Largest fraction of a dataset that is held out; takes precedence over min_val.
-    max_val_fraction: float = MAX_VAL_FRACTION
+    max_val_fraction: float = HeldOut.max_val_fraction
     frame_step: int | None = None  # store every N-th native frame; 1: all; null: those of the study's rate
     corrupt: Literal["raise", "skip"] = "raise"  # at a damaged record, stop with an error, or leave it out and count it
     max_skipped: float = 16.0  # largest number of damaged episodes per dataset to leave out; below 1: a fraction
@@ -78,11 +71,15 @@ class StoreConfig:
             f"store.max_skipped must be a whole number of episodes or, below 1, a fraction of them, got {m:g}",
         )
         # As tokenising asks for them, which may come hours later.
-        check_bounds(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, "store.")
+        self.held_out.check("store.")
         require(
             self.frame_step is None or self.frame_step >= 1,
             f"store.frame_step must be at least 1, got {self.frame_step}",
         )
+
+    @property
+    def held_out(self) -> HeldOut:
+        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
 
 
 @dataclass(frozen=True)
@@ -307,8 +304,7 @@ def count_trained_on(spec: DatasetSpec, settings: StoreConfig) -> int | None:
     held out."""
     if not spec.episodes or spec.val_split:
         return None
-    bounds = settings.val_fraction, settings.min_val, settings.max_val, settings.max_val_fraction
-    return spec.episodes - count_held_out(spec.episodes, *bounds)
+    return spec.episodes - settings.held_out.count(spec.episodes)
 
 
 def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:

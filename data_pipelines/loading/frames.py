@@ -20,7 +20,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.mixture import make_mixture
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, held_out_episodes
+from data_pipelines.sampling.splits import HeldOut, held_out_episodes
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.open import open_source
@@ -43,10 +43,7 @@ def make_frame_loader(
     seed: int,
     start_step: int = 0,
     tau: float = 3.0,
-    val_fraction: float = VAL_FRACTION,
-    min_val: int = MIN_VAL,
-    max_val: int = MAX_VAL,
-    max_val_fraction: float = MAX_VAL_FRACTION,
+    held_out: HeldOut = HeldOut(),
     split: Literal["train", "val"] = "train",
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: float = MAX_SKIPPED,
@@ -55,7 +52,7 @@ def make_frame_loader(
     """Endless batches of frames, uint8 [B, image_size, image_size, 3].
 
     Datasets are drawn with p ∝ episodes^(1/tau), episodes and frames within them uniformly.
-    Held-out episodes are those that the token store holds out under the same fractions. `threads` (default: as many as
+    Held-out episodes are those that the token store holds out under the same `held_out`. `threads` (default: as many as
     cores, up to 8) read and decode; they change no frame.
     Raises ConfigError and DataError as `open_source` does.
     """
@@ -66,15 +63,15 @@ def make_frame_loader(
     for spec, directory in datasets:
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-        bounds = (val_fraction, min_val, max_val, max_val_fraction)
-        all_held_out = held_out_episodes(spec, source.runs, *bounds)
+        all_held_out = held_out_episodes(spec, source.runs, held_out)
         mask = all_held_out[source.numbers]
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):
             reasons[spec.name] = f"it has no {split} episode"
             if split == "val":
-                bound = f"val_fraction={val_fraction:g}, min_val={min_val} and max_val={max_val} set how many are"
+                h = held_out
+                bound = f"val_fraction={h.val_fraction:g}, min_val={h.min_val} and max_val={h.max_val} set how many are"
                 skipped = f"all {all_held_out.sum():,} held-out episodes of its {len(all_held_out):,} were skipped"
                 where = " in one of its parts" if spec.joins else ""
                 none = f"of {len(mask)} none is held out: this needs at least two{where}"

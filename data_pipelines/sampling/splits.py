@@ -9,6 +9,7 @@ should have, so that damaged ones do not change the split of the others.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,13 +18,34 @@ from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.sources.identity import EpisodeRun, episode_ids, runs_of_parts
 from hma_jax.config import require
 
-VAL_FRACTION, MIN_VAL, MAX_VAL, MAX_VAL_FRACTION = 0.05, 2, 200, 0.25
-"""How many episodes are held out, unless a study says otherwise: see `count_held_out`."""
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How many episodes of a dataset are held out, as the settings of a study and of a token store call it."""
+
+    val_fraction: float = 0.05  # of all episodes
+    min_val: int = 2
+    max_val: int = 200
+    max_val_fraction: float = 0.25  # takes precedence over min_val
+
+    def count(self, episodes: int) -> int:
+        """`val_fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_val_fraction`.
+
+        In a small dataset the last bound decides: with min_val 8 and max_val_fraction 0.25, two of nine episodes are
+        held out. If the other bounds ask for any, at least one of two or more episodes is held out.
+        """
+        most = max(int(self.max_val_fraction * episodes), 1)
+        return min(max(round(self.val_fraction * episodes), self.min_val), self.max_val, most, episodes // 2)
+
+    def check(self, group: str = "") -> None:
+        """Raises ConfigError, which names the setting and its `group`, for bounds that `count` cannot take."""
+        fraction, low, high, most = self.val_fraction, self.min_val, self.max_val, self.max_val_fraction
+        require(0 <= fraction < 1, f"{group}val_fraction must lie in [0, 1), got {fraction:g}")
+        require(0 <= low <= high, f"{group}min_val must lie between 0 and {group}max_val, {high}, got {low}")
+        require(0 < most <= 0.5, f"{group}max_val_fraction must lie in (0, 0.5], got {most:g}")
 
 
-def held_out_episodes(
-    spec: DatasetSpec, runs: Sequence[EpisodeRun], fraction: float, min_val: int, max_val: int, max_fraction: float
-) -> np.ndarray:
+def held_out_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: HeldOut) -> np.ndarray:
     """bool [episodes that `runs` name], True for validation: the split that the dataset's entry names for that,
     whatever its size, or else as `held_out` chooses. Raises ConfigError if there is no such split.
 
@@ -31,9 +53,8 @@ def held_out_episodes(
     is new to a model that was trained on the part alone, or joined with others.
     """
     if not spec.val_split:
-        bounds = (fraction, min_val, max_val, max_fraction)
         parts = runs_of_parts(runs).items()
-        masks = [held_out(part or spec.name, episode_ids(own), *bounds) for part, own in parts]
+        masks = [held_out(part or spec.name, episode_ids(own), amount) for part, own in parts]
         return np.concatenate([np.zeros(0, bool), *masks])
     own = [run.split == spec.val_split for run in runs]
     require(
@@ -44,40 +65,14 @@ def held_out_episodes(
     return np.repeat(own, [run.count for run in runs])
 
 
-def held_out(
-    dataset: str,
-    ids: np.ndarray,
-    fraction: float = VAL_FRACTION,
-    min_val: int = MIN_VAL,
-    max_val: int = MAX_VAL,
-    max_fraction: float = MAX_VAL_FRACTION,
-) -> np.ndarray:
+def held_out(dataset: str, ids: np.ndarray, amount: HeldOut) -> np.ndarray:
     """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 
-    `count_held_out` says how many.
     DIFFERS: the release takes the first max(20, 5 %) episodes (reference section 5.1).
     """
-    count = count_held_out(len(ids), fraction, min_val, max_val, max_fraction)
     mask = np.zeros(len(ids), bool)
-    mask[smallest_hashes(dataset, ids, count, "held-out")] = True
+    mask[smallest_hashes(dataset, ids, amount.count(len(ids)), "held-out")] = True
     return mask
-
-
-def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, max_fraction: float) -> int:
-    """`fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_fraction` of a dataset.
-
-    In a small dataset the last bound decides: with min_val 8 and max_fraction 0.25, two of nine episodes are held
-    out. If the other bounds ask for any, at least one of two or more episodes is held out.
-    """
-    most = max(int(max_fraction * episodes), 1)
-    return min(max(round(fraction * episodes), min_val), max_val, most, episodes // 2)
-
-
-def check_bounds(fraction: float, min_val: int, max_val: int, max_fraction: float, group: str = "") -> None:
-    """Raises ConfigError, which names the setting and its `group`, for bounds that `count_held_out` cannot take."""
-    require(0 <= fraction < 1, f"{group}val_fraction must lie in [0, 1), got {fraction:g}")
-    require(0 <= min_val <= max_val, f"{group}min_val must lie between 0 and {group}max_val, {max_val}, got {min_val}")
-    require(0 < max_fraction <= 0.5, f"{group}max_val_fraction must lie in (0, 0.5], got {max_fraction:g}")
 
 
 def subset(

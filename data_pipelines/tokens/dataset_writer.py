@@ -222,7 +222,7 @@ def _changes(existing: Manifest, plan: Manifest) -> list[str]:
     inputs = ("spec", "tokenizer", "settings", "source", "recipe")
     counts, asked = existing.episodes_of_parts, plan.settings
     own = replace(asked, max_val_fraction=existing.settings.max_val_fraction)
-    if all(own.count_held_out(n) == asked.count_held_out(n) for n in counts):  # another limit changes nothing here
+    if all(own.held_out.count(n) == asked.held_out.count(n) for n in counts):  # another limit changes nothing here
         plan = replace(plan, settings=own)
     return [line for name in inputs for line in diff(getattr(existing, name), getattr(plan, name), name)]
 

@@ -19,7 +19,7 @@ import numpy as np
 from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
-from data_pipelines.sampling.splits import MAX_VAL, MIN_VAL, VAL_FRACTION, check_bounds, count_held_out
+from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources.identity import EpisodeRun, runs_of_parts
 from data_pipelines.tokens.moments import Moments
 from data_pipelines.tokens.row_sample import ActionRange, quantiles_vary
@@ -77,25 +77,25 @@ class TokenizerFacts:
 class JobSettings:
     """What a tokenising job may choose. Equal settings on equal input give equal stores."""
 
-    val_fraction: float = VAL_FRACTION
-    min_val: int = MIN_VAL
-    max_val: int = MAX_VAL
+    val_fraction: float = HeldOut.val_fraction
+    min_val: int = HeldOut.min_val
+    max_val: int = HeldOut.max_val
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
-    # Limits min_val too. The default is that of older stores (`ADDED_FIELDS`), not of new ones (`MAX_VAL_FRACTION`).
+    # Limits min_val too. The default is that of older stores (`ADDED_FIELDS`), not of new ones (`HeldOut`).
     max_val_fraction: float = 0.5
 
     def __post_init__(self):
-        check_bounds(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
+        self.held_out.check()
         require(self.frame_step >= 1, f"frame_step must be at least 1, got {self.frame_step}")
         require(
             self.keep_frames in ("none", "val", "all"),
             f"keep_frames must be none, val or all, got {self.keep_frames!r}",
         )
 
-    def count_held_out(self, episodes: int) -> int:
-        """How many of `episodes` are held out."""
-        return count_held_out(episodes, self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
+    @property
+    def held_out(self) -> HeldOut:
+        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from data_pipelines.errors import EpisodeError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
-from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, held_out_episodes
+from data_pipelines.sampling.splits import HeldOut, held_out_episodes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import decoding_threads, fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
@@ -41,6 +41,7 @@ from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
 from data_pipelines.tokens.turns import TurnWatch
 from hma_jax.config import require
+from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.sources.joined import Parts
@@ -54,10 +55,7 @@ def tokenize_dataset(
     tokenizer: Tokenizer,
     store_root: str | Path,
     *,
-    val_fraction: float = VAL_FRACTION,
-    min_val: int = MIN_VAL,
-    max_val: int = MAX_VAL,
-    max_val_fraction: float = MAX_VAL_FRACTION,
+    held_out: HeldOut = HeldOut(),
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
     rate: float | None = FRAME_RATE,
@@ -90,8 +88,7 @@ def tokenize_dataset(
     source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = plan_dataset(
-        spec, source, tokenizer, val_fraction, min_val, max_val,
-        max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
+        spec, source, tokenizer, held_out, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
         recorded=recorded_source(store_root, spec.name),
     )  # fmt: skip
     watch = TurnWatch(spec, warn or (lambda _: None))
@@ -122,11 +119,8 @@ def plan_dataset(
     spec: DatasetSpec,
     source: EpisodeSource,
     tokenizer: Tokenizer,
-    val_fraction: float,
-    min_val: int,
-    max_val: int,
+    held_out: HeldOut,
     *,
-    max_val_fraction: float = MAX_VAL_FRACTION,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
     rate: float | None = FRAME_RATE,
@@ -139,7 +133,7 @@ def plan_dataset(
     return Manifest(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
-        settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step, max_val_fraction),
+        settings=JobSettings(**to_dict(held_out), keep_frames=keep_frames, frame_step=frame_step),
         source=source.fingerprint_as(recorded),
         source_version=source.version,
         action_mean=(),
@@ -201,13 +195,11 @@ class _Work:
         threads: int,
         watch: TurnWatch,
     ):
-        s = plan.settings
         self._source, self._plan, self._threads, self._watch = source, plan, threads, watch
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
         self._numbers = source.numbers
-        bounds = (s.val_fraction, s.min_val, s.max_val, s.max_val_fraction)
-        self._is_val = held_out_episodes(plan.spec, source.runs, *bounds)[self._numbers]
+        self._is_val = held_out_episodes(plan.spec, source.runs, plan.settings.held_out)[self._numbers]
 
     def make(self, part: Part) -> Iterator[PartItem]:
         """The episodes of a part, in order. An unusable one is skipped, or raised, as the source's policy says."""

@@ -188,9 +188,8 @@ def _chosen(manifest: Manifest, split: str, usable: np.ndarray, limit: int, salt
     at = np.flatnonzero(usable)
     if not manifest.runs:  # a store that names episodes by their number
         return at[smallest_hashes(name, present[at], limit, salt)]
-    ids, s = episode_ids(manifest.runs), manifest.settings
-    bounds = (s.val_fraction, s.min_val, s.max_val, s.max_val_fraction)
-    is_val = held_out_episodes(manifest.spec, manifest.runs, *bounds)
+    ids = episode_ids(manifest.runs)
+    is_val = held_out_episodes(manifest.spec, manifest.runs, manifest.settings.held_out)
     members = is_val == (split == "val")
     members[present[~usable]] = False
     return at[subset(name, ids, members, present[at], limit, salt)]

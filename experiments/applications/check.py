@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from data_pipelines.sampling.splits import count_held_out
+from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.tokens.manifest import JobSettings
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches, subsample_windows
@@ -112,8 +112,8 @@ def _hold_out_more(settings: JobSettings, counts: Sequence[int]) -> str:
     """How to have MIN_EPISODES held out, of a dataset with so many in each of its parts."""
     episodes = sum(counts)
     for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
-        most = max(AT_LEAST, settings.max_val)
-        count = sum(count_held_out(n, settings.val_fraction, AT_LEAST, most, share) for n in counts)
+        more_held_out = HeldOut(settings.val_fraction, AT_LEAST, max(AT_LEAST, settings.max_val), share)
+        count = sum(map(more_held_out.count, counts))
         if count >= MIN_EPISODES:
             return (
                 "To hold out more, tokenise and train again in another --out, with --set "

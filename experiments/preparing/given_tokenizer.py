@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from data_pipelines.publishing.files import publish
 from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, read_stamp, require_same
 from experiments.preparing.sources import Source, open_source
-from experiments.preparing.tokenizer import HELD_OUT, OF_FRAMES, TRAINED, require_same_trained
+from experiments.preparing.tokenizer import OF_FRAMES, TRAINED, require_same_trained
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.terminal.progress import say
@@ -109,12 +109,12 @@ def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[So
     """Warns where a given tokenizer was trained on frames that the study holds out: it was trained on datasets of
     the study with fewer episodes held out (those are among these) or with others, on datasets before they grew (the
     hold-out is drawn among all episodes of a dataset), or on robots that no model of the study is trained on."""
-    trained_with, study_settings = training.inputs.get("store", {}), to_dict(study.store)
+    trained_with = training.inputs.get("store", {})
     data = {name: facts for name, facts in training.inputs.get("data", {}).items() if name in study.all_names()}
     more = [
-        f"store.{name}: {trained_with[name]} -> {study_settings[name]}"
-        for name in HELD_OUT
-        if study_settings[name] > trained_with.get(name, math.inf)
+        f"store.{name}: {trained_with[name]} -> {value}"
+        for name, value in to_dict(study.store.held_out).items()
+        if value > trained_with.get(name, math.inf)
     ]
     if data and more:
         say(

@@ -19,7 +19,6 @@ from experiments.study import Study
 from experiments.terminal.progress import Eta, say, step
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError
-from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.base import Tokenizer
@@ -44,7 +43,7 @@ def make_store(
     from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
-    made_with, settings = load_tokenizer(tokenizer or workspace.tokenizer), to_dict(study.store)
+    made_with, s = load_tokenizer(tokenizer or workspace.tokenizer), study.store
     require_same("tokens", workspace.store, _differences(study, workspace, sources, made_with), replace)
     say_other_rates(study, sources)
     say_unreached_rates(study, sources)
@@ -55,7 +54,8 @@ def make_store(
         (spec, path), eta = sources[i], Eta()
         note = f"{spec.name} ({i + 1} of {len(sources)}{', the rest is made by other processes' if wait else ''})"
         manifest = tokenize_dataset(
-            spec, path, made_with, workspace.store, **settings, **how, rate=study.rate,
+            spec, path, made_with, workspace.store, held_out=s.held_out, frame_step=s.frame_step, rate=study.rate,
+            corrupt=s.corrupt, max_skipped=s.max_skipped, **how,
             overwrite=may_replace("tokens", replace), wait=wait,
             progress=lambda done, total: update(done, total, f"{note}{eta(done, total)}"),
             warn=lambda text: say(f"warning: {text}"),
@@ -107,8 +107,7 @@ def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], 
             continue
         source = open_source((spec, path), s)
         plan = plan_dataset(
-            spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val,
-            max_val_fraction=s.max_val_fraction, frame_step=s.frame_step, rate=study.rate,
+            spec, source, tokenizer, s.held_out, frame_step=s.frame_step, rate=study.rate,
             recorded=recorded_source(workspace.store, spec.name),
         )  # fmt: skip
         try:

@@ -43,9 +43,6 @@ QUALITY = "quality.json"
 QUALITY_FRAMES = 1024
 """Held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
 
-HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
-"""Settings of the store that say which episodes no tokenizer is trained on."""
-
 OF_FRAMES = ("split", "val_split")
 """Facts of a registry entry that say which frames a dataset has for a tokenizer, beside its camera."""
 
@@ -84,7 +81,7 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
         ORIGIN: TRAINED,
         "tokenizer": to_dict(study.tokenizer),
         "tokenizer_train": to_dict(study.tokenizer_train),
-        "store": {name: getattr(settings, name) for name in HELD_OUT},
+        "store": to_dict(settings.held_out),
         "tau": study.tau,
         "order": ORDER_VERSION,
         "datasets": list(data),
@@ -124,8 +121,7 @@ def make_tokenizer(
     def frames(start: int, split: str = "train") -> FrameLoader:
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
-            **{name: getattr(settings, name) for name in HELD_OUT},
-            corrupt=settings.corrupt, max_skipped=settings.max_skipped, threads=threads,
+            held_out=settings.held_out, corrupt=settings.corrupt, max_skipped=settings.max_skipped, threads=threads,
         )  # fmt: skip
 
     held_out = frames(0, "val")  # raises before hours of training if there are none

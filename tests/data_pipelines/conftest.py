@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPECS = {
     # native Hz 4, 2 and 10: strides 2, 1 and 5; very unequal sizes

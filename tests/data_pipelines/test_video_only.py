@@ -10,8 +10,8 @@ import numpy as np
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 
 def test_a_dataset_read_without_its_actions_is_video_alone(tmp_path: Path):

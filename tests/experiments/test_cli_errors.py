@@ -23,7 +23,7 @@ import pytest
 from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
-from data_pipelines.sampling.splits import held_out
+from data_pipelines.sampling.splits import HeldOut, held_out
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from data_pipelines.sources.rlds.schema import DATASETS
 from data_pipelines.tokens import tokenize_job
@@ -215,7 +215,7 @@ def test_damage_can_be_left_out_and_is_counted(arm, tmp_path, capsys):
 
 
 def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
-    held = held_out(ARM.name, episode_ids([EpisodeRun(f"{ARM.name}-train.tfrecord-00000-of-00001", 0, 24)]))
+    held = held_out(ARM.name, episode_ids([EpisodeRun(f"{ARM.name}-train.tfrecord-00000-of-00001", 0, 24)]), HeldOut())
     kept = (int(np.flatnonzero(held)[0]), int(np.flatnonzero(~held)[0]))  # one to judge, one to train on
     bad = [e for e in range(24) if e not in kept]
 

@@ -13,7 +13,7 @@ import pytest
 from data_pipelines.convert.write import convert
 from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
-from data_pipelines.sampling.splits import held_out
+from data_pipelines.sampling.splits import HeldOut, held_out
 from data_pipelines.sources.convertible import Episode, Layout
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
@@ -127,7 +127,7 @@ def test_directories_of_one_robot_become_one_robot(hma, data, tmp_path):
             list(manifest.spec.joins) == list(dict.fromkeys(run.file.split("/")[0] for run in manifest.runs)) == given
         )
         alone = open_source(folder)
-        assert held_out_of(root, folder) == set(np.flatnonzero(held_out("pick_cube", alone.ids)))
+        assert held_out_of(root, folder) == set(np.flatnonzero(held_out("pick_cube", alone.ids, HeldOut())))
     (robot,) = table.entries
     train = [
         *(float(i) for i in manifest.train.episodes if i < 8),

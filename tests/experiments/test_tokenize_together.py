@@ -20,7 +20,6 @@ from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.tokens import part_maker
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli import tokenize as cli_tokenize
 from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
@@ -32,6 +31,7 @@ from experiments.running.workspace import Workspace
 from experiments.study_setup import StudyArguments, make_setup
 from experiments.terminal.progress import Eta
 from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.fakes import STUDY
 from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401

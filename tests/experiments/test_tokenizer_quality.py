@@ -2,7 +2,7 @@
 
 import inspect
 import itertools
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.loading.frames import make_frame_loader
+from data_pipelines.sampling.splits import HeldOut
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import MadeFrom
 from experiments.preparing.tokenizer import reconstruction_psnr
@@ -78,11 +79,11 @@ def test_every_frame_counts_equally():
 
 
 def test_a_tokenizer_is_trained_on_what_the_store_does_not_hold_out_and_judged_on_what_it_does(tmp_path, monkeypatch):
-    held_out = {"val_fraction": 0.3, "min_val": 3, "max_val": 7, "max_val_fraction": 0.4}
+    held_out = HeldOut(0.3, 3, 7, 0.4)
     kept = {"corrupt": "skip", "max_skipped": 5.0}
     study = replace(
         SMOKE,
-        store=StoreConfig(**held_out, **kept),
+        store=StoreConfig(**asdict(held_out), **kept),
         tau=2.0,
         tokenizer_train=replace(SMOKE.tokenizer_train, seed=4),
     )
@@ -110,6 +111,6 @@ def test_a_tokenizer_is_trained_on_what_the_store_does_not_hold_out_and_judged_o
     same = {"tau": 2.0, "seed": 4, "batch": study.tokenizer_train.batch, "image_size": study.tokenizer.image_size}
     (test, training) = loaders
     for loader, split, start in ((test, "val", 0), (training, "train", 6)):
-        expected = held_out | kept | same | {"split": split, "start_step": start}
+        expected = {"held_out": held_out} | kept | same | {"split": split, "start_step": start}
         assert {name: getattr(loader, name) for name in expected} == expected
     assert judged == [test]

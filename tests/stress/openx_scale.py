@@ -118,8 +118,8 @@ def measure_start(out: Path) -> dict:
 
 
 def measure_tokenise(out: Path) -> dict:
-    from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from tests.data_pipelines.fakes import FakeTokenizer
+    from tests.data_pipelines.tokenizing import tokenize_dataset
 
     begin = time.perf_counter()
     for k in range(DATASETS):

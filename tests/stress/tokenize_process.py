@@ -18,8 +18,8 @@ import tensorflow_datasets  # noqa: F401  once, in the server that processes are
 
 from data_pipelines.registry import get_spec
 from data_pipelines.tokens import part_maker
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 STEPS_OF_A_SAVE = ("replace", "rename", "fsync", "unlink")
 

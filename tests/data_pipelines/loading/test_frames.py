@@ -11,16 +11,16 @@ import pytest
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import get_spec
-from data_pipelines.sampling.splits import held_out
+from data_pipelines.sampling.splits import HeldOut, held_out
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.rlds import images
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles
 from data_pipelines.sources.rlds.writer import encode_jpeg
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import REAL_DATA, FakeTokenizer, count_open, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec()
 
@@ -78,7 +78,7 @@ def test_a_tokenizer_is_trained_on_the_frames_that_it_will_encode(tmp_path):
 
 
 def test_splits_share_no_episode_and_cover_all_frames(rlds):
-    mask = held_out("toy", RldsDataset(rlds).ids)
+    mask = held_out("toy", RldsDataset(rlds).ids, HeldOut())
     seen = {}
     for split in ("train", "val"):
         frames = np.concatenate(take([(SPEC, rlds)], 120, split=split))[:, 0, 0]
@@ -171,7 +171,7 @@ def test_damaged_episode_is_an_error_or_replaced(tmp_path):
             features["steps/observation/image"] = [b"broken"] * 9
 
     rlds = write_rlds(tmp_path, SPEC, [9] * 6, change=spoil)
-    assert not held_out("toy", RldsDataset(rlds).ids)[3]
+    assert not held_out("toy", RldsDataset(rlds).ids, HeldOut())[3]
     with pytest.raises(EpisodeError, match="episode 3"):
         take([(SPEC, rlds)], 20)
     seen = np.concatenate(take([(SPEC, rlds)], 20, corrupt="skip"))[:, 0, 0, 0]
@@ -197,7 +197,7 @@ def test_an_episode_without_a_step_is_damaged(tmp_path, kind):
         spec = make_spec("robomimic_lift", (7,))
         spec, place = replace(spec, image_key="observation/agentview"), tmp_path / "x.hdf5"
         write_robomimic(place, lengths=(5, 7), change=lambda file: empty(file["data/demo_10"]))
-    options = {"val_fraction": 0, "min_val": 0, "max_val": 0}
+    options = {"held_out": HeldOut(0.0, 0, 0)}
     with pytest.raises(EpisodeError, match="(episode 1|demo_10).*(with no|without) steps"):
         take([(spec, place)], 4, **options)
     assert len(take([(spec, place)], 4, corrupt="skip", max_skipped=1, **options)) == 4
@@ -216,7 +216,7 @@ def empty(demonstration) -> None:
 def test_held_out_episodes_that_were_all_skipped_are_told_as_such(tmp_path):
     """As where a small part of a large dataset was fetched: the present ones are not too few, but held in."""
     directory = write_rlds(tmp_path, SPEC, [6] * 60, shards=60)
-    held = np.flatnonzero(held_out(SPEC.name, RldsDataset(directory).ids))
+    held = np.flatnonzero(held_out(SPEC.name, RldsDataset(directory).ids, HeldOut()))
     for number in held:
         next(directory.glob(f"*-{number:05d}-of-00060")).unlink()
     with pytest.raises(

@@ -15,10 +15,10 @@ from data_pipelines.loading.loader import describe_batch, make_loader
 from data_pipelines.loading.selection import LoaderConfig, select_windows, training_table
 from data_pipelines.sources.identity import describe
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from hma_jax.model.embodiments import EmbodimentTable
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 STATM = Path("/proc/self/statm")
 CONFIG = LoaderConfig(frames=6, batch=16, seed=3)

@@ -13,9 +13,9 @@ from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.registry.angles import convert_angles
 from data_pipelines.registry.toml_file import load_entries, to_toml
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec("toy", (3,))
 

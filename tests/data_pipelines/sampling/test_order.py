@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.sampling.order import endless_shuffle, hash64, permute, random_below, stream_seed
-from data_pipelines.sampling.splits import held_out, smallest_hashes, subset
+from data_pipelines.sampling.splits import HeldOut, held_out, smallest_hashes, subset
 
 
 @pytest.mark.parametrize("n", [*range(1, 40), 63, 64, 65, 1000, 60_000, 65_535, 65_536, 65_537, 10**6])
@@ -68,7 +68,7 @@ def test_order_does_not_change_between_releases():
     assert hash64(np.arange(2), 5).tolist() == [13168350753275463132, 7134611160154358618]
     assert endless_shuffle(np.arange(10), 10, 0).tolist() == [0, 2, 4, 6, 1, 7, 9, 3, 8, 5]
     assert endless_shuffle(np.arange(3), 100_000, 0).tolist() == [36333, 38480, 56565]
-    assert np.flatnonzero(held_out("arm", np.arange(100))).tolist() == [16, 52, 60, 64, 81]
+    assert np.flatnonzero(held_out("arm", np.arange(100), HeldOut())).tolist() == [16, 52, 60, 64, 81]
     assert smallest_hashes("arm", np.arange(100), 3, "subset/0").tolist() == [11, 29, 68]
 
 
@@ -80,7 +80,7 @@ def test_random_below_is_even_and_other_for_every_seed():
 
 
 def test_held_out_depends_on_the_dataset_not_on_order():
-    a, b = held_out("arm", np.arange(100)), held_out("base", np.arange(100))
+    a, b = held_out("arm", np.arange(100), HeldOut()), held_out("base", np.arange(100), HeldOut())
     assert a.sum() == b.sum() == 5
     assert (a != b).any()
     assert not a[:5].all()
@@ -90,14 +90,14 @@ def test_held_out_depends_on_the_dataset_not_on_order():
     "episodes, expected", [(1, 0), (2, 1), (3, 1), (4, 1), (8, 2), (25, 2), (55, 3), (100, 5), (10_000, 200)]
 )
 def test_held_out_number_is_bounded_and_leaves_three_in_four_for_training(episodes, expected):
-    assert held_out("arm", np.arange(episodes)).sum() == expected
+    assert held_out("arm", np.arange(episodes), HeldOut()).sum() == expected
 
 
 @pytest.mark.parametrize("episodes, expected", [(9, 2), (32, 8), (33, 8), (400, 20)])
 def test_the_least_number_held_out_is_a_fraction_of_a_small_dataset(episodes, expected):
     """Of nine episodes four were, where at least eight were asked for: five were left to train on."""
-    assert held_out("arm", np.arange(episodes), min_val=8).sum() == expected
-    assert held_out("arm", np.arange(9), min_val=8, max_fraction=0.5).sum() == 4
+    assert held_out("arm", np.arange(episodes), HeldOut(min_val=8)).sum() == expected
+    assert held_out("arm", np.arange(9), HeldOut(min_val=8, max_val_fraction=0.5)).sum() == 4
 
 
 def test_subsets_are_nested():

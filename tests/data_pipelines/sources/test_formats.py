@@ -31,7 +31,6 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.robomimic import RobomimicSource
 from data_pipelines.sources.video import open_video
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import (
     CAMERA,
@@ -43,6 +42,7 @@ from tests.data_pipelines.convert.sources import (
     write_video,
 )
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 TOP = DatasetSpec("toy_arm", "observation/top", ("action",), (3,), 10)
 VIEW = DatasetSpec("robomimic_lift", "observation/agentview", ("action",), (7,), 20)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.sampling.splits import held_out
+from data_pipelines.sampling.splits import HeldOut, held_out
 from data_pipelines.sources.identity import EpisodeRun, describe, episode_ids
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.windows.windows import train_windows
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 from tests.data_pipelines.shards import index_shard
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec()
 OPTIONS = {"corrupt": "skip", "max_skipped": 100}
@@ -67,10 +67,10 @@ def chosen(store: TokenStore, limit: int) -> set[int]:
 def test_a_shard_that_is_absent_changes_no_other_split(tmp_path):
     directory = write_rlds(tmp_path, SPEC, [2] * 40, shards=4)
     whole = RldsDataset(directory)
-    mask = held_out("toy", whole.ids)
+    mask = held_out("toy", whole.ids, HeldOut())
     sorted(directory.glob("*.tfrecord*"))[1].unlink()
     rest = RldsDataset(directory, corrupt="skip")
     assert rest.numbers.tolist() == [*range(10), *range(20, 40)]
-    assert np.array_equal(held_out("toy", rest.ids), mask)
+    assert np.array_equal(held_out("toy", rest.ids, HeldOut()), mask)
     keys = (SPEC.image_key, SPEC.action_keys)
     assert [rest.episode(i, *keys).actions[0, 0] for i in range(30)] == rest.numbers.tolist()

@@ -12,16 +12,17 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.loading.frames import make_frame_loader
-from data_pipelines.sampling.splits import held_out, held_out_episodes
+from data_pipelines.sampling.splits import HeldOut, held_out, held_out_episodes
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.open import open_source
 from data_pipelines.tokens.dataset_writer import differences
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import plan_dataset, tokenize_dataset
+from data_pipelines.tokens.tokenize_job import plan_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 ARM = replace(make_spec("arm", (3,), hz=10), joins=("folder", "robomimic_lift", "shards"))
 
@@ -99,7 +100,7 @@ def test_the_same_episodes_are_held_out_of_a_part_whatever_is_joined(tmp_path):
         chosen[names] = split_by_name(manifest)
         for name in names:
             alone = open_source(rlds[name])
-            own = {f"{name}/{alone.runs[0].file} {i}" for i in np.flatnonzero(held_out(name, alone.ids))}
+            own = {f"{name}/{alone.runs[0].file} {i}" for i in np.flatnonzero(held_out(name, alone.ids, HeldOut()))}
             assert {episode for episode in chosen[names]["val"] if episode.startswith(f"{name}/")} == own
     assert [len(split["val"]) for split in chosen.values()] == [2, 4, 4]  # of the one of three none can be
 
@@ -109,7 +110,7 @@ def test_the_validation_splits_of_all_parts_are_held_out():
     runs = [
         EpisodeRun(f"{part}/{split}", 0, n, split) for part in spec.joins for split, n in (("train", 3), ("val", 1))
     ]
-    assert held_out_episodes(spec, runs, 0.05, 2, 200, 0.25).tolist() == [False, False, False, True] * 2
+    assert held_out_episodes(spec, runs, HeldOut()).tolist() == [False, False, False, True] * 2
 
 
 def test_a_joined_dataset_is_tokenised_in_parts_with_statistics_of_all(places, tmp_path):
@@ -136,7 +137,7 @@ def test_another_limit_of_held_out_episodes_is_judged_by_the_parts(tmp_path):
     place = Parts("all", tuple(write_rlds(tmp_path, spec, [8] * 4) for spec in specs))
     spec = replace(make_spec("all"), joins=tuple(s.name for s in specs))
     tokenize_dataset(spec, place, FakeTokenizer(), tmp_path / "store")
-    other = plan_dataset(spec, open_source(place), FakeTokenizer(), 0.05, 2, 200, max_val_fraction=0.5)
+    other = plan_dataset(spec, open_source(place), FakeTokenizer(), HeldOut(max_val_fraction=0.5))
     (line,) = differences(tmp_path / "store", other)
     assert line == "settings.max_val_fraction: 0.25 -> 0.5"
 

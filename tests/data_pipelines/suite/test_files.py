@@ -17,7 +17,7 @@ import pytest
 import simplejpeg
 
 from data_pipelines.registry import get_spec
-from data_pipelines.sampling.splits import held_out_episodes
+from data_pipelines.sampling.splits import HeldOut, held_out_episodes
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.tfrecord import read_record
 from data_pipelines.suite import generate
@@ -28,11 +28,11 @@ from data_pipelines.suite.generate import MIN_EPISODES, episode_count, fingerpri
 from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.windows.windows import train_windows, val_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer
 from tests.data_pipelines.shards import index_shard
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 NAMES = ("pusher_mint", "rover_slate", "mobile_sky")
 """Short ones: a single tensor of actions; video alone; dict-valued actions."""
@@ -117,7 +117,7 @@ def test_the_validation_split_is_what_is_held_out(suite):
     """Whatever fraction is asked for: the store and the frame loader both take it as it is."""
     spec = get_spec("pusher_mint")
     source = RldsDataset(suite / spec.name, spec.split)
-    mask = held_out_episodes(spec, source.runs, 0.5, 1, 1, 0.25)
+    mask = held_out_episodes(spec, source.runs, HeldOut(0.5, 1, 1, 0.25))
     assert mask.tolist() == [False] * MIN_EPISODES + [True] * 3
     seeds = [int(source.record(i)["episode_metadata/seed"][0]) for i in range(len(source))]
     robot = next(s for s in EMBODIMENTS if s.name == spec.name)
@@ -130,8 +130,8 @@ def test_the_token_store_and_the_frame_loader_hold_out_the_validation_split(suit
     from data_pipelines.loading.frames import make_frame_loader
     from data_pipelines.registry import get_spec
     from data_pipelines.sources.rlds.dataset import RldsDataset
-    from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from tests.data_pipelines.fakes import FakeTokenizer
+    from tests.data_pipelines.tokenizing import tokenize_dataset
 
     spec = get_spec("pusher_mint")
     manifest = tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path, min_val=1, max_val=1)
@@ -139,7 +139,9 @@ def test_the_token_store_and_the_frame_loader_hold_out_the_validation_split(suit
 
     source = RldsDataset(suite / spec.name, "val")
     recorded = np.concatenate([source.episode(i, spec.image_key, ()).images for i in range(3)])
-    batches = make_frame_loader([(spec, suite / spec.name)], 64, 8, 0, min_val=1, max_val=1, split="val")
+    batches = make_frame_loader(
+        [(spec, suite / spec.name)], 64, 8, 0, held_out=HeldOut(min_val=1, max_val=1), split="val"
+    )
     for frame in next(batches):
         assert (frame == recorded).all((1, 2, 3)).any(), "a frame of no validation episode"
 

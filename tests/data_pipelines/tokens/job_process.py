@@ -16,8 +16,8 @@ import numpy as np
 import tensorflow_datasets  # noqa: F401  once, in the server that processes are forked from
 
 from data_pipelines.tokens.manifest import Manifest
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec(hz=4)
 PART_SIZE = 2000  # bytes: about two episodes

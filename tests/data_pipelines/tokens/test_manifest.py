@@ -16,9 +16,9 @@ from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.manifest import SplitFacts
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.windows.windows import train_windows
 from tests.data_pipelines.fakes import FakeTokenizer, OneDataset, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec()
 

@@ -24,10 +24,10 @@ from data_pipelines.tokens.row_sample import (
     rows_of_part,
 )
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec("toy", (3,))
 

@@ -20,9 +20,9 @@ from data_pipelines.sources.rlds import location
 from data_pipelines.tokens import store as store_module
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode, encode_episode, token_dtype
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 
 def make_item(**changes) -> StoredEpisode:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
-from data_pipelines.sampling.splits import held_out
+from data_pipelines.sampling.splits import HeldOut, held_out
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, png, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec(hz=4)  # stride 2
 FILES = [
@@ -54,7 +54,7 @@ def test_every_episode_is_stored_once_with_its_own_frames_and_actions(tmp_path, 
                 assert (item.frames[:, 0, 0, 1] == np.arange(0, steps, 2)).all()
             seen.append(number)
     assert sorted(seen) == list(range(8))
-    assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", RldsDataset(rlds).ids)))
+    assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", RldsDataset(rlds).ids, HeldOut())))
     assert files(tmp_path / "store" / "toy") == ["episodes.columns", "manifest.json", "parts", *FILES]
     assert files(tmp_path / "store") == ["toy"]
 

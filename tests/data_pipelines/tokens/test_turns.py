@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry.toml_file import load_entries, to_toml
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.tokens.turns import EARLY, TurnWatch
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec(dims=(2, 3))
 

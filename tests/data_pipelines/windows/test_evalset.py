@@ -7,7 +7,6 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from data_pipelines.windows.evalset import (
     ChoiceSettings,
     EvalManifest,
@@ -18,6 +17,7 @@ from data_pipelines.windows.evalset import (
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash, to_dict
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.generate import generate_suite
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.applications.generating import source as source_module
 from experiments.applications.generating import trajectories as trajectories_module
 from experiments.applications.generating.trajectories import describe, open_trajectories
@@ -26,6 +25,7 @@ from hma_jax.simulator.folder import save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.data_pipelines.fakes import write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 from tests.experiments.applications.runs import TABLE, make_run
 
 ROBOT = Robot.of(TABLE.entries[0])

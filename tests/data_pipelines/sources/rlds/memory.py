@@ -77,11 +77,11 @@ def _features(episode: int, frames: int) -> dict:
 
 def tokenize(root: Path) -> None:
     """Tokenises and prints the peak of memory, in MB, and how much of it came with the records."""
-    from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from hma_jax.config import TokenizerConfig
     from hma_jax.runtime.host_memory import keep_freed_memory
     from hma_jax.tokenizers.autoencoder import declare_tokenizer
     from hma_jax.tokenizers.lfq import LfqTokenizer
+    from tests.data_pipelines.tokenizing import tokenize_dataset
 
     keep_freed_memory()
     config = TokenizerConfig(image_size=256, downsample=16, channels=32)

@@ -15,10 +15,10 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import absolute, is_remote, locate
 from data_pipelines.sources.rlds.schema import dataset_name
 from data_pipelines.sources.rlds.tfrecord import open_record, scan_shard
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 from tests.data_pipelines.shards import index_shard
+from tests.data_pipelines.tokenizing import tokenize_dataset
 from tests.full_disk import full_disk
 
 UPath = pytest.importorskip("upath").UPath

@@ -9,8 +9,8 @@ from data_pipelines.errors import UnreachableError
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 pytest.importorskip("moto")
 s3fs = pytest.importorskip("s3fs")

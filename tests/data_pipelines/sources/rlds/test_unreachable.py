@@ -12,9 +12,9 @@ from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, U
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles, retry
-from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 from tests.data_pipelines.shards import index_shard
+from tests.data_pipelines.tokenizing import tokenize_dataset
 
 SPEC = make_spec()
 KEYS = (SPEC.image_key, SPEC.action_keys)
