@@ -76,7 +76,7 @@ def test_the_law_of_best_sizes_stands_under_exponents(monkeypatch, tmp_path, cap
         near=Coefficient("a", 0.6, 0.4, 0.8),
         apart=Coefficient("d", -0.1, -0.2, -0.05),
     )
-    monkeypatch.setattr(numbers, "read_numbers", lambda _: SimpleNamespace(fits=[], isoflop=law))
+    monkeypatch.setattr(numbers, "read_numbers", lambda _: SimpleNamespace(fits=[], isoflop=law, results={}))
     assert command(tmp_path) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert lines[0].index("N_opt ~ C^0.500") == head.index("exponents")

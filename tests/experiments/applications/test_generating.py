@@ -195,7 +195,7 @@ def episode_seed(i: int) -> int:
 
 def test_that_a_model_without_actions_follows_none_is_said(tmp_path, capsys):
     run = make_run(tmp_path / "study", TrainConfig(masking=MaskingConfig(setting="passive")))
-    assert generate(run, tmp_path / "none", tmp_path / "out") == 1
+    assert generate(run, tmp_path / "none", tmp_path / "out") == 2
     assert "note: the model was trained without actions" in " ".join(capsys.readouterr().out.split())
 
 
