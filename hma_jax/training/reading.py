@@ -87,9 +87,12 @@ def require_finished(checkpoint: Path) -> None:
 
 def _require_listed(checkpoint: Path) -> None:
     """Raises Damaged for a checkpoint without a list of hashes after one that has it: nobody can tell whether its files
-    are as they were written. Where none has a list, a version that wrote none made them."""
+    are as they were written. Where none has a list, a version that wrote none made them. One that training has removed
+    meanwhile is no matter of this."""
+    if (checkpoint / NAME).exists() or not checkpoint.is_dir():
+        return
     earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
-    if not (checkpoint / NAME).exists() and any((checkpoint.parent / str(step) / NAME).exists() for step in earlier):
+    if any((checkpoint.parent / str(step) / NAME).exists() for step in earlier):
         raise Damaged(checkpoint / NAME, "is missing, so it was not written or copied to its end")
 
 

@@ -31,6 +31,7 @@ from hma_jax.training.reading import (
     on_host,
     raised_in_all,
     read_description,
+    require_finished,
 )
 from hma_jax.training.run_lock import CHECKPOINTS
 
@@ -181,6 +182,7 @@ def _warn_of_unfinished(run_dir: str, step: int, steps: int) -> None:
 
 
 def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
+    require_finished(checkpoint)
     with raised_in_all("description"):
         described = read_description(checkpoint)
         missing = {"model", "train", "table", "provenance"} - set(described)

@@ -25,8 +25,9 @@ from hma_jax.config.json import to_dict
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import inference_params
 from hma_jax.training import reading, runs
+from hma_jax.training.branch import branch
 from hma_jax.training.checkpoints import Checkpoints
-from hma_jax.training.hashes import ReadError
+from hma_jax.training.hashes import NAME, ReadError
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
 from hma_jax.training.runs import describe_run, load_model, load_run, modernise
@@ -88,6 +89,20 @@ def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_ne
 
     monkeypatch.setattr(runs, "read_description", replaced)
     assert load_run(tmp_path / "run").step == 3
+
+
+def test_a_checkpoint_that_was_not_written_or_copied_to_its_end_is_neither_loaded_nor_branched(
+    averaged, tmp_path: Path
+):
+    run = shutil.copytree(averaged[0], tmp_path / "run")
+    shutil.copytree(run / "checkpoints" / "2", run / "checkpoints" / "1")
+    (run / "checkpoints" / "2" / NAME).unlink()
+    message = f"{NAME} is missing, .* copied to its end; that of step 1 is undamaged"
+    with pytest.raises(CheckpointError, match=message):
+        load_run(run)
+    with pytest.raises(CheckpointError, match=message):
+        branch(run, tmp_path / "new")
+    assert not (tmp_path / "new").exists() and branch(run, tmp_path / "new", 1) == 1
 
 
 @pytest.mark.parametrize("code", [errno.ENOENT, errno.ESTALE])
