@@ -26,7 +26,7 @@ from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import decoding_threads, fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
-from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4
@@ -42,10 +42,11 @@ def make_frame_loader(
     batch: int,
     seed: int,
     start_step: int = 0,
-    tau: float = 3.0,
-    held_out: HeldOut = HeldOut(),
+    *,
+    tau: float,
+    held_out: HeldOut,
     split: Literal["train", "val"] = "train",
-    corrupt: Literal["raise", "skip"] = "raise",
+    corrupt: Corrupt = "raise",
     max_skipped: float = MAX_SKIPPED,
     threads: int | None = None,
 ) -> FrameLoader:

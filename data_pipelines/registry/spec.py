@@ -36,7 +36,7 @@ NOT_OF_ACTIONS = (
 ImageCorrection = Literal["rotate_180", "swap_red_blue"]
 
 
-def stride_of(hz: float, rate: float | None = FRAME_RATE) -> int:
+def stride_of(hz: float, rate: float | None) -> int:
     """Native frames per model frame, at least 1: of the two integers around hz / rate the one nearer in ratio.
 
     Frames are then as near to `rate` Hz as possible: for 5 Hz and a rate of 2 the stride is 3 (1.67 Hz, off by a
@@ -170,7 +170,7 @@ class DatasetSpec:
         """The rate, in Hz, that gives this stride, to six digits, which are enough."""
         return float(f"{self.hz / stride:.6g}")
 
-    def check_compatible(self, robot: Embodiment, rate: float | None = FRAME_RATE) -> None:
+    def check_compatible(self, robot: Embodiment, rate: float | None) -> None:
         """Raises ConfigError, saying what to change, unless a study at `rate` Hz has the actions of a frame as this
         `robot` of a model has them."""
         name = self.name

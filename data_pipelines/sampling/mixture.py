@@ -23,7 +23,7 @@ class Mixture:
     dropped: dict[str, str]  # name -> reason
 
 
-def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.ndarray:
+def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float) -> np.ndarray:
     """float64 probabilities ∝ counts^(1/tau), 0 where the count is 0 (paper section 4;
     reference section 4.3). tau = 1 is proportional sampling, larger is flatter.
     """
@@ -37,7 +37,7 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.
     return powers / powers.sum()
 
 
-def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] | None = None) -> Mixture:
+def make_mixture(counts: Mapping[str, int], tau: float, reasons: Mapping[str, str] | None = None) -> Mixture:
     """The mixture of the datasets in `counts` (name -> examples).
 
     Those with none are left out; `reasons` may say why. If none remains: DataError with all

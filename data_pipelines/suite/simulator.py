@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data_pipelines.registry.spec import stride_of
+from data_pipelines.registry.spec import FRAME_RATE, stride_of
 from data_pipelines.suite.controls import Control, Drive
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.environment import Environment
@@ -77,7 +77,7 @@ def suite_starts(
     every `stride` native steps; None: as nearly twice a second as they can be.
     """
     spec = SPECS[name]
-    stride, numbers = stride or stride_of(spec.hz), episode_seeds(spec, count, seed, "val")
+    stride, numbers = stride or stride_of(spec.hz, FRAME_RATE), episode_seeds(spec, count, seed, "val")
     rollout, starts = simulate(spec, numbers), []
     for i, number in enumerate(numbers):
         if len(starts) == most:

@@ -18,7 +18,7 @@ import numpy as np
 
 from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
-from data_pipelines.registry import FRAME_RATE, DatasetSpec
+from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources.identity import EpisodeRun, runs_of_parts
 from data_pipelines.tokens.moments import Moments
@@ -149,7 +149,7 @@ class Manifest:
     recipe: int = 1  # RECIPE_VERSION of the code that made it; 1 where the file does not say
     format: int = FORMAT_VERSION
 
-    def stride_at(self, rate: float | None = FRAME_RATE) -> int:
+    def stride_at(self, rate: float | None) -> int:
         """Native frames per model frame at `rate` Hz (None: native). ConfigError if such frames are not stored."""
         stride = self.spec.stride_at(rate)
         own = rate if self.spec.rate is None else self.spec.rate
@@ -189,7 +189,7 @@ class Manifest:
 
     def embodiment(
         self,
-        rate: float | None = FRAME_RATE,
+        rate: float | None,
         moments: Moments | None = None,
         scale: ActionScale = "deviation",
         action_range: ActionRange | None = None,

@@ -17,7 +17,6 @@ import numpy as np
 from array_record.python import array_record_module
 
 from data_pipelines.errors import DataError
-from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sources.rlds.array_record import READ_OPTIONS
 from data_pipelines.sources.rlds.location import read_through, retry
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
@@ -84,7 +83,7 @@ class TokenStore:
         return stable_hash({name: self.manifest(name).hash() for name in chosen})
 
     def embodiment_table(
-        self, names: Sequence[str], rate: float | None = FRAME_RATE, scale: ActionScale = "deviation"
+        self, names: Sequence[str], rate: float | None, scale: ActionScale = "deviation"
     ) -> EmbodimentTable:
         """The table of `names`, in that order, with statistics of all training actions. Raises what
         `Manifest.embodiment` raises."""
@@ -171,7 +170,7 @@ class TokenStore:
                 rows.append(kept[own - (ends[part - 1] if part else 0)])
         return merge_exactly(np.concatenate([np.atleast_2d(x) for x in rows]), self.manifest(name).spec.action_dim)
 
-    def check_table(self, table: EmbodimentTable, names: Sequence[str], rate: float | None = FRAME_RATE) -> None:
+    def check_table(self, table: EmbodimentTable, names: Sequence[str], rate: float | None) -> None:
         """Raises ConfigError unless `table` has each of `names` with the action layout stored here, at `rate`."""
         for name in names:
             manifest = self.manifest(name)

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.registry import FRAME_RATE, DatasetSpec
+from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.splits import HeldOut, held_out_episodes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import decoding_threads, fit_image
-from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, recorded_source, write_dataset
 from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
@@ -55,14 +55,14 @@ def tokenize_dataset(
     tokenizer: Tokenizer,
     store_root: str | Path,
     *,
-    held_out: HeldOut = HeldOut(),
+    held_out: HeldOut,
+    rate: float | None,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
-    rate: float | None = FRAME_RATE,
     batch: int = 256,
     threads: int | None = None,
     part_size: int = PART_SIZE,
-    corrupt: Literal["raise", "skip"] = "raise",
+    corrupt: Corrupt = "raise",
     max_skipped: float = MAX_SKIPPED,
     overwrite: bool = False,
     wait: bool = True,
@@ -121,9 +121,9 @@ def plan_dataset(
     tokenizer: Tokenizer,
     held_out: HeldOut,
     *,
+    rate: float | None,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
-    rate: float | None = FRAME_RATE,
     recorded: str = "",
 ) -> Manifest:
     """The manifest of a dataset before it is made; `recorded` as of `EpisodeSource.fingerprint_as`.
@@ -145,7 +145,7 @@ def plan_dataset(
     )
 
 
-def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | None = FRAME_RATE) -> int:
+def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | None) -> int:
     """Native frames per stored frame: `frame_step` or, if that is None, the stride at `rate` Hz (None: native). Raises
     ConfigError for a step that does not divide that stride."""
     stride = spec.stride_at(rate)

@@ -130,8 +130,8 @@ def freeze_manifest(
     windows_per_dataset: int,
     seed: int,
     *,
+    rate: float | None,
     prompt: int | None = None,
-    rate: float | None = FRAME_RATE,
     spacing: int | None = None,
 ) -> EvalManifest:
     """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.

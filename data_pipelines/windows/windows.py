@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sampling.splits import held_out_episodes, smallest_hashes, subset
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.tokens.manifest import Manifest
@@ -129,7 +128,7 @@ def train_windows(
     max_trajectories: int | None = None,
     subset_seed: int = 0,
     *,
-    rate: float | None = FRAME_RATE,
+    rate: float | None,
     min_real: int = MIN_TRAIN_FRAMES,
 ) -> WindowSet:
     """Windows of the train split, optionally of `max_trajectories` episodes chosen by hash.
@@ -147,9 +146,7 @@ def train_windows(
     return _windows(store, name, "train", slicer, min(min_real, frames), max_trajectories, subset_seed)
 
 
-def val_windows(
-    store: TokenStore, name: str, frames: int, min_real: int, *, rate: float | None = FRAME_RATE
-) -> WindowSet:
+def val_windows(store: TokenStore, name: str, frames: int, min_real: int, *, rate: float | None) -> WindowSet:
     """Windows of the held-out split with at least `min_real` real frames."""
     return _windows(store, name, "val", make_slicer(store, name, frames, rate), min_real, None, 0)
 

@@ -53,9 +53,7 @@ class Controllability:
     role: str = POINT  # or CONTROL: a model trained on the actions of other episodes, which has nothing to follow
 
 
-def controllability(
-    seeds: dict[int, WindowTable], role: str = POINT, rate: float | None = FRAME_RATE
-) -> list[Controllability]:
+def controllability(seeds: dict[int, WindowTable], role: str = POINT, *, rate: float | None) -> list[Controllability]:
     """Measures of controllability of one model, given its tables by seed, for that `role` and frame rate: one entry for
     each robot that has the metric, in the order of the tables.
 

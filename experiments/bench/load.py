@@ -14,6 +14,7 @@ from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.tokens.dataset_writer import cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
@@ -82,7 +83,7 @@ class LoadTiming:
 def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threads: int) -> LoadTiming:
     """`windows` training windows; a call is a batch."""
     config = LoaderConfig(batch=batch, frames=frames)
-    loader = make_loader(store, store.embodiment_table(store.names), config, threads=threads)
+    loader = make_loader(store, store.embodiment_table(store.names, config.rate), config, threads=threads)
     return _drain(loader, _with_threads("windows", threads), max(windows // batch, 20), batch, batch * frames)
 
 
@@ -90,7 +91,7 @@ def time_shards(
     sources: Sequence[tuple[DatasetSpec, Location | Parts]], frames: int, batch: int, size: int, threads: int
 ) -> LoadTiming:
     """The same for single frames of RLDS shards, decoded and resized to `size` pixels."""
-    loader = make_frame_loader(sources, size, batch, 0, threads=threads)
+    loader = make_frame_loader(sources, size, batch, 0, tau=LoaderConfig.tau, held_out=HeldOut(), threads=threads)
     return _drain(loader, _with_threads("RLDS frames", threads), max(frames // batch, 20), batch, batch)
 
 

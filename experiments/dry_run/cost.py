@@ -75,7 +75,7 @@ def _count_parameters(model: ModelConfig, table: EmbodimentTable) -> int:
     return declare_model(model, table).count()
 
 
-def declared_table(names: Sequence[str], rate: float | None = 2.0) -> EmbodimentTable:
+def declared_table(names: Sequence[str], rate: float | None) -> EmbodimentTable:
     """Embodiments with the right action sizes and no statistics.
 
     Raises ConfigError for a name that the registry does not know.

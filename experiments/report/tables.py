@@ -47,7 +47,9 @@ def write_tables(
         ids = [trial_id(trial, provenance) for trial in trials]
         kept = [id for id in ids if (workspace.trials / id / FILE).exists()]
         seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
-        controllability_rows += controllability(dict(sorted(seeds.items())), role, record.study.rate) if seeds else []
+        controllability_rows += (
+            controllability(dict(sorted(seeds.items())), role, rate=record.study.rate) if seeds else []
+        )
     if not controllability_rows:
         workspace.controllability.unlink(missing_ok=True)  # of trials that are no longer the reference
         return [workspace.trial_table]

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.registry.spec import stride_of
+from data_pipelines.registry.spec import FRAME_RATE, stride_of
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.render import render_frames
@@ -55,7 +55,7 @@ def explained(spec: EmbodimentSpec, states: int = STATES) -> ExplainedShare:
     """The share of one robot, a pure function of its arguments."""
     seeds = episode_seeds(spec, states, 0, "explained")
     rollout, rng = simulate(spec, seeds), np.random.default_rng(0)
-    stride = stride_of(spec.hz)
+    stride = stride_of(spec.hz, FRAME_RATE)
     times = (rng.random(states) * (rollout.lengths - stride)).astype(int)
     starts = states_at(spec, rollout, times)
     of = rng.integers(states, size=(states, ACTIONS))

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.registry.spec import stride_of
+from data_pipelines.registry.spec import FRAME_RATE, stride_of
 from data_pipelines.suite.embodiments import EMBODIMENTS, siblings, strangers
 from data_pipelines.suite.render import positions_of
 from data_pipelines.suite.rollout import episode_seeds, simulate
@@ -63,7 +63,7 @@ class Result:
 
 def sample(spec: EmbodimentSpec, joints: int, episodes: int = EPISODES) -> Samples:
     """Steps of `episodes` episodes, configurations padded to `joints` entries."""
-    rollout, stride = simulate(spec, episode_seeds(spec, episodes, 0, "siblings")), stride_of(spec.hz)
+    rollout, stride = simulate(spec, episode_seeds(spec, episodes, 0, "siblings")), stride_of(spec.hz, FRAME_RATE)
     recorded = np.concatenate([rollout.actions[i, : rollout.lengths[i]] for i in range(episodes)])
     actions = (rollout.actions - recorded.mean(0)) / recorded.std(0)
     parts: list[tuple[np.ndarray, ...]] = []

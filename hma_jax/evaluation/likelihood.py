@@ -15,5 +15,5 @@ def window_loss(
     """Mean loss of each window [B] over the frames `truth` [B, T, S (, C)] that are `real_BT` (None: all), given the
     model's outputs for these: cross-entropy of ids, or diffusion loss with noise drawn by `key_B`."""
     if model.config.diffusion:
-        return mean_over_frames(frame_diffusion_loss(model, token_outputs, truth, key_B), real_BT)
+        return mean_over_frames(frame_diffusion_loss(model, token_outputs, truth, key_B, training=False), real_BT)
     return mean_over_frames(factored_cross_entropy(model.logits(token_outputs, truth), truth), real_BT)

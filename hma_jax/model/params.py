@@ -166,7 +166,7 @@ class Declared(Generic[M]):
 
     graphdef: nnx.GraphDef = field(repr=False)
     specs: Params = field(repr=False)  # nested dict of ParamSpec
-    min_shard_size: int = MeshConfig.min_shard_size
+    min_shard_size: int
 
     def init(self, seed: int, shardings: Params | None = None) -> Params:
         """Arrays for every declaration, laid out by `shardings` (default: on the default device).

@@ -99,7 +99,8 @@ def masked_loss(
     key_B: jax.Array,
     robot_row_B: jax.Array | None = None,
     real_BT: jax.Array | None = None,
-    training: bool = True,
+    *,
+    training: bool,
 ) -> LossSums:
     """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise, and the past that
     `masking.own_past` and `displaced_past` ask for; `robot_row_B` as for the model.
@@ -156,7 +157,7 @@ def masked_loss(
     if masking.predicts_frames:
         weight, tokens = weigh_tokens(masked, tokens, masking)[:, FIRST_PREDICTED:], tokens[:, FIRST_PREDICTED:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.token_outputs, tokens, key_B, training)
+            per_token = frame_diffusion_loss(model, out.token_outputs, tokens, key_B, training=training)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
             logits = model.logits(out.token_outputs, tokens)
@@ -176,7 +177,7 @@ def bidirectional_mask(frames: int, real_BT: jax.Array | None = None) -> jax.Arr
 
 
 def frame_diffusion_loss(
-    model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array, training: bool = False
+    model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array, *, training: bool
 ) -> jax.Array:
     """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4).
 

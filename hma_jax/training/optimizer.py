@@ -17,7 +17,7 @@ import optax
 import optax.contrib
 from jax.sharding import PartitionSpec
 
-from hma_jax.config import MeshConfig, ModelConfig, OptimizerConfig, require
+from hma_jax.config import ModelConfig, OptimizerConfig, require
 from hma_jax.model.params import MatrixAxes, Params, ParamSpec, Use, is_spec
 from hma_jax.runtime.sharding import STORAGE, is_split, mesh_axes, partition
 from hma_jax.training import active_robots
@@ -128,9 +128,7 @@ ORTHOGONALISE = "orthogonalise_matrices"
 """Scope of Muon's communication in compiled programs."""
 
 
-def muon_direction(
-    momentum: jax.Array, spec: ParamSpec, multiplier: float, min_shard_size: int = MeshConfig.min_shard_size
-) -> jax.Array:
+def muon_direction(momentum: jax.Array, spec: ParamSpec, multiplier: float, min_shard_size: int) -> jax.Array:
     """What a `hidden` parameter is moved along, in units of the rate at the base width: each of its matrices made
     orthogonal, so that all its singular values are about 1. `momentum` may have fewer robots than the declaration.
 
@@ -206,7 +204,7 @@ def apply_update(
     presence: Presence,
     learning_rate: jax.Array,
     config: OptimizerConfig,
-    min_shard_size: int = MeshConfig.min_shard_size,
+    min_shard_size: int,
 ) -> tuple[Params, AdamState]:
     """New parameters and state after one step. On a mesh, parameters of fewer than `min_shard_size` numbers are whole.
 

@@ -121,6 +121,7 @@ def make_gradient(
             rows["key"],
             rows["slice"],
             rows.get("real"),
+            training=True,
         )
         loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
         return loss, result

@@ -45,4 +45,4 @@ def latent_store(rlds, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def table(store):
-    return store.embodiment_table(store.names)
+    return store.embodiment_table(store.names, rate=2.0)

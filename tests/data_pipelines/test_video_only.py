@@ -22,7 +22,7 @@ def test_a_dataset_read_without_its_actions_is_video_alone(tmp_path: Path):
         read_as = replace(spec, action_keys=(), action_dims=()) if spec is film else spec
         tokenize_dataset(read_as, directory, FakeTokenizer(), store_root, min_val=1)
     store = TokenStore(store_root)
-    table = store.embodiment_table(("robot", "film"))
+    table = store.embodiment_table(("robot", "film"), rate=2.0)
     assert [e.chunk for e in table.entries] == [6, 0]
     batch = next(make_loader(store, table, LoaderConfig(frames=3, batch=16, datasets=("robot", "film"))))
     of_film = batch["embodiment"] == 1
@@ -34,5 +34,5 @@ def test_a_dataset_may_be_shown_without_being_predicted(tmp_path: Path):
     spec = replace(make_spec("blind"), video_targets=False)
     directory = write_rlds(tmp_path, spec, [12] * 3)
     tokenize_dataset(spec, directory, FakeTokenizer(), tmp_path / "store", min_val=1)
-    (entry,) = TokenStore(tmp_path / "store").embodiment_table(("blind",)).entries
+    (entry,) = TokenStore(tmp_path / "store").embodiment_table(("blind",), rate=2.0).entries
     assert not entry.video_targets

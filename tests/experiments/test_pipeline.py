@@ -27,7 +27,7 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     prepare(study, workspace)
     prepared = open_prepared_data(workspace)
     store = prepared.store
-    table = store.embodiment_table(study.dataset_names())
+    table = store.embodiment_table(study.dataset_names(), rate=2.0)
     loader = make_loader(store, table, LoaderConfig(frames=model.frames, batch=2))
     (train,) = itertools.islice(loader, 1)
     validation = next(eval_batches(store, table, prepared.manifest, 2))

@@ -90,7 +90,7 @@ def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind,
     assert hma("tokenize", *common, "--tokenizer", tokenizer) == 0
     prepared = open_prepared_data(Workspace(tmp_path / "out"))
     assert prepared.tokenizer.identity == load_tokenizer(tokenizer).identity
-    table = prepared.store.embodiment_table([ARM.name])
+    table = prepared.store.embodiment_table([ARM.name], rate=2.0)
     batch = next(eval_batches(prepared.store, table, prepared.manifest, 2))
     model = on_tokenizer(get_preset("smoke-continuous"), prepared.tokenizer.config).model
     assert batch["tokens"].shape == (2, 4, model.tokens, model.diffusion.token_channels)

@@ -516,7 +516,7 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
 def test_held_out_loss_is_of_as_many_episodes_as_a_batch_takes(tmp_path):
     """Of the first windows it would be that of one long episode and its neighbours."""
     store = small_store(tmp_path, lengths=(40,) * 16, min_val=4)
-    manifest, table = freeze_manifest(store, ("toy",), 4, 64, 0), store.embodiment_table(["toy"])
+    manifest, table = freeze_manifest(store, ("toy",), 4, 64, 0, rate=2.0), store.embodiment_table(["toy"], rate=2.0)
     prepared = SimpleNamespace(store=store, manifest=manifest)
     trial = SimpleNamespace(train=SimpleNamespace(batch=4), evaluated=("toy",))
     (batch,) = trials.validation_batches(trial, prepared, table)

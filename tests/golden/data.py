@@ -129,7 +129,9 @@ def _check_starts(case: Case, data: OnDisk, one: dict[str, Any]) -> None:
         why = "we keep overlapping windows" if one["filter_overlaps"] else "our windows never leave an episode"
         case.add(Finding(label, None, note=f"not followed: {why}"))
         return
-    ours = train_windows(OneDataset((data.ends - data.firsts).tolist(), hz=2 * stride), "toy", frames, min_real=frames)
+    ours = train_windows(
+        OneDataset((data.ends - data.firsts).tolist(), hz=2 * stride), "toy", frames, min_real=frames, rate=2.0
+    )
     got = set((data.firsts[ours.episode_idx] + ours.start).tolist())
     theirs = set(one["starts"])
     # DIFFERS: their last chunk may run over an episode's end, and they drop the last window of all.

@@ -90,7 +90,7 @@ def as_masked(ids: jax.Array, masked: jax.Array, hidden: jax.Array | None = None
 
 def loss_and_accuracy(model, masked: Masked, labels, actions, robots, masking: MaskingConfig = MASKING):
     keys = jax.random.split(jax.random.key(0), len(labels))  # of no effect on ids
-    sums = masked_loss(model, masked, labels, actions, robots, masking, keys)
+    sums = masked_loss(model, masked, labels, actions, robots, masking, keys, training=True)
     count = masked.targets_TS.sum()
     return sums.tokens / count, sums.correct / count
 

@@ -38,7 +38,7 @@ def check_train_steps(case: Case) -> None:
         grads, norm = clip_by_global_norm(grads, optimizer.clip_norm)
         presence = find_presence(recorded, robots, trained, config)
         rate = jnp.float32(optimizer.learning_rate)
-        return *apply_update(grads, state, params, specs, multipliers, presence, rate, optimizer), loss, norm
+        return *apply_update(grads, state, params, specs, multipliers, presence, rate, optimizer, 2**14), loss, norm
 
     params, state = case.params, init_adam(case.params, case.table.size)
     losses, gradient_norms = [], []

@@ -37,7 +37,9 @@ def gradients(dtype: str, diffusion: DiffusionConfig | None, rounded: bool = Fal
         def loss(params):
             robots = batch["embodiment"]
             model = declared.merge(params)
-            sums = masked_loss(model, masked, batch["tokens"], batch["actions"], robots, masking, keys, robots)
+            sums = masked_loss(
+                model, masked, batch["tokens"], batch["actions"], robots, masking, keys, robots, training=True
+            )
             return sums.tokens + sums.actions
 
         return jax.grad(loss)(params)

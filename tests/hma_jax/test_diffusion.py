@@ -227,7 +227,7 @@ def test_the_weighed_loss_of_a_token_is_the_error_times_its_weight_and_the_bound
     @jax.jit
     def losses():
         model = declared.merge(params)
-        return [frame_diffusion_loss(model, z, x0, keys, training) for training in (False, True)]
+        return [frame_diffusion_loss(model, z, x0, keys, training=training) for training in (False, True)]
 
     plain, weighed = losses()
     time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, 0), x0.shape[1:], config.steps))(keys)
@@ -245,7 +245,7 @@ def test_the_loss_of_a_token_is_the_mean_over_repeats_that_noise_it_anew():
     def loss(repeats):
         diffusion = DiffusionConfig(channels=3, patch=1, repeats=repeats)
         model = SimpleNamespace(config=SimpleNamespace(diffusion=diffusion), denoiser=network)
-        return frame_diffusion_loss(model, x0, x0, keys)
+        return frame_diffusion_loss(model, x0, x0, keys, training=False)
 
     def repeat(number):
         time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, number), x0.shape[1:], 1000))(keys)

@@ -72,7 +72,7 @@ def test_the_past_alone_is_displaced(monkeypatch):
     for masking in (TRUE, DISPLACED):
         masked = mask(jax.random.key(0), tokens, given[1], config, masking, TABLE)
         with pytest.raises(Shown) as shows:
-            losses.masked_loss(SimpleNamespace(table=TABLE), masked, tokens, *given, masking, keys)
+            losses.masked_loss(SimpleNamespace(table=TABLE), masked, tokens, *given, masking, keys, training=True)
         shown.append(shows.value.args)
     (past, *rest), (displaced, *others) = shown
     assert 0.02 < (past != displaced).mean() < 0.2

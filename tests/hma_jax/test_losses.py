@@ -26,7 +26,7 @@ def test_labels_are_smoothed_by_as_much_as_is_configured(monkeypatch):
     monkeypatch.setattr("hma_jax.objective.losses.smoothed_cross_entropy", cross_entropy)
     declared, (data, masked) = declare_model(config, TABLE), masked_batch(config, masking, batch=8)
     inputs = masked, data["tokens"], data["actions"], data["embodiment"], masking, KEYS
-    jax.eval_shape(lambda params: masked_loss(declared.merge(params), *inputs), declared.shapes())
+    jax.eval_shape(lambda params: masked_loss(declared.merge(params), *inputs, training=True), declared.shapes())
     assert seen == [0.3]
 
 
@@ -45,7 +45,7 @@ def test_robots_without_actions_are_shown_none_where_others_are_shown_theirs(mon
     data, masked = masked_batch(shallow_config(), masking, MIXED, batch=8)
     robots, model = data["embodiment"], SimpleNamespace(table=MIXED)
     with pytest.raises(Seen):
-        masked_loss(model, masked, data["tokens"], data["actions"], robots, masking, KEYS)
+        masked_loss(model, masked, data["tokens"], data["actions"], robots, masking, KEYS, training=True)
     np.testing.assert_array_equal(np.all(seen[0], axis=1), np.array(MIXED.chunks)[robots] == 0)
 
 

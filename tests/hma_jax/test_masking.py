@@ -168,7 +168,14 @@ def losses(config, masking, changes=None, table=TABLE):
     keys = jax.random.split(jax.random.key(1), 8)
     run = jax.jit(
         lambda p: masked_loss(
-            declared.merge(p), masked, data["tokens"], data["actions"], data["embodiment"], masking, keys
+            declared.merge(p),
+            masked,
+            data["tokens"],
+            data["actions"],
+            data["embodiment"],
+            masking,
+            keys,
+            training=True,
         )
     )
     return np.array(run(params))
@@ -189,7 +196,9 @@ def test_tokens_that_change_may_count_more():
     def sums_and_counts(weight: float, among):
         model, masking = declared.merge(params), MaskingConfig(change_weight=weight)
         counted = masked._replace(targets_TS=masked.targets_TS & among)
-        sums = masked_loss(model, counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8))
+        sums = masked_loss(
+            model, counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8), training=True
+        )
         return sums.tokens, sums.correct, count_targets(counted, tokens, masking).tokens
 
     def found(weight, among=np.ones_like(changed)):
@@ -237,7 +246,7 @@ def test_only_in_training_are_latents_noised_and_weighed_as_it_is_configured(mon
     def both(params, keys):
         model, (_, masked) = declared.merge(params), masked_batch(config, masking, batch=8)
         inputs = masked, data["tokens"], data["actions"], data["embodiment"], masking, keys
-        return masked_loss(model, *inputs), masked_loss(model, *inputs, training=False)
+        return masked_loss(model, *inputs, training=True), masked_loss(model, *inputs, training=False)
 
     jax.eval_shape(both, declared.shapes(), jax.random.split(jax.random.key(0), 8))
     assert seen == [True, False]

@@ -49,7 +49,7 @@ def compiled(config: OptimizerConfig):
 
     def step(gradients, state, params, present):
         here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, present))
-        return apply_update(gradients, state, params, specs, ones, here, 1e-2, config)
+        return apply_update(gradients, state, params, specs, ones, here, 1e-2, config, 2**14)
 
     return jax.jit(step)
 
@@ -145,7 +145,9 @@ def test_muon_moves_every_matrix_by_as_much_in_every_direction_and_all_else_as_a
     specs = list(declared.leaves().values())
     at = next(i for i, spec in enumerate(specs) if spec.role == "hidden")
     momentum = 0.95 * 0.05 * first[at] + 0.05 * second[at]
-    ahead = jax.jit(lambda x: muon_direction(x, specs[at], 1.0))(0.95 * momentum + 0.05 * second[at])
+    ahead = jax.jit(lambda x: muon_direction(x, specs[at], 1.0, min_shard_size=2**14))(
+        0.95 * momentum + 0.05 * second[at]
+    )
     was, moved = (np.asarray(jax.tree.leaves(tree)[at]) for tree in (muon, again))
     np.testing.assert_allclose((was - moved) / 1e-2 - 0.1 * was, ahead, atol=2e-4)
 
@@ -180,7 +182,10 @@ def test_under_mup_muon_s_updates_keep_their_spectral_norm_at_every_width():
 
         @jax.jit
         def directions(moved):
-            return {p: muon_direction(moved[p], s, learning_rate_multiplier(s, config)) for p, s in hidden.items()}
+            return {
+                p: muon_direction(moved[p], s, learning_rate_multiplier(s, config), min_shard_size=2**14)
+                for p, s in hidden.items()
+            }
 
         return {p: float(singular_values(x, hidden[p]).max()) for p, x in directions(moved).items()}
 
@@ -211,7 +216,7 @@ def test_mup_leaves_decay_as_it_is():
     params = {"matrix": jnp.ones(specs["matrix"].shape)}
     nothing, state = jax.tree.map(jnp.zeros_like, params), init_adam(params, TABLE.size)
     here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, jnp.ones(TABLE.size, bool)))
-    new, _ = apply_update(nothing, state, params, specs, {"matrix": 0.25}, here, 1e-2, CONFIG)
+    new, _ = apply_update(nothing, state, params, specs, {"matrix": 0.25}, here, 1e-2, CONFIG, 2**14)
     np.testing.assert_allclose(new["matrix"], 1 - 1e-2 * CONFIG.weight_decay, rtol=1e-6)
 
 

@@ -63,7 +63,7 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
 
     def loss(masking: MaskingConfig) -> jax.Array:
         masked = mask_batch(jax.random.key(0), one["tokens"], one["embodiment"], config, masking, TABLE)
-        return losses.masked_loss(model, masked, one["tokens"], *given, masking, keys).tokens
+        return losses.masked_loss(model, masked, one["tokens"], *given, masking, keys, training=True).tokens
 
     jax.eval_shape(lambda: loss(OWN))
     jax.eval_shape(lambda: loss(TRUE))
@@ -148,5 +148,7 @@ def test_it_is_drawn_after_hidden_actions_where_these_leak_to_the_model(monkeypa
     monkeypatch.setattr(losses, "draw_own_past", lambda model, past, *_, leak, **__: seen.append(leak) or past)
     masking = replace(OWN, setting="passive", action_leak="all")
     masked = mask_batch(jax.random.key(0), tokens, given[1], config, masking, TABLE)
-    jax.eval_shape(lambda: losses.masked_loss(declared.merge(params), masked, tokens, *given, masking, keys).tokens)
+    jax.eval_shape(
+        lambda: losses.masked_loss(declared.merge(params), masked, tokens, *given, masking, keys, training=True).tokens
+    )
     assert seen == ["all"]

@@ -75,7 +75,7 @@ def test_muon_multiplies_what_the_page_says():
     hidden = {name: spec for name, spec in declared.leaves().items() if spec.role == "hidden"}
 
     def update(momenta):
-        return [muon_direction(momenta[name], spec, 1.0) for name, spec in hidden.items()]
+        return [muon_direction(momenta[name], spec, 1.0, min_shard_size=2**14) for name, spec in hidden.items()]
 
     momenta = {name: jax.ShapeDtypeStruct(spec.shape, jnp.float32) for name, spec in hidden.items()}
     of_a_layer, of_stems = 420 + 110 * TABLE.size, 30 * TABLE.size

@@ -41,13 +41,13 @@ def test_of_wholly_masked_frames_it_is_the_loss_of_what_generation_is_asked_firs
     @jax.jit
     def found():
         masked = mask_batch(key, tokens, batch["embodiment"], model.config, WHOLLY, TABLE)
-        return masked.targets_TS, masked_loss(model, masked, tokens, *rest, WHOLLY, keys).tokens
+        return masked.targets_TS, masked_loss(model, masked, tokens, *rest, WHOLLY, keys, training=True).tokens
 
     @jax.jit
     def wanted():
         asked = next_frame_outputs(model, tokens, *rest)
         if diffusion:
-            return frame_diffusion_loss(model, asked, tokens[:, 1:], keys).sum()
+            return frame_diffusion_loss(model, asked, tokens[:, 1:], keys, training=False).sum()
         labels = factorise(tokens[:, 1:], model.config.factors, model.config.factor_vocab)
         return smoothed_cross_entropy(asked, labels, WHOLLY.label_smoothing)[0].sum()
 

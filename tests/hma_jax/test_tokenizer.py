@@ -345,7 +345,7 @@ def test_other_images_are_not_trained_on(images, got, tmp_path):
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_runs_shorter_than_their_warm_up_learn(steps):
-    one_array = Declared(None, {"w": ParamSpec((3,), (None,), "hidden", True, normal(1.0))})
+    one_array = Declared(None, {"w": ParamSpec((3,), (None,), "hidden", True, normal(1.0))}, 1)
     optimizer = make_optimizer(replace(TRAIN, steps=steps, warmup_steps=50), one_array)
     params = {"w": jnp.ones(3)}
     state, sizes = optimizer.init(params), []

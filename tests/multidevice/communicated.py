@@ -41,10 +41,14 @@ def of_muon() -> dict[str, Any]:
     mesh = make_mesh(MeshConfig(2, 2, 2))
     momentum = np.random.default_rng(0).normal(size=SPEC.shape).astype(np.float32)
     layout = NamedSharding(mesh, PartitionSpec(None, None, "fsdp", "tensor"))
-    one = jax.jit(lambda x: muon_direction(x, SPEC, 1.0))(momentum)
+    one = jax.jit(lambda x: muon_direction(x, SPEC, 1.0, min_shard_size=2**14))(momentum)
     with jax.set_mesh(mesh):
         stored = jax.device_put(momentum, layout)
-        compiled = jax.jit(lambda x: muon_direction(x, SPEC, 1.0), out_shardings=layout).lower(stored).compile()
+        compiled = (
+            jax.jit(lambda x: muon_direction(x, SPEC, 1.0, min_shard_size=2**14), out_shardings=layout)
+            .lower(stored)
+            .compile()
+        )
         off = np.abs(np.asarray(compiled(stored)) - np.asarray(one)).max()
         return describe(compiled, mesh) | {"off": float(off)}
 

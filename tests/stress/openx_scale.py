@@ -145,7 +145,7 @@ def measure_training(out: Path, windows: int) -> dict:
     parsed = time.perf_counter()
     files = [p for p in (out / "store").glob("*/*") if p.suffix != ".array_record" and p.is_file()]
     loader = make_loader(
-        store, store.embodiment_table(store.names), LoaderConfig(frames=FRAMES, batch=BATCH), threads=1
+        store, store.embodiment_table(store.names, rate=2.0), LoaderConfig(frames=FRAMES, batch=BATCH), threads=1
     )
     next(loader)
     ready = time.perf_counter()

@@ -144,11 +144,11 @@ def data_inspect(
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, require_own_rate, suggest_entry
     from data_pipelines.registry import all_specs
-    from data_pipelines.registry.spec import stride_of
+    from data_pipelines.registry.spec import FRAME_RATE, stride_of
     from data_pipelines.registry.table import find_reader
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
-    stride_of(hz or 1)  # raises before the dataset is read
+    stride_of(hz or 1, FRAME_RATE)  # raises before the dataset is read
     require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
     require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
     own = {spec.name: spec for spec in all_specs()}  # the project's, before the user's take their places
@@ -192,10 +192,10 @@ def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetS
     """Prints at which stride frames are taken at a native `rate`, and how many windows there are. `hz`: the rate given
     by the user; `taken`: the registry entry by which the dataset will be read."""
     from data_pipelines.inspection.suggest import window_facts
-    from data_pipelines.registry.spec import stride_of
+    from data_pipelines.registry.spec import FRAME_RATE, stride_of
     from data_pipelines.sources.source import same_rate
 
-    stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate)
+    stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate, FRAME_RATE)
     windows = window_facts(facts, stride, frames)
     source = "" if hz or not taken else " (registry)"
     if facts.hz is not None and not same_rate(facts.hz, rate):

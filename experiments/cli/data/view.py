@@ -86,7 +86,7 @@ def _view_one(
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.issues import find_issues
     from data_pipelines.inspection.suggest import require_own_rate, suggest_entry, window_facts
-    from data_pipelines.registry.spec import stride_of
+    from data_pipelines.registry.spec import FRAME_RATE, stride_of
     from data_pipelines.registry.table import find_reader
     from data_pipelines.sources.open import source_name
     from experiments.report.data_page import CLIP_FRAMES, DatasetView
@@ -105,7 +105,7 @@ def _view_one(
     if known is None and rate is not None:
         suggestion = suggest_entry(facts, rate)
         entry = suggestion.spec() if suggestion else None
-    usual = entry.stride if entry else stride_of(rate) if rate else None
+    usual = entry.stride if entry else stride_of(rate, FRAME_RATE) if rate else None
     stride = (stride or usual) if rate else None
     others = [s.name for s in facts.splits if s.name not in split.split("+") and s.episodes][:OTHER_SPLITS]
     prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes, keys))]

@@ -31,13 +31,16 @@ def rlds(tmp_path_factory):
 
 
 def take(datasets, count, batch=8, **options):
+    options = {"tau": 3.0, "held_out": HeldOut()} | options
     loader = make_frame_loader(datasets, image_size=8, batch=batch, seed=1, **options)
     return list(itertools.islice(loader, count))
 
 
 @pytest.mark.parametrize("batch", [1, 6, 8])
 def test_frames_are_uint8_squares_of_the_asked_size(batch):
-    loader = make_frame_loader([(get_spec("bridge_dataset"), REAL_DATA)], image_size=16, batch=batch, seed=0)
+    loader = make_frame_loader(
+        [(get_spec("bridge_dataset"), REAL_DATA)], image_size=16, batch=batch, seed=0, tau=3.0, held_out=HeldOut()
+    )
     frames = next(loader)
     assert frames.shape == (batch, 16, 16, 3) and frames.dtype == np.uint8 and frames.std() > 10
 
@@ -73,7 +76,7 @@ def test_a_tokenizer_is_trained_on_the_frames_that_it_will_encode(tmp_path):
 
     rlds = write_rlds(tmp_path, spec, [5] * 4, change=draw)
     tokenize_dataset(spec, rlds, tokenizer, tmp_path / "store", rate=None)
-    frames = next(make_frame_loader([(spec, rlds)], tokenizer.image_size, 16, seed=1))
+    frames = next(make_frame_loader([(spec, rlds)], tokenizer.image_size, 16, seed=1, tau=3.0, held_out=HeldOut()))
     assert all(frame.tobytes() in tokenizer.seen for frame in frames)
 
 
@@ -99,7 +102,7 @@ def test_resuming_at_every_step_continues_exactly(tmp_path, rlds):
 
 def test_the_records_of_a_batch_are_those_that_its_frames_were_read_from(rlds):
     """The fixture's frames say (episode, step); four come from one episode at a time."""
-    loader = make_frame_loader([(SPEC, rlds)], image_size=8, batch=8, seed=1)
+    loader = make_frame_loader([(SPEC, rlds)], image_size=8, batch=8, seed=1, tau=3.0, held_out=HeldOut())
     runs = RldsDataset(rlds).runs
     for step in range(4):
         episodes = next(loader)[::4, 0, 0, 0]
@@ -109,7 +112,9 @@ def test_the_records_of_a_batch_are_those_that_its_frames_were_read_from(rlds):
 def test_every_frame_of_a_batch_has_its_dataset_and_episode(tmp_path, rlds):
     """Episodes of the second dataset are longer than any of the first, whose frames say (episode, step)."""
     other = make_spec("other")
-    loader = make_frame_loader([(SPEC, rlds), (other, write_rlds(tmp_path, other, [200] * 6))], 8, batch=6, seed=1)
+    loader = make_frame_loader(
+        [(SPEC, rlds), (other, write_rlds(tmp_path, other, [200] * 6))], 8, batch=6, seed=1, tau=3.0, held_out=HeldOut()
+    )
     seen = set()
     for step in range(40):
         frames, (dataset, episode) = next(loader), loader.episodes(step)
@@ -150,7 +155,7 @@ def test_files_kept_open_are_bounded_over_all_datasets(tmp_path, monkeypatch):
     specs = [make_spec(name) for name in ("a", "b", "c")]
     datasets = [(spec, write_rlds(tmp_path, spec, [5] * 8, shards=4)) for spec in specs]
     monkeypatch.setattr("data_pipelines.loading.frames.OpenFiles", lambda: OpenFiles(2))
-    loader = make_frame_loader(datasets, image_size=8, batch=8, seed=1, threads=0)
+    loader = make_frame_loader(datasets, image_size=8, batch=8, seed=1, threads=0, tau=3.0, held_out=HeldOut())
     after = list(itertools.islice(loader, 60))
     assert count_open(tmp_path) == 2
     monkeypatch.undo()
@@ -222,15 +227,15 @@ def test_held_out_episodes_that_were_all_skipped_are_told_as_such(tmp_path):
     with pytest.raises(
         DataError, match="all 3 held-out episodes of its 60 were skipped; val_fraction=0.05, min_val=2 and"
     ):
-        make_frame_loader([(SPEC, directory)], 8, 4, 0, split="val", corrupt="skip")
+        make_frame_loader([(SPEC, directory)], 8, 4, 0, split="val", corrupt="skip", tau=3.0, held_out=HeldOut())
 
 
 def test_wrong_arguments_are_one_clear_message(rlds):
     with pytest.raises(ConfigError, match="no dataset was given"):
-        make_frame_loader([], 8, 8, 0)
+        make_frame_loader([], 8, 8, 0, tau=3.0, held_out=HeldOut())
     with pytest.raises(ConfigError, match="images there"):
-        make_frame_loader([(get_spec("bridge_dataset"), rlds)], 8, 8, 0)
+        make_frame_loader([(get_spec("bridge_dataset"), rlds)], 8, 8, 0, tau=3.0, held_out=HeldOut())
     with pytest.raises(ConfigError, match="but 4 were expected"):
-        make_frame_loader([(make_spec("toy", (4,)), rlds)], 8, 8, 0)
+        make_frame_loader([(make_spec("toy", (4,)), rlds)], 8, 8, 0, tau=3.0, held_out=HeldOut())
     with pytest.raises(ConfigError, match="split must be"):
-        make_frame_loader([(SPEC, rlds)], 8, 8, 0, split="test")
+        make_frame_loader([(SPEC, rlds)], 8, 8, 0, split="test", tau=3.0, held_out=HeldOut())

@@ -92,7 +92,7 @@ def test_datasets_are_drawn_with_the_cube_root_of_their_windows(store, table):
 
 
 def test_an_epoch_visits_every_window_once(store):
-    table = store.embodiment_table(("base",))
+    table = store.embodiment_table(("base",), rate=2.0)
     config = LoaderConfig(frames=6, batch=5, datasets=("base",))
     n = len(select_windows(store, config).sets["base"])
     assert n % 5 == 0
@@ -175,7 +175,7 @@ def test_a_dataset_more_does_not_reorder_the_others(store):
     few, more = ("arm", "base"), ("arm", "base", "hand")
     orders = []
     for names in (few, more):
-        table = store.embodiment_table(names)
+        table = store.embodiment_table(names, rate=2.0)
         batches = take(store, table, 12, replace(CONFIG, datasets=names))
         rows = [(e, t[0, 0]) for b in batches for e, t in zip(b["embodiment"], b["tokens"], strict=True)]
         orders.append([t for e, t in rows if e == 0][:40])
@@ -186,7 +186,7 @@ def test_a_dataset_more_does_not_reorder_the_others(store):
 
 
 def test_small_subset_is_inside_the_large_one(store):
-    table = store.embodiment_table(("arm",))
+    table = store.embodiment_table(("arm",), rate=2.0)
     seen = []
     for limit in (2, 10, None):
         config = LoaderConfig(frames=6, batch=16, datasets=("arm",), max_trajectories=limit)
@@ -215,7 +215,7 @@ def test_shuffled_actions_change_the_actions_and_nothing_else(store, table):
 
 def test_a_window_meets_other_actions_on_each_visit(store):
     """Otherwise a wrong pair could be learnt by heart."""
-    table = store.embodiment_table(("base",))
+    table = store.embodiment_table(("base",), rate=2.0)
     config = LoaderConfig(frames=20, batch=10, datasets=("base",), shuffle_actions=True)  # one window each
     pairs: dict[int, set[int]] = {}
     for batch in take(store, table, 6, config):
@@ -241,7 +241,7 @@ def test_short_episodes_fill_up_their_windows_with_what_is_marked(tmp_path):
     short = sum(n < 4 for n in store.manifest("mixed").train.steps)
     assert select_windows(store, config).too_short == {"mixed": short} and short >= 3
     seen = set()
-    for batch in take(store, store.embodiment_table(("mixed",)), 12, config):
+    for batch in take(store, store.embodiment_table(("mixed",), rate=2.0), 12, config):
         for real, tokens, actions in zip(batch["real"], batch["tokens"], batch["actions"], strict=True):
             count = int(real.sum())
             seen.add(count)
@@ -256,7 +256,7 @@ def test_shuffled_actions_reach_every_real_frame(tmp_path):
     """Those of a shorter window are repeated; frames that are none get none."""
     store = store_of(tmp_path, {"mixed": [8, 30] * 5})
     config = LoaderConfig(frames=6, batch=4)
-    table = store.embodiment_table(("mixed",))
+    table = store.embodiment_table(("mixed",), rate=2.0)
     pairs = zip(
         take(store, table, 12, config), take(store, table, 12, replace(config, shuffle_actions=True)), strict=True
     )
@@ -270,7 +270,7 @@ def test_shuffled_actions_reach_every_real_frame(tmp_path):
 def test_windows_of_a_single_episode_meet_actions_of_another_window_of_it(tmp_path):
     """There is no other episode to take them from."""
     store = store_of(tmp_path, {"single": [40, 40]}, min_val=1, max_val=1)
-    config, table = LoaderConfig(frames=6, batch=15), store.embodiment_table(("single",))
+    config, table = LoaderConfig(frames=6, batch=15), store.embodiment_table(("single",), rate=2.0)
     assert len(store.manifest("single").train.episodes) == 1 and len(select_windows(store, config).sets["single"]) >= 10
     (true,), (shuffled,) = take(store, table, 1, config), take(store, table, 1, replace(config, shuffle_actions=True))
     assert np.array_equal(true["tokens"], shuffled["tokens"])
@@ -282,7 +282,7 @@ def test_dataset_without_windows_is_dropped_and_reported(tmp_path):
     selected = select_windows(store, LoaderConfig(frames=6, batch=4))
     assert set(selected.mixture.names) == {"long"}
     assert "a window has at least 2 frames, which at stride 2 need 4 native frames" in selected.mixture.dropped["short"]
-    table = store.embodiment_table(("short", "long"))
+    table = store.embodiment_table(("short", "long"), rate=2.0)
     (batch,) = take(store, table, 1, LoaderConfig(frames=6, batch=4))
     assert set(batch["embodiment"].tolist()) == {1}
     with pytest.raises(
@@ -366,7 +366,7 @@ def test_statistics_are_of_exactly_the_trajectories_used(store_root, tmp_path, k
         np.testing.assert_allclose(entry.std, rows.std(0), rtol=1e-12)
         assert entry.mean != store.manifest(name).action_mean
     everything = training_table(store, LoaderConfig(frames=6))
-    assert everything == store.embodiment_table(store.names)
+    assert everything == store.embodiment_table(store.names, rate=2.0)
 
 
 def test_statistics_beside_a_part_and_of_its_episodes_are_the_same_bits(store_root, tmp_path):
@@ -401,7 +401,7 @@ def test_the_rate_is_a_setting(tmp_path):
     with pytest.raises(
         ConfigError, match="toy: the model was trained with frames at stride 5, but here the stride is 2"
     ):
-        make_loader(store, store.embodiment_table(("toy",)), config)
+        make_loader(store, store.embodiment_table(("toy",), rate=2.0), config)
 
 
 def test_a_store_without_the_frames_of_a_rate_names_the_command(store):
@@ -436,7 +436,7 @@ def test_table_of_another_action_layout(store, table):
 def test_swapped_actions_are_refused(store, tmp_path):
     """The same number of values at the same rate, in another order."""
     spec = make_spec("hand", (2, 1, 3), hz=10)
-    table = store.embodiment_table(("hand",))
+    table = store.embodiment_table(("hand",), rate=2.0)
     swapped = replace(spec, action_keys=spec.action_keys[::-1], action_dims=spec.action_dims[::-1])
     tokenize_dataset(swapped, write_rlds(tmp_path, spec, [60] * 4), FakeTokenizer(), tmp_path / "store")
     other, config = TokenStore(tmp_path / "store"), replace(CONFIG, datasets=("hand",))
@@ -452,7 +452,7 @@ def test_datasets_of_different_tokenizers_do_not_mix(store_root, tmp_path):
         tokenize_dataset(spec, write_rlds(tmp_path, spec, [20] * 4), tokenizer, tmp_path / "store")
     store = TokenStore(tmp_path / "store")
     with pytest.raises(ConfigError, match="tokenised with different tokenizers"):
-        make_loader(store, store.embodiment_table(store.names), CONFIG)
+        make_loader(store, store.embodiment_table(store.names, rate=2.0), CONFIG)
 
 
 @pytest.mark.parametrize("change", [{"frames": 0}, {"batch": 0}, {"tau": 0.0}, {"datasets": ("a", "a")}])

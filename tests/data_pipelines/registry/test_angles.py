@@ -65,7 +65,7 @@ def test_stored_actions_are_as_the_entry_says_and_have_no_jump(tmp_path, rlds):
     for form, width in (("unwrapped", 3), ("sine_cosine", 4)):
         spec = replace(SPEC, angles=(2,), angle_form=form)
         manifest = tokenize_dataset(spec, rlds, FakeTokenizer(), tmp_path / form)
-        embodiment = manifest.embodiment()
+        embodiment = manifest.embodiment(rate=2.0)
         assert spec.action_dim == embodiment.action_dim == len(manifest.action_mean) == width
         episode = TokenStore(tmp_path / form).episode("toy", "train", 0)
         assert np.abs(np.diff(episode.actions[:, 2:], axis=0)).max() < 0.41

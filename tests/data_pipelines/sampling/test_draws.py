@@ -13,8 +13,8 @@ WEIGHTS = {
     "one": np.ones(1),
     "none": np.array([0.0, 0.75, 0.25, 0.0, 0.0]),
     "tiny": np.array([1e-7, 0.6, 1e-9, 0.4 - 1.01e-7]),
-    "decades": mixture_weights(10.0 ** np.arange(1, 7)),
-    "many": mixture_weights(np.arange(1, 1001)),
+    "decades": mixture_weights(10.0 ** np.arange(1, 7), tau=3.0),
+    "many": mixture_weights(np.arange(1, 1001), tau=3.0),
 }
 
 

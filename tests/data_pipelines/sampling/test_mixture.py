@@ -33,7 +33,7 @@ def test_nothing_left_is_an_error_with_all_reasons():
     with pytest.raises(DataError, match="a: too short; b: it is empty"):
         make_mixture({"a": 0, "b": 0}, 3.0, {"a": "too short"})
     with pytest.raises(DataError, match="every dataset of the mixture is empty"):
-        mixture_weights([0, 0])
+        mixture_weights([0, 0], tau=3.0)
 
 
 @pytest.mark.parametrize("tau", [0.01, 0.001])

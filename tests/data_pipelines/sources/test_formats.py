@@ -22,6 +22,7 @@ from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources import lerobot_dataset, lerobot_meta
 from data_pipelines.sources.joined import JoinedSource
 from data_pipelines.sources.lerobot import LeRobotSource
@@ -458,10 +459,13 @@ def test_every_format_is_tokenised_directly(tmp_path, places):
 
 
 def test_every_format_gives_frames_to_a_tokenizer(places):
-    frames = [next(make_frame_loader([place], 8, 8, seed=0)) for place in places]
+    frames = [next(make_frame_loader([place], 8, 8, seed=0, tau=3.0, held_out=HeldOut())) for place in places]
     assert all(f.shape == (8, 8, 8, 3) for f in frames) and frames[0].std() > 1
-    mixed = list(itertools.islice(make_frame_loader(places, 8, 8, seed=0, threads=3), 4))
-    assert np.array_equal(mixed, list(itertools.islice(make_frame_loader(places, 8, 8, seed=0, threads=0), 4)))
+    mixed = list(itertools.islice(make_frame_loader(places, 8, 8, seed=0, threads=3, tau=3.0, held_out=HeldOut()), 4))
+    assert np.array_equal(
+        mixed,
+        list(itertools.islice(make_frame_loader(places, 8, 8, seed=0, threads=0, tau=3.0, held_out=HeldOut()), 4)),
+    )
 
 
 def test_every_format_is_inspected(places):

@@ -60,7 +60,7 @@ def test_losing_episodes_moves_no_other(tmp_path):
 
 
 def chosen(store: TokenStore, limit: int) -> set[int]:
-    windows = train_windows(store, "toy", 1, limit)
+    windows = train_windows(store, "toy", 1, limit, rate=2.0)
     return {int(store.manifest("toy").train.episodes[i]) for i in windows.episodes}
 
 

@@ -127,7 +127,7 @@ def test_a_joined_dataset_is_tokenised_in_parts_with_statistics_of_all(places, t
     np.testing.assert_allclose(manifest.action_mean, np.concatenate(actions).mean(0), rtol=1e-5)
     np.testing.assert_allclose(whole.action_mean, manifest.action_mean, rtol=1e-6)
     assert manifest.spec.joins == ARM.joins and manifest.episodes_of_parts == [4, 4, 5]
-    batch = next(make_frame_loader([(ARM, place)], 8, 8, seed=0))
+    batch = next(make_frame_loader([(ARM, place)], 8, 8, seed=0, tau=3.0, held_out=HeldOut()))
     assert batch.shape == (8, 8, 8, 3)
 
 
@@ -137,7 +137,7 @@ def test_another_limit_of_held_out_episodes_is_judged_by_the_parts(tmp_path):
     place = Parts("all", tuple(write_rlds(tmp_path, spec, [8] * 4) for spec in specs))
     spec = replace(make_spec("all"), joins=tuple(s.name for s in specs))
     tokenize_dataset(spec, place, FakeTokenizer(), tmp_path / "store")
-    other = plan_dataset(spec, open_source(place), FakeTokenizer(), HeldOut(max_val_fraction=0.5))
+    other = plan_dataset(spec, open_source(place), FakeTokenizer(), HeldOut(max_val_fraction=0.5), rate=2.0)
     (line,) = differences(tmp_path / "store", other)
     assert line == "settings.max_val_fraction: 0.25 -> 0.5"
 

@@ -140,7 +140,13 @@ def test_the_token_store_and_the_frame_loader_hold_out_the_validation_split(suit
     source = RldsDataset(suite / spec.name, "val")
     recorded = np.concatenate([source.episode(i, spec.image_key, ()).images for i in range(3)])
     batches = make_frame_loader(
-        [(spec, suite / spec.name)], 64, 8, 0, held_out=HeldOut(min_val=1, max_val=1), split="val"
+        [(spec, suite / spec.name)],
+        64,
+        8,
+        0,
+        held_out=HeldOut(min_val=1, max_val=1),
+        split="val",
+        tau=3.0,
     )
     for frame in next(batches):
         assert (frame == recorded).all((1, 2, 3)).any(), "a frame of no validation episode"
@@ -269,9 +275,9 @@ def test_subsets_are_of_the_training_split_alone(suite, tmp_path):
     spec = get_spec("pusher_mint")
     tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path)
     store = TokenStore(tmp_path)
-    everything, held = train_windows(store, spec.name, 4), val_windows(store, spec.name, 4, 3)
+    everything, held = train_windows(store, spec.name, 4, rate=2.0), val_windows(store, spec.name, 4, 3, rate=2.0)
     assert len(everything.episodes) == MIN_EPISODES and len(held.episodes) == 3
-    few, more = (set(train_windows(store, spec.name, 4, n).episodes.tolist()) for n in (3, MIN_EPISODES - 1))
+    few, more = (set(train_windows(store, spec.name, 4, n, rate=2.0).episodes.tolist()) for n in (3, MIN_EPISODES - 1))
     assert (len(few), len(more)) == (3, MIN_EPISODES - 1) and few < more
 
 

@@ -79,7 +79,7 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
     np.testing.assert_allclose(manifest.action_mean, [10, 5, -10])
     np.testing.assert_allclose(manifest.action_std[0], rows.std())
     assert (
-        len(train_windows(store, "toy_arm", 3, min_real=3)) == 1 + 0 + 2
+        len(train_windows(store, "toy_arm", 3, min_real=3, rate=2.0)) == 1 + 0 + 2
     )  # 6 native frames each, starts every other one
 
 

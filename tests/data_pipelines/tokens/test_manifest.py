@@ -50,7 +50,7 @@ def test_a_store_of_the_format_before_is_read_and_keeps_its_identity(tmp_path):
     store = TokenStore(tmp_path)
     assert store.manifest("toy").hash() == "e385554ab1617f45" and store.hash() == "c0e0dd2b43268632"
     assert store.manifest("toy").val.episodes == (5, 7) and store.manifest("toy").train.steps == (5, 6, 7, 8, 9, 11)
-    assert train_windows(store, "toy", 2, 3).episodes.tolist() == [0, 2, 5]  # the subset that it had
+    assert train_windows(store, "toy", 2, 3, rate=2.0).episodes.tolist() == [0, 2, 5]  # the subset that it had
 
 
 def test_a_store_of_the_format_before_is_not_made_again(tmp_path):

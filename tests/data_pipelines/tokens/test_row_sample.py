@@ -116,8 +116,8 @@ def test_the_scale_is_an_option_and_off_by_default(tmp_path):
     rlds = write_rlds(tmp_path, SPEC, [30] * 8)
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     store = TokenStore(tmp_path / "store")
-    (plain,) = store.embodiment_table(["toy"]).entries
-    (scaled,) = store.embodiment_table(["toy"], scale="quantiles").entries
+    (plain,) = store.embodiment_table(["toy"], rate=2.0).entries
+    (scaled,) = store.embodiment_table(["toy"], scale="quantiles", rate=2.0).entries
     assert (plain.low, plain.high, plain.centre, plain.unit) == ((), (), plain.mean, plain.std)
     assert (scaled.low[:2], scaled.high[:2]) == (
         manifest.action_quantiles[0][:2], manifest.action_quantiles[-1][:2],
@@ -137,7 +137,7 @@ def test_a_value_that_moves_in_less_than_a_hundredth_is_measured_by_its_extremes
     rlds = write_rlds(tmp_path, SPEC, [60] * 8, change=change)
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", min_val=0, val_fraction=0.0)
     assert manifest.action_quantiles[0][2] == 0 <= manifest.action_quantiles[-1][2] <= rounding
-    scaled = manifest.embodiment(scale="quantiles")
+    scaled = manifest.embodiment(scale="quantiles", rate=2.0)
     assert (scaled.low[2], scaled.high[2]) == (0, 4)
 
 
@@ -166,7 +166,9 @@ def test_quantiles_of_some_trajectories_read_those_that_are_sampled_alone(tmp_pa
     store, read = TokenStore(tmp_path / "s"), set()
     whole = store.action_range("toy", range(len(manifest.train.episodes)))
     assert whole == ActionRange(manifest.action_quantiles)
-    assert manifest.embodiment(scale="quantiles", action_range=whole) == manifest.embodiment(scale="quantiles")
+    assert manifest.embodiment(scale="quantiles", action_range=whole, rate=2.0) == manifest.embodiment(
+        scale="quantiles", rate=2.0
+    )
     real, few = store.episode, row_sample.sampled_episodes
     monkeypatch.setattr(store, "episode", lambda *place: read.add(place[2]) or real(*place))
     monkeypatch.setattr(store_module, "sampled_episodes", lambda *rows: few(*rows, 2))
@@ -205,6 +207,6 @@ def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
     del values["action_quantiles"]
     path.write_text(json.dumps(values))
     manifest = load_manifest(path)
-    assert manifest.embodiment().low == ()
+    assert manifest.embodiment(rate=2.0).low == ()
     with pytest.raises(DataError, match="toy: its tokens .* stored no quantiles.*train.action_scale=deviation"):
-        manifest.embodiment(scale="quantiles")
+        manifest.embodiment(scale="quantiles", rate=2.0)

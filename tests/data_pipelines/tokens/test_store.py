@@ -90,7 +90,7 @@ def test_manifest_from_before_there_were_latents_is_one_of_ids(store_root, copy)
 
 
 def test_table_follows_the_order_asked_for(store):
-    table = store.embodiment_table(("hand", "arm"))
+    table = store.embodiment_table(("hand", "arm"), rate=2.0)
     assert table.names == ("hand", "arm")
     hand = table.entries[0]
     assert (hand.action_dim, hand.stride, hand.chunk) == (6, 5, 30)

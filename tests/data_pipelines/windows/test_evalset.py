@@ -22,11 +22,11 @@ from tests.data_pipelines.tokenizing import tokenize_dataset
 
 @pytest.fixture(scope="module")
 def manifest(store):
-    return freeze_manifest(store, store.names, frames=4, windows_per_dataset=5, seed=0)
+    return freeze_manifest(store, store.names, frames=4, windows_per_dataset=5, seed=0, rate=2.0)
 
 
 def test_windows_of_an_episode_do_not_overlap(store):
-    everything = freeze_manifest(store, store.names, 4, 500, seed=0)
+    everything = freeze_manifest(store, store.names, 4, 500, seed=0, rate=2.0)
     for entry in everything.datasets:
         facts = store.manifest(entry.dataset)
         assert len(set(entry.windows)) == len(entry.windows) > 0
@@ -36,20 +36,22 @@ def test_windows_of_an_episode_do_not_overlap(store):
 
 
 def test_spacing_allows_overlap_when_asked(store):
-    counts = [len(freeze_manifest(store, ("arm",), 4, 500, 0, spacing=s).datasets[0].windows) for s in (4, 2, 1)]
+    counts = [
+        len(freeze_manifest(store, ("arm",), 4, 500, 0, spacing=s, rate=2.0).datasets[0].windows) for s in (4, 2, 1)
+    ]
     assert counts == [6, 12, 24]  # two episodes of 15 model frames
 
 
 def test_windows_are_whole_where_the_prompt_fills_them(store, manifest):
-    filled = freeze_manifest(store, store.names, 4, 5, 0, prompt=4)
+    filled = freeze_manifest(store, store.names, 4, 5, 0, prompt=4, rate=2.0)
     assert filled == manifest and filled.hash() == manifest.hash() and filled.settings == ChoiceSettings(5, 4)
 
 
 def test_fewer_windows_are_a_subset_of_more(store):
-    few, more = (freeze_manifest(store, store.names, 4, n, seed=0) for n in (2, 4))
+    few, more = (freeze_manifest(store, store.names, 4, n, seed=0, rate=2.0) for n in (2, 4))
     for a, b in zip(few.datasets, more.datasets, strict=True):
         assert len(a.windows) == 2 and set(a.windows) < set(b.windows)
-    assert len({freeze_manifest(store, store.names, 4, 2, seed=seed).datasets for seed in range(4)}) > 2
+    assert len({freeze_manifest(store, store.names, 4, 2, seed=seed, rate=2.0).datasets for seed in range(4)}) > 2
 
 
 def test_some_of_the_windows_are_of_as_many_episodes_as_can_be_and_not_of_neighbours():
@@ -72,7 +74,7 @@ def names_of(batch):
 
 
 def test_an_episode_is_read_once_for_all_its_windows(store, table, monkeypatch):
-    frozen, read, episode = freeze_manifest(store, ("arm",), 4, 5, 0), [], TokenStore.episode
+    frozen, read, episode = freeze_manifest(store, ("arm",), 4, 5, 0, rate=2.0), [], TokenStore.episode
     monkeypatch.setattr(TokenStore, "episode", lambda self, *place: read.append(place) or episode(self, *place))
     windows = sum(batch["valid"].sum() for batch in eval_batches(store, table, frozen, batch=2))
     assert windows == 5 and len(read) == len(set(read)) == 2
@@ -113,7 +115,7 @@ def test_the_first_windows_of_each_dataset_alone(store, table, manifest):
 
 
 def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, manifest):
-    frozen = freeze_manifest(latent_store, store.names, frames=4, windows_per_dataset=5, seed=0)
+    frozen = freeze_manifest(latent_store, store.names, frames=4, windows_per_dataset=5, seed=0, rate=2.0)
     assert frozen.datasets == manifest.datasets
     pairs = zip(eval_batches(store, table, manifest, 2), eval_batches(latent_store, table, frozen, 2), strict=True)
     for a, b in pairs:
@@ -150,8 +152,8 @@ def test_file_round_trip_and_hash(store, manifest, tmp_path):
     manifest.save(tmp_path / "new" / "eval.json")
     loaded = EvalManifest.load(tmp_path / "new" / "eval.json")
     assert loaded == manifest and loaded.hash() == manifest.hash() and loaded.settings == ChoiceSettings(5, None)
-    assert freeze_manifest(store, store.names, 4, 5, seed=1).hash() != manifest.hash()
-    assert freeze_manifest(store, store.names[::-1], 4, 5, seed=0) == manifest
+    assert freeze_manifest(store, store.names, 4, 5, seed=1, rate=2.0).hash() != manifest.hash()
+    assert freeze_manifest(store, store.names[::-1], 4, 5, seed=0, rate=2.0) == manifest
 
 
 def test_edited_file_is_refused(manifest, tmp_path):
@@ -193,35 +195,35 @@ def test_other_data_is_refused(store, table, manifest, tmp_path):
 
 def test_store_without_raw_frames_is_refused(tmp_path):
     store = small_store(tmp_path, keep_frames="none")
-    frozen = freeze_manifest(store, ("toy",), 4, 5, 0)
+    frozen = freeze_manifest(store, ("toy",), 4, 5, 0, rate=2.0)
     with pytest.raises(ConfigError, match="keep_frames='val'"):
-        eval_batches(store, store.embodiment_table(("toy",)), frozen, 2)
+        eval_batches(store, store.embodiment_table(("toy",), rate=2.0), frozen, 2)
 
 
 def test_dataset_too_short_to_evaluate_is_reported_and_all_of_them_an_error(tmp_path):
     small_store(tmp_path, "long")
     store = small_store(tmp_path, "short", [2] * 4)
-    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2, rate=2.0)
     assert frozen.names == ("long",)
     assert "a window has at least 3 frames, which at stride 1 need 3 native frames" in frozen.empty["short"]
     with pytest.raises(DataError, match="short: a window has at least 3 frames.*has 2.*a shorter prompt"):
-        freeze_manifest(store, ("short",), 4, 5, 0, prompt=2)
+        freeze_manifest(store, ("short",), 4, 5, 0, prompt=2, rate=2.0)
 
 
 def test_short_episodes_are_judged_up_to_their_end(tmp_path):
     """Of four frames the prompt takes two: three are enough, and the fourth is no frame."""
     small_store(tmp_path, "long")
     store = small_store(tmp_path, "short", [3] * 4)
-    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2, rate=2.0)
     assert frozen.names == ("long", "short")
-    (batch,) = eval_batches(store, store.embodiment_table(store.names), frozen, 12)
+    (batch,) = eval_batches(store, store.embodiment_table(store.names, rate=2.0), frozen, 12)
     rows = zip(batch["dataset"], batch["real"], batch["tokens"], batch["images"], batch["actions"], strict=True)
     for name, real, *arrays in rows:
         assert real.tolist() == [True, True, True, name == "long"]
         assert all((x[~real] == 0).all() and (x[:3] != 0).any() for x in arrays)
-    whole = freeze_manifest(store, store.names, 4, 5, 0)
+    whole = freeze_manifest(store, store.names, 4, 5, 0, rate=2.0)
     assert whole.names == ("long",) and "real" not in next(
-        eval_batches(store, store.embodiment_table(("long",)), whole, 2)
+        eval_batches(store, store.embodiment_table(("long",), rate=2.0), whole, 2)
     )
 
 
@@ -247,7 +249,7 @@ def test_the_rate_is_that_of_the_frames(tmp_path):
         assert (np.diff(batch["tokens"][0, :, 0]) == stride).all()
         assert batch["actions"].shape == (1, 4, 3 * stride)
     with pytest.raises(ConfigError, match="stride 2, but here the stride is 4"):
-        eval_batches(store, store.embodiment_table(("toy",)), frozen, 1)
+        eval_batches(store, store.embodiment_table(("toy",), rate=2.0), frozen, 1)
 
 
 def test_unknown_dataset_is_named(store, table, manifest):

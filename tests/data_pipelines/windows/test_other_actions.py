@@ -23,8 +23,8 @@ from tests.data_pipelines.windows.test_evalset import small_store
 
 def batches(store, count: int, prompt: int | None = None, **options):
     """(frozen windows, the one batch of all of them)."""
-    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=prompt)
-    table = store.embodiment_table(store.names)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=prompt, rate=2.0)
+    table = store.embodiment_table(store.names, rate=2.0)
     whole = sum(len(d.windows) for d in frozen.datasets)
     (batch,) = eval_batches(store, table, frozen, whole, other_actions=count, prompt=2, **options)
     return frozen, batch
@@ -52,7 +52,9 @@ def test_a_window_has_the_same_ones_in_any_batch_and_a_longer_list_begins_with_t
     frozen, five = batches(store, 5)
     _, nine = batches(store, 9)
     np.testing.assert_array_equal(five["other_actions"], nine["other_actions"][:, :5])
-    for row, single in enumerate(eval_batches(store, store.embodiment_table(("toy",)), frozen, 1, other_actions=5)):
+    for row, single in enumerate(
+        eval_batches(store, store.embodiment_table(("toy",), rate=2.0), frozen, 1, other_actions=5)
+    ):
         np.testing.assert_array_equal(single["other_actions"][0], five["other_actions"][row])
     assert len(np.unique(five["other_actions"], axis=0)) > 1  # not the same for all windows
 
@@ -180,7 +182,7 @@ def frames_for(frozen, dataset: str = "toy") -> CounterfactualFrames:
 def test_frames_under_other_actions_follow_the_prompt(tmp_path):
     small_store(tmp_path, "arm")
     store = small_store(tmp_path, "toy")
-    frozen = freeze_manifest(store, store.names, 4, 5, 0)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, rate=2.0)
     counterfactual = frames_for(frozen)
     counterfactual.save(tmp_path / "t.npz")
     before = (tmp_path / "t.npz").read_bytes()
@@ -196,7 +198,7 @@ def test_frames_under_other_actions_follow_the_prompt(tmp_path):
 def test_nothing_is_seen_under_actions_that_there_are_not(tmp_path):
     """The held-out episode is longer than all others: none covers its window."""
     store = small_store(tmp_path, lengths=(3, 4), min_val=1)
-    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2, rate=2.0)
     _, batch = batches(store, 1, prompt=2, counterfactual=frames_for(frozen))
     assert not batch["other_valid"].any() and not batch["other_seen"].any()
     np.testing.assert_array_equal(batch["other_images"], batch["images"])
@@ -204,10 +206,10 @@ def test_nothing_is_seen_under_actions_that_there_are_not(tmp_path):
 
 def test_frames_of_other_windows_or_prompts_or_damaged_ones_are_refused(tmp_path):
     store = small_store(tmp_path)
-    frozen = freeze_manifest(store, store.names, 4, 5, 1)
+    frozen = freeze_manifest(store, store.names, 4, 5, 1, rate=2.0)
     with pytest.raises(ConfigError, match="made for other windows than the frozen ones"):
         batches(store, 1, counterfactual=frames_for(frozen))
-    table = store.embodiment_table(store.names)
+    table = store.embodiment_table(store.names, rate=2.0)
     for options, words in (
         ({"other_actions": 0, "prompt": 2}, "need these actions; ask for other_actions of at least 1"),
         ({"other_actions": 1, "prompt": 3}, "made for prompt 2, .* what follows prompt 3; prepare the study again"),

@@ -23,7 +23,9 @@ from tests.data_pipelines.fakes import OneDataset
 @pytest.mark.parametrize("least", [2, 12])
 def test_windows_are_the_longest_that_lie_inside_one_episode(stride, frame_step, frames, least):
     steps = [1, 3, 11, 12, 13, 24, 25, 59, 60, 61, 62, 83]
-    found = train_windows(OneDataset(steps, hz=2 * stride, frame_step=frame_step), "toy", frames, min_real=least)
+    found = train_windows(
+        OneDataset(steps, hz=2 * stride, frame_step=frame_step), "toy", frames, min_real=least, rate=2.0
+    )
     # The chunk of the last real frame is whole; T are enough.
     real = [min(n // stride, frames) for n in steps]
     least = min(least, frames)
@@ -49,7 +51,7 @@ def item_of(steps: int, frame_step: int) -> StoredEpisode:
 def test_frames_and_actions_of_a_window_belong_together(steps, real):
     """Chunk k holds the native actions from frame k until frame k + 1; what is missing is zero."""
     data, item = OneDataset([steps], hz=12, frame_step=3, dims=(2,)), item_of(steps, 3)
-    windows = train_windows(data, "toy", 4)
+    windows = train_windows(data, "toy", 4, rate=2.0)
     assert len(windows) > 0
     for i in range(len(windows)):
         _, start = windows.locate(i)
@@ -66,9 +68,9 @@ def test_language_table_gives_windows():
     """Its 442,226 episodes have 15.9 steps on average at 10 Hz, where twelve whole frames take 60: lengths as
     in its published statistics, roughly."""
     steps = np.random.default_rng(0).poisson(15.9, 2000).tolist()
-    windows = train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12)
+    windows = train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12, rate=2.0)
     assert len(windows) > 1800 and windows.padded == len(windows)
-    assert len(train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12, min_real=12)) == 0
+    assert len(train_windows(OneDataset(steps, hz=10, frame_step=5), "toy", 12, min_real=12, rate=2.0)) == 0
 
 
 @pytest.mark.parametrize("rate, stride", [(2.0, 5), (None, 1), (5.0, 2), (3.0, 3), (10.0, 1), (30.0, 1)])
@@ -89,14 +91,14 @@ def test_subsets_of_trajectories_are_nested():
     data = OneDataset([20] * 300)
     previous: set[int] = set()
     for limit in (1, 10, 100):
-        chosen = set(train_windows(data, "toy", 4, limit).episodes.tolist())
+        chosen = set(train_windows(data, "toy", 4, limit, rate=2.0).episodes.tolist())
         assert len(chosen) == limit and previous <= chosen
         previous = chosen
-    assert len(set(train_windows(data, "toy", 4, 10**6).episodes)) == 300
-    other = set(train_windows(data, "toy", 4, 100, subset_seed=1).episodes.tolist())
+    assert len(set(train_windows(data, "toy", 4, 10**6, rate=2.0).episodes)) == 300
+    other = set(train_windows(data, "toy", 4, 100, subset_seed=1, rate=2.0).episodes.tolist())
     assert other != previous
     with pytest.raises(ConfigError, match="max_trajectories must be at least 1"):
-        train_windows(data, "toy", 4, 0)
+        train_windows(data, "toy", 4, 0, rate=2.0)
 
 
 @pytest.mark.parametrize("runs", [(), (EpisodeRun("toy.tfrecord", 0, 200),)], ids=["numbers", "names"])
@@ -105,7 +107,7 @@ def test_too_short_episodes_use_up_no_trajectories(runs):
     data = OneDataset([1, 30, 1, 1, 1] * 40)
     settings = replace(data.manifest("toy").settings, val_fraction=0.0, min_val=0)
     data._manifest = replace(data.manifest("toy"), runs=runs, settings=settings)
-    windows = train_windows(data, "toy", 5, max_trajectories=10)
+    windows = train_windows(data, "toy", 5, max_trajectories=10, rate=2.0)
     assert windows.too_short == 160 and len(windows.episodes) == 10 and (windows.episodes % 5 == 1).all()
 
 
@@ -114,19 +116,19 @@ def test_trajectories_of_a_subset_are_counted_without_the_damaged_ones():
     settings = replace(data.manifest("toy").settings, val_fraction=0.0, min_val=0)
     data._manifest = replace(data.manifest("toy"), runs=(EpisodeRun("toy.tfrecord", 0, 200),), settings=settings)
     for cap in (None, 1, 40, 150):
-        used = train_windows(data, "toy", 4, cap).episodes
+        used = train_windows(data, "toy", 4, cap, rate=2.0).episodes
         assert len(used) == 20 if cap is None else len(used) < min(cap + 1, 20)
         assert count_trajectories(data, LoaderConfig(4, max_trajectories=cap, datasets=("toy",))) == {"toy": len(used)}
 
 
 def test_nothing_long_enough_says_what_is_needed():
-    windows = train_windows(OneDataset([2, 3], hz=4), "toy", 12)
+    windows = train_windows(OneDataset([2, 3], hz=4), "toy", 12, rate=2.0)
     assert len(windows) == 0
     with pytest.raises(
         DataError, match="at least 2 frames, which at stride 2 need 4 .*; the longest of its 2 .* has 3"
     ):
         require_windows({"toy": windows})
-    assert len(train_windows(OneDataset([2, 4], hz=4), "toy", 12)) == 1
+    assert len(train_windows(OneDataset([2, 4], hz=4), "toy", 12, rate=2.0)) == 1
 
 
 @pytest.mark.parametrize(
@@ -140,7 +142,7 @@ def test_nothing_long_enough_says_what_is_needed():
 )
 def test_nothing_long_enough_names_the_settings_that_would_help(hz, min_real, advice):
     """At stride 1 every frame is taken already, and training needs no prompt."""
-    windows = train_windows(OneDataset([1, 1], hz=hz), "toy", 12, min_real=min_real)
+    windows = train_windows(OneDataset([1, 1], hz=hz), "toy", 12, min_real=min_real, rate=2.0)
     with pytest.raises(DataError, match=re.escape(f". {advice}")):
         require_windows({"toy": windows})
 
@@ -150,11 +152,11 @@ def test_a_dataset_without_episodes_is_not_a_crash():
         "no val episode for windows.* toy: it has no val episode. Of a single .* add more. .* store.min_val and store"
     )
     with pytest.raises(DataError, match=said):
-        require_windows({"toy": val_windows(OneDataset([10]), "toy", 4, 2)})
+        require_windows({"toy": val_windows(OneDataset([10]), "toy", 4, 2, rate=2.0)})
 
 
 def test_memory_does_not_grow_with_windows():
-    windows = train_windows(OneDataset([10**6] * 3), "toy", 12)
+    windows = train_windows(OneDataset([10**6] * 3), "toy", 12, rate=2.0)
     assert len(windows) == 3 * (10**6 - 11)
     assert windows.ends.nbytes + windows.episodes.nbytes < 100
     assert windows.locate(len(windows) - 1) == (2, 10**6 - 12)

@@ -30,7 +30,7 @@ def model(follows: float, seed: int = 0, shift: float = 0.0):
 
 
 def test_robots_beyond_two_errors_are_counted_against_what_a_deaf_model_has():
-    follows, deaf = controllability({0: model(1.0)}), controllability({0: model(0.0)})
+    follows, deaf = controllability({0: model(1.0)}, rate=2.0), controllability({0: model(0.0)}, rate=2.0)
     for metric, robots in (("delta_psnr", 3), ("action_nats", 3), ("retrieval", 3), ("counterfactual_gain", 2)):
         assert count_following(follows, metric) == (robots, robots)
         assert count_following(deaf, metric) == (0, robots)
@@ -42,7 +42,7 @@ def test_a_deaf_model_has_as_many_robots_beyond_as_is_said():
     found, said, rng = 0, 0.0, np.random.default_rng(3)
     for _ in range(100):
         table = judged(rng, robots=6, episodes=4)
-        rows = controllability({0: replace(table, metrics={"delta_psnr": table.metrics["cross_entropy"]})})
+        rows = controllability({0: replace(table, metrics={"delta_psnr": table.metrics["cross_entropy"]})}, rate=2.0)
         found, said = found + count_following(rows, "delta_psnr")[0], said + expected_by_chance(rows, "delta_psnr")
     assert said == pytest.approx(100 * 6 * 0.0697, rel=1e-3)
     assert found == pytest.approx(said, abs=3 * said**0.5)
@@ -52,20 +52,20 @@ def test_a_robot_without_actions_is_never_there_by_chance():
     """It has the value of a deaf model in every window; it was counted as one that might be far from it."""
     table = judged(np.random.default_rng(3), robots=6, episodes=4)
     values = np.where(table.dataset == "r0", 1e-7, table.metrics["cross_entropy"])  # up to rounding
-    rows = controllability({0: replace(table, metrics={"delta_psnr": values})})
+    rows = controllability({0: replace(table, metrics={"delta_psnr": values})}, rate=2.0)
     assert count_following(rows, "delta_psnr")[1] == 6
     assert expected_by_chance(rows, "delta_psnr") == pytest.approx(5 * 0.0697, rel=1e-3)
 
 
 def test_rounding_is_no_control():
     """Always the same 1e-6 dB: many standard errors, and nothing."""
-    rows = controllability({0: model(0.0, shift=1e-6)})
+    rows = controllability({0: model(0.0, shift=1e-6)}, rate=2.0)
     assert count_following(rows, "delta_psnr") == (0, 3)
-    assert count_following(controllability({0: model(0.0, shift=1e-3)}), "delta_psnr") == (3, 3)
+    assert count_following(controllability({0: model(0.0, shift=1e-3)}, rate=2.0), "delta_psnr") == (3, 3)
 
 
 def test_a_row_says_what_there_is_to_follow():
-    rows, truth = controllability({0: model(1.0)}), read_table()
+    rows, truth = controllability({0: model(1.0)}, rate=2.0), read_table()
     for row in rows:
         assert row.explained == truth[row.robot].share if row.robot in truth else np.isnan(row.explained)
     assert {row.robot for row in rows} >= {"mine", sorted(truth)[0]}
@@ -78,8 +78,8 @@ def test_what_there_is_to_follow_is_of_the_rate_at_which_it_was_measured(rate):
 
 
 def test_seeds_that_differ_make_the_error_larger():
-    one = controllability({0: model(1.0)})
-    three = controllability({s: model(1.0, shift=s) for s in range(3)})
+    one = controllability({0: model(1.0)}, rate=2.0)
+    three = controllability({s: model(1.0, shift=s) for s in range(3)}, rate=2.0)
     own = [next(r for r in rows if r.metric == "delta_psnr") for rows in (one, three)]
     assert own[1].seeds == 3 and own[1].sem > 3 * own[0].sem
     assert own[1].mean == pytest.approx(own[0].mean + 1)

@@ -35,7 +35,7 @@ from tests.experiments.applications.runs import make_run
 )  # fmt: skip
 def test_too_few_episodes_are_told_with_what_took_them(episodes, min_val, frozen, windows, said, tmp_path):
     store = small_store(tmp_path, lengths=(20,) * episodes, min_val=min_val)
-    manifest = freeze_manifest(store, ("toy",), 4, frozen, 0)
+    manifest = freeze_manifest(store, ("toy",), 4, frozen, 0, rate=2.0)
     found = shortage(store, manifest, "toy", windows, Path("runs/a"))
     assert said in found if said else found is None
 
@@ -43,8 +43,8 @@ def test_too_few_episodes_are_told_with_what_took_them(episodes, min_val, frozen
 def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path):
     for name, count in (("few", 5), ("many", 20), ("none", 4)):
         store = small_store(tmp_path, name, lengths=(8 if name == "none" else 20,) * count, min_val=5)
-    manifest = freeze_manifest(store, ("few", "many", "none"), 10, 64, 0)
-    model = SimpleNamespace(table=store.embodiment_table(store.names))
+    manifest = freeze_manifest(store, ("few", "many", "none"), 10, 64, 0, rate=2.0)
+    model = SimpleNamespace(table=store.embodiment_table(store.names, rate=2.0))
     prepared = SimpleNamespace(store=store, manifest=manifest)
 
     def choose(*robots: str) -> tuple[list[str], dict[str, str]]:
@@ -68,13 +68,13 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
     assert set(own.manifest("toy").train.episodes) & set(here.manifest("toy").val.episodes)
     provenance = {"loader": {"datasets": ["toy"]}, "store": own.hash(["toy"])}
     model = SimpleNamespace(
-        table=own.embodiment_table(("toy",)), run=SimpleNamespace(provenance=provenance, train=TrainConfig())
+        table=own.embodiment_table(("toy",), rate=2.0), run=SimpleNamespace(provenance=provenance, train=TrainConfig())
     )
     monkeypatch.setattr("hma_jax.training.runs.load_model", lambda run: model)
     monkeypatch.setattr("experiments.cli.evaluate.check_fits", lambda trained, prepared: None)
     monkeypatch.setattr("experiments.applications.check.check_run", lambda *_: {})
     for store, told in ((own, False), (here, True)):
-        prepared = SimpleNamespace(store=store, manifest=freeze_manifest(store, ("toy",), 4, 64, 0))
+        prepared = SimpleNamespace(store=store, manifest=freeze_manifest(store, ("toy",), 4, 64, 0, rate=2.0))
         monkeypatch.setattr("experiments.applications.check.open_study", lambda _, found=prepared: found)
         check(tmp_path, tmp_path)
         said = " ".join(capsys.readouterr().out.split())
