@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from experiments.running.slots import find_accelerators
 from experiments.running.subprocess_call import call_in_subprocess
 from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
-from experiments.running.workspace import Record, Workspace, find_record, save_record
+from experiments.running.workspace import LOCK, Record, Workspace, find_record, save_record
 from experiments.study import Study
 from experiments.study_setup import StudySetup
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
@@ -33,10 +34,14 @@ from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
-from hma_jax.runtime.locks import Lock
+from hma_jax.runtime.locks import EXPIRES, Lock, find_held, machine
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
+
+
+POLL_SECONDS = 1.0
+"""Seconds between two checks whether a lease is over."""
 
 
 class TrialsFailed(Exception):
@@ -82,6 +87,7 @@ def run_study(
         say_points(setup, sweeps)
     say_average(point.trial.train for sweep in sweeps for point in sweep.points)
     say_prepared_here(setup, launcher_options)
+    await_lease(workspace)
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
         require_same_windows(study, workspace, replace)
@@ -113,6 +119,22 @@ def run_study(
         states = run_jobs(jobs, workspace, launcher, lock, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again, accept_code)
+
+
+def await_lease(workspace: Workspace) -> None:
+    """Waits where the directory was in use on another machine, or on this one before it was booted: until the lease is
+    over or is renewed, by a command that still runs. So a study may be started with its machine."""
+    lock, renewed = workspace.root / LOCK, 0.0
+    while (holder := workspace.holder) and holder.machine != machine() and find_held(lock):
+        time_renewed = lock.stat().st_mtime
+        if not renewed:
+            say(
+                f"{workspace.root} was in use by {holder}; waiting {EXPIRES / 60:.0f} minutes at most whether that runs still"
+            )
+            renewed = time_renewed
+        if time_renewed != renewed:
+            return
+        time.sleep(POLL_SECONDS)
 
 
 def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:

@@ -14,7 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, short
 from experiments.terminal.words import counted
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
     from experiments.running.attempts import State
@@ -33,13 +33,16 @@ def status(
         everything: List finished trials, and those that have not begun, too.
     """
     from experiments.running.attempts import read_states
-    from experiments.running.ledger import FINISHED, MISSING, RUNNING, Ledger
+    from experiments.running.ledger import DIVERGED, FINISHED, MISSING, RUNNING, Ledger
     from experiments.running.workspace import LOCK, Workspace, load_record
     from experiments.sweeps.registry import plan_sweeps
     from experiments.sweeps.sweep import titles
     from hma_jax.runtime.locks import find_held
 
     workspace = Workspace(study)
+    running = find_held(workspace.root / LOCK) if workspace.root.is_dir() else None
+    if running and not workspace.record.exists():
+        raise ConfigError(f"the study in {short(study)} has no trial yet: {running.who} prepares its data")
     record = load_record(workspace)
     require(
         record.provenance is not None,
@@ -69,7 +72,7 @@ def status(
     for id, state in states.items():
         if state.message:
             console.print(Text(f"{names[id]}: {state.message}"), soft_wrap=True)
-    if counts[FINISHED] < len(names) and find_held(workspace.root / LOCK) is None:
+    if counts[FINISHED] + counts[DIVERGED] < len(names) and running is None:
         console.print(Text(f"no command runs it; to go on: {record.command}"), soft_wrap=True)
 
 

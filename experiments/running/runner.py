@@ -120,6 +120,7 @@ class _Attempt:
     handle: Any
     launched: float
     reached: int  # of the trial, when this attempt began
+    began: float  # when its process was first seen; before that, when it was launched
     moved: float  # when it last made progress
     start: dict[str, Any] | None = None
     shown: dict[str, Any] | None = None
@@ -176,6 +177,7 @@ class _Run:
         if not chosen or time.monotonic() < self.relaunch_at:
             return
         directories = [retry_io(self._prepare, job) for job, _ in chosen]
+        before = [retry_io(reached, directory) for directory in directories]
         now = time.monotonic()
         try:
             handles = self.launcher.launch(directories)
@@ -188,8 +190,8 @@ class _Run:
             return
         self.launched = True
         self.waiting = [entry for entry in self.waiting if entry not in chosen]
-        for (job, state), directory, handle in zip(chosen, directories, handles, strict=True):
-            self.running.append(_Attempt(job, directory, handle, now, retry_io(reached, directory), now))
+        for (job, state), directory, handle, got in zip(chosen, directories, handles, before, strict=True):
+            self.running.append(_Attempt(job, directory, handle, now, got, began=now, moved=now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
     def _runnable(self) -> list[tuple[Job, str]]:
@@ -248,7 +250,8 @@ class _Run:
                 self._count(attempt)
                 if self.fruitless[attempt.job.id] >= TRIES:  # the engine would go on for ever
                     self.launcher.ask_to_stop([attempt.handle])
-            attempt.start, attempt.moved = start, time.monotonic()
+            attempt.start, attempt.began = start, time.monotonic()
+            attempt.moved = attempt.began
             where = {key: value for key, value in start.items() if key != "token"}
             self.ledger.append(attempt.job.id, RUNNING, title=attempt.job.title, **where)
 
@@ -293,12 +296,20 @@ class _Run:
         elif place and state.event == LOST:
             lost = self.lost_at.setdefault(place, set())
             lost.add(attempt.job.id)
-            if len(lost) == BAD_PLACE:
-                left_out = self.launcher.leave_out(attempt.handle, place)
+            to_blame = len(lost) >= BAD_PLACE and self._others_run(attempt)
+            left_out = to_blame and self.launcher.leave_out(attempt.handle, place)
+            if left_out or len(lost) == BAD_PLACE:
                 log.warning(
                     "%d trials in a row were lost on %s before their first step%s; the last one: %s",
-                    BAD_PLACE, place, ", which gets no more of them" if left_out else "", state.message,
+                    len(lost), place, ", which gets no more of them" if left_out else "", state.message,
                 )  # fmt: skip
+
+    def _others_run(self, attempt: _Attempt) -> bool:
+        """Whether a trial that began before this attempt still runs, in a place where none is lost. Otherwise what all
+        places share may be to blame, such as a disk or how JAX is installed."""
+        older = (other for other in self.running if other.began <= attempt.began)
+        places = {self.launcher.place(other.handle, other.start) for other in older}
+        return bool(places - {None} - self.lost_at.keys())
 
     def _poll_elsewhere(self) -> None:
         """What an earlier runner started and left: once its lock is free, it has ended or is ours to try."""

@@ -8,7 +8,6 @@ belong to one process each.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -95,15 +94,15 @@ def _named(visible: str) -> tuple[str, ...]:
 
 @cache
 def _gpus(devices: Path = Path("/dev")) -> tuple[str, ...]:
-    if shutil.which("nvidia-smi") is None:  # a container may have the devices alone, and numbers them anew
-        found = [device for device in devices.glob("nvidia*") if device.name.removeprefix("nvidia").isdigit()]
-        return tuple(map(str, range(len(found))))
     command = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    except (OSError, subprocess.SubprocessError):  # the program is there, the driver is not
-        return ()
-    return tuple(done.stdout.split())
+        return tuple(done.stdout.split())
+    except (OSError, subprocess.SubprocessError):
+        # A container may have the devices alone, and numbers them anew. Or the driver is out of order, as after an
+        # update without a reboot: trials are then to say that JAX does not find what is there.
+        found = [device for device in devices.glob("nvidia*") if device.name.removeprefix("nvidia").isdigit()]
+        return tuple(map(str, range(len(found))))
 
 
 @cache

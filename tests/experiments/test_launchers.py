@@ -173,6 +173,7 @@ def test_a_node_that_loses_one_trial_after_another_gets_no_new_jobs(submitted, m
     assert place.place(handle, start) == "node7" and place.place(handle, None) is None
     assert place.leave_out(handle, "node7") and place.leave_out(handle, "node9")
     assert given == [{"exclude": "node7"}, {"exclude": "node7,node9"}]
+    assert not place.leave_out(handle, "node9"), "a job that was in its queue already"
     place = SlurmLauncher(place._root, None, SlurmSettings(sbatch=("exclude=node1",)), executor=fake)
     assert place.leave_out(handle, "node7") and given[-1] == {"exclude": "node1,node7"}
 
@@ -204,6 +205,14 @@ def test_a_trial_is_told_which_accelerator_it_has_on_ray(tmp_path, settings, kin
     [task] = place.launch([tmp_path])
     assert task.reference.result(timeout=20) == 0
     assert (tmp_path / "output.txt").read_text() == f"has {kind}.\n"
+
+
+@pytest.mark.parametrize("option", ["gres=gpu:h100:1", "gpus-per-node=1"])
+def test_gpus_that_a_further_option_asks_for_are_expected(submitted, tmp_path, option):
+    place, fake, _ = submitted
+    fake.submit_array = lambda attempts: attempts
+    place = SlurmLauncher(tmp_path, None, SlurmSettings(sbatch=("exclusive", option)), executor=fake)
+    assert place.launch([tmp_path])[0].accelerator == "gpu"
 
 
 def test_where_slurm_takes_some_jobs_but_not_all_none_stays_in_its_queue(submitted, tmp_path, monkeypatch):

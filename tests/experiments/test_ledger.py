@@ -3,9 +3,12 @@
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from experiments import run_study
+from experiments.cli.main import main
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Workspace
 from hma_jax.config import ConfigError
@@ -91,3 +94,21 @@ def test_a_writer_on_another_machine_is_refused_where_its_lock_is_not_seen(tmp_p
     os.utime(lock, (ago, ago))
     with Workspace(tmp_path).locked() as held:
         assert not held.lost()
+
+
+@pytest.mark.parametrize(("time_of_change", "said"), [(0, "it is ours"), (None, "another command is using")])
+def test_a_study_that_starts_with_its_machine_waits_for_a_lease(tmp_path, monkeypatch, capsys, time_of_change, said):
+    """It was refused, for minutes after a reboot. That of a command that lives is renewed, and not waited for."""
+    lock = tmp_path / ".lock"
+    lock.write_text(json.dumps({"process": 7, "host": "here", "since": "noon", "machine": "boot 1", "token": "x"}))
+    os.utime(lock, (lock.stat().st_mtime - 60,) * 2)
+    change = time_of_change if time_of_change is None else (time_of_change,) * 2
+    monkeypatch.setattr(run_study, "time", SimpleNamespace(sleep=lambda _: os.utime(lock, change)))
+
+    def prepare(*_):
+        raise ConfigError("it is ours")
+
+    monkeypatch.setattr(run_study, "prepare_apart", prepare)
+    assert main(["sweep", "width", "--preset", "smoke", "--out", str(tmp_path)]) == 2
+    out, err = capsys.readouterr()
+    assert "was in use by process 7 on here, since noon; waiting 5 minutes at most" in out and said in err

@@ -20,7 +20,7 @@ from jax.errors import JaxRuntimeError
 
 from experiments.running import attempts, ledger, runner, shared_disk, trial_main
 from experiments.running.attempts import EVALUATING, AttemptEnd, attempt, outcome, reached, read_states
-from experiments.running.children import child_environment
+from experiments.running.children import child_environment, require_accelerator
 from experiments.running.launchers import local
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.local import LocalLauncher
@@ -178,6 +178,16 @@ def test_one_bad_gpu_does_not_eat_the_queue(tmp_path, monkeypatch, caplog):
     )
 
 
+def test_what_all_places_share_is_no_fault_of_one(tmp_path, monkeypatch, caplog):
+    """A disk that is full, or JAX without CUDA: Slurm had no node left that trials might run on."""
+    place = LocalLauncher(tmp_path, 2, command=lambda directory: ["sh", "-c", "sleep 0.2; kill -SEGV $$"])
+    place.pause, place.leave_out = 0.01, lambda handle, place: pytest.fail(f"left {place} out")
+    jobs = [job(str(i)) for i in range(8)]
+    states = run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert {state.event for state in states.values()} == {"lost"}
+    assert caplog.text.count("lost on slot 0 before") == caplog.text.count("lost on slot 1 before") == 1
+
+
 def test_the_only_place_there_is_goes_on(tmp_path):
     jobs = [job(str(i), "SIGSEGV") for i in range(runner.BAD_PLACE)]
     assert {state.event for state in run(tmp_path, jobs).values()} == {"finished"}
@@ -240,6 +250,8 @@ def test_what_failed_while_an_attempt_waited_is_not_run_again(tmp_path, in_this_
 
 def test_a_trial_that_should_have_a_gpu_does_not_run_without(tmp_path, monkeypatch, in_this_process):
     monkeypatch.setenv("HMA_ACCELERATOR", "gpu")
+    require_accelerator()  # the tests' JAX_PLATFORMS=cpu does without
+    monkeypatch.delenv("JAX_PLATFORMS")
     (tmp_path / "job.json").write_text("{}")
     assert trial_main.main(tmp_path) == Exit.LOST
     state = outcome(tmp_path, AttemptEnd(Exit.LOST))

@@ -87,6 +87,12 @@ def test_gpus_are_counted_by_their_devices_where_a_container_has_no_program_that
         (tmp_path / name).touch()
     monkeypatch.setenv("PATH", str(tmp_path))
     assert slots._gpus(tmp_path) == ("0", "1")
+    (tmp_path / "nvidia-smi").write_text(
+        "#!/bin/sh\nexit 18\n"
+    )  # the driver was updated, and does not fit the kernel's
+    (tmp_path / "nvidia-smi").chmod(0o755)
+    slots._gpus.cache_clear()
+    assert slots._gpus(tmp_path) == ("0", "1")
 
 
 def test_tpu_chips_are_counted_on_the_bus(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 from experiments.cli.main import main
@@ -45,3 +46,15 @@ def test_a_directory_without_a_study_is_refused(tmp_path: Path, capsys):
     assert main(["status", str(tmp_path)]) == 2 and "no study in" in capsys.readouterr().err
     save_record(Workspace(tmp_path), record_of())
     assert "not begun" in said(capsys, str(tmp_path))
+
+
+def test_a_study_whose_data_are_being_prepared_says_so(tmp_path: Path, capsys):
+    with Workspace(tmp_path).locked():
+        assert main(["status", str(tmp_path)]) == 2
+    assert f"no trial yet: process {os.getpid()} on" in capsys.readouterr().err
+
+
+def test_no_command_is_named_where_what_is_missing_diverged(tmp_path: Path, capsys):
+    workspace = finished_study(tmp_path, broken={"width 8 · seed 0": "diverged"})
+    save_record(workspace, record_of())
+    assert "1 diverged" in (whole := said(capsys, str(tmp_path))) and "to go on" not in whole

@@ -136,6 +136,8 @@ def test_a_study_has_given_back_its_accelerators_when_its_trials_begin(tmp_path)
 )  # fmt: skip
 def test_an_error_of_preparing_is_the_same_wherever_that_is_done(found, words, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_study, "find_accelerators", lambda: found)
+    monkeypatch.delenv("JAX_PLATFORMS")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     out = tmp_path / "a[1]"
     assert main(["study", "--preset", "smoke", "--out", str(out)]) == Exit.REFUSED
     said = capsys.readouterr().err

@@ -110,7 +110,8 @@ class SlurmLauncher(Launcher):
     ):
         self.at_once = workers or Launcher.at_once
         self._root, self._command = root, command
-        self._accelerator = "gpu" if settings.gpus else ""
+        by_option = any(option.startswith(("gres=gpu", "gpus")) for option in settings.sbatch)
+        self._accelerator = "gpu" if settings.gpus or by_option else ""
         self._grace = max(settings.grace - REQUEUE, LEAST_TO_SAVE)
         self._executor = executor or _make_executor(root / "slurm", settings)
         self._left_out = [o.removeprefix("exclude=") for o in settings.sbatch if o.startswith("exclude=")]  # nodes
@@ -186,6 +187,8 @@ class SlurmLauncher(Launcher):
 
     def leave_out(self, handle: Any, place: str) -> bool:
         """Jobs that are in the queue already may still get there."""
+        if place in self._left_out:
+            return False
         self._left_out.append(place)
         self._executor.update_parameters(exclude=",".join(self._left_out))
         return True
