@@ -568,7 +568,7 @@ def test_what_is_no_dataset_is_told_with_what_to_give_instead(tmp_path):
     with pytest.raises(DataError, match=f"/demos is no dataset.* Datasets in it: {lift}$"):
         open_source(tmp_path / "demos")
     (arm / "meta" / "info.json").unlink()
-    with pytest.raises(DataError, match=f"/toy-arm is no dataset.* copy {arm}/meta/info.json too$"):
+    with pytest.raises(NoDatasetError, match=f"/toy-arm is no dataset.* copy {arm}/meta/info.json too$"):
         open_source(arm)
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="it is a file, not a directory.*robomimic .hdf5 file.$"):  # not: Closest: file
