@@ -107,7 +107,7 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
         of_a, of_b = (f"{escape(side.name)} is of seed {next(iter(side.seeds))}" for side in (a, b))
         caption += f" {of_a}, {of_b}: differences are also those of seeds, which no error counts."
     known = [side for side in (a, b) if side.step]
-    if len({(side.step, side.steps) for side in known}) > 1 or any(side.step < side.steps for side in known):
+    if len({side.step for side in known}) > 1 or any(side.step < side.steps for side in known):
         made = [f"{escape(one.name)} {one.step:,}" + (f" of {one.steps:,}" if one.steps else "") for one in known]
         caption += f" Steps of training when they were evaluated: {', '.join(made)}."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):

@@ -214,6 +214,7 @@ def test_an_evaluated_model_is_compared_with_a_study_of_its_seed(seed, kept, tab
         ({"step": 1, "steps": 3}, {"step": 0}, "a/model 1 of 3."),  # b is a converted model
         ({"step": 1}, {"steps": 3}, "a/model 1, b/model 3 of 3."),  # a was evaluated by an earlier version
         ({"steps": 3}, {"steps": 3}, ""),
+        ({}, {"steps": 3}, ""),  # both of step 3
     ],
 )
 def test_models_whose_training_differs_or_is_not_finished_are_compared_and_it_is_said(
