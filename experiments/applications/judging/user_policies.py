@@ -48,6 +48,7 @@ class CheckedPolicy:
             except TypeError as error:
                 raise ConfigError(f"{where}: its {method}{signature} cannot be called as {shown}: {error}") from error
         self.policy, self.robot, self.where = policy, robot, where
+        self._shape: tuple[int, ...] | None = None  # of what it returned for an image
 
     def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
         self.policy.reset(episodes=episodes, seeds=seeds)
@@ -66,6 +67,12 @@ class CheckedPolicy:
             raise ConfigError(f"{wanted}; it returned something that is not an array ({error})") from error
         good = actions.shape in (shape, chunks) and np.issubdtype(actions.dtype, np.floating)
         require(good, f"{wanted}; it returned {actions.dtype} {list(actions.shape)}")
+        require(
+            self._shape in (None, actions.shape[1:]),
+            f"{self.where}: act(images) must return always actions or always chunks; for an image it returned "
+            f"{list(self._shape or ())} before, and now {list(actions.shape[1:])}",
+        )
+        self._shape = actions.shape[1:]
         actions = np.array(actions, np.float32)
         for b in np.flatnonzero(~np.isfinite(actions).reshape(count, -1).all(1))[:1]:
             raise ConfigError(

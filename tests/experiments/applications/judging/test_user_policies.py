@@ -178,6 +178,16 @@ def test_a_policy_may_give_whole_chunks():
     np.testing.assert_array_equal(acted, chunks)
 
 
+def test_a_policy_that_gives_now_actions_and_now_chunks_is_refused():
+    """A rollout's actions are one array: there was a traceback once all of its frames had been made."""
+    given, images = Gives(np.zeros((2, 2, 3), np.float32)), np.zeros((2, 8, 8, 3), np.uint8)
+    policy = CheckedPolicy(given, ROBOT, "net")
+    policy.act(images)
+    given.actions = np.zeros((2, 3), np.float32)
+    with pytest.raises(ConfigError, match=r"net: .* always chunks; .* \[2, 3\] before, and now \[3\]"):
+        policy.act(images)
+
+
 def test_a_policy_may_write_into_images_and_into_what_it_gave():
     given = Gives(np.ones((2, 3), np.float32))
     policy, images = CheckedPolicy(given, ROBOT, "net"), np.full((2, 8, 8, 3), 9, np.uint8)
