@@ -151,7 +151,9 @@ def evaluation_mesh(config: MeshConfig, params: Params) -> MeshConfig:
     windows alike. Called by all processes."""
     data, fsdp, tensor = mesh_sizes(config, jax.device_count())
     size = sum(x.nbytes for x in jax.tree.leaves(params)) / tensor
-    memory = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", math.inf)  # CPUs do not say
+    device = jax.local_devices()[0]
+    unknown = math.inf if device.platform == "cpu" else 0  # CPUs do not say, nor do GPUs by some of XLA's allocators
+    memory = (device.memory_stats() or {}).get("bytes_limit", unknown)
     whole = broadcast_from_writer("evaluation_mesh", "whole" if size <= WHOLE * memory else "")
     return replace(config, data=data * fsdp, fsdp=1, tensor=tensor) if whole else config
 

@@ -94,12 +94,17 @@ def test_parameters_are_cast_once_not_in_every_pass(params, monkeypatch):
     assert given[0]["trunk"]["blocks"]["mlp_in"]["kernel"].dtype == "bfloat16"
 
 
-@pytest.mark.parametrize(("memory", "whole"), [(800, True), (799, False), (None, True)], ids=["fit", "do not", "CPU"])
-def test_parameters_that_fit_are_not_gathered_again_in_every_pass(memory, whole, monkeypatch):
+@pytest.mark.parametrize(
+    ("platform", "memory", "whole"),
+    [("gpu", 800, True), ("gpu", 799, False), ("gpu", None, False), ("cpu", None, True)],
+    ids=["fit", "do not", "unknown", "CPU"],
+)
+def test_parameters_that_fit_are_not_gathered_again_in_every_pass(platform, memory, whole, monkeypatch):
     """An eighth of a device's memory, split along `tensor` alone."""
     stats = None if memory is None else {"bytes_limit": memory}
     monkeypatch.setattr(jax, "device_count", lambda: 8)
-    monkeypatch.setattr(jax, "local_devices", lambda: [SimpleNamespace(memory_stats=lambda: stats)])
+    device = SimpleNamespace(platform=platform, memory_stats=lambda: stats)
+    monkeypatch.setattr(jax, "local_devices", lambda: [device])
     config = MeshConfig(1, -1, 2, min_shard_size=5)
     want = MeshConfig(4, 1, 2, min_shard_size=5) if whole else config
     assert module.evaluation_mesh(config, {"w": np.zeros(50, np.float32)}) == want
