@@ -57,7 +57,8 @@ class _Shard:
 def suggest_spec(source: ConvertibleSource, name: str) -> DatasetSpec:
     """The registry entry of a converted dataset: its first camera and its action."""
     layout = source.layout
-    actions = {key: size for key, size in layout.vectors.items() if key.partition("/")[0] in ("action", "actions")}
+    field = "action" if any(key.partition("/")[0] == "action" for key in layout.vectors) else "actions"
+    actions = {key: size for key, size in layout.vectors.items() if key.partition("/")[0] == field}
     return DatasetSpec(
         name,
         image_key=next(iter(layout.images)),

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 MAX_ACTION_WIDTH = 256
 """Values of a field that is taken for an action by its name; wider ones are usually embeddings or flattened images. The
-fields `action` and `actions` themselves may be wider: it may hold the actions of several steps."""
+fields `action` and `actions` themselves may be wider: they may hold the actions of several steps."""
 
 NOT_READ = "no camera"
 """What pictures are called that are not read as such: LeRobot's depths and grey ones, robomimic's of other names."""

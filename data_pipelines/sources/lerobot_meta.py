@@ -133,7 +133,8 @@ def hash_meta(root: Path) -> hashlib._Hash:
 
 def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     """SHA-256, to be added to, of what is read of the meta folder: the rate, the features, and of every episode its
-    place, its length and its statistics, which no reader needs but which change with its actions and images."""
+    place, its length and its statistics, which no reader needs but which change with its actions and images. Where
+    single episodes have none, those of the whole dataset stand for them."""
 
     def place(path: Path) -> str:
         return path.relative_to(root).as_posix()
@@ -143,12 +144,16 @@ def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     for e in meta.episodes:
         videos = {name: (place(path), begin) for name, (path, begin) in sorted(e.videos.items())}
         digest.update(repr((e.index, e.length, place(e.data), videos)).encode())
-    statistics = root / "meta" / "episodes_stats.jsonl"  # 2.1; 2.0 has none of single episodes
+    names = [f"stats/{name}/{value}" for name in shapes for value in ("min", "max", "mean", "std")]
+    known = False
+    for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):  # 3.0
+        columns = [(name, column.to_pylist()) for name, column in _columns(path, names)]
+        digest.update(repr(columns).encode())
+        known |= bool(columns)
+    of_episodes = root / "meta" / "episodes_stats.jsonl"  # 2.1
+    statistics = of_episodes if known or of_episodes.exists() else root / "meta" / "stats.json"
     if statistics.exists():
         digest.update(retry(statistics, functools.partial(_hash_file, statistics)).encode())
-    columns = [f"stats/{name}/{value}" for name in shapes for value in ("min", "max", "mean", "std")]
-    for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        digest.update(repr([(name, c.to_pylist()) for name, c in _columns(path, columns)]).encode())
     return digest
 
 

@@ -268,7 +268,7 @@ def _demonstrations(path: Path, file: Any, filter_key: str | None) -> dict[str, 
     numbered = re.compile(r"demo_\d+").fullmatch
     names = [name for name in file["data"] if numbered(name)]
     others = [] if filter_key else [name for name in file["data"] if not numbered(name)]
-    if unread := next((name for name in others if "actions" in file["data"][name]), None):
+    if unread := next((name for name in others if f"{name}/actions" in file["data"]), None):
         raise DataError(
             f"{path}: data/{quote(unread)} has actions, but is not called demo_<number>, so it would not be read. Rename it "
             "in a copy of the file (h5py: move(OLD, NEW)), or choose demonstrations by a mask."

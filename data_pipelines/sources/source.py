@@ -145,7 +145,7 @@ class EpisodeSource(ABC):
         """Hash of the contents, independent of the location."""
 
     def former_fingerprint(self) -> str:
-        """What `fingerprint` was by earlier versions."""
+        """What `fingerprint` was by earlier versions, over task texts too."""
         return self.fingerprint()
 
     def fingerprint_as(self, recorded: str) -> str:

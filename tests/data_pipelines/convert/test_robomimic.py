@@ -54,6 +54,10 @@ def test_a_demonstration_without_a_number_is_not_left_out_in_silence(tmp_path):
     with pytest.raises(DataError, match="data/'demo_a' has actions, but is not called demo_<number>.*Rename it"):
         RobomimicSource(path)
     assert RobomimicSource(path, RobomimicSettings(filter_key="train")).units == ["demo_9", "demo_10"]
+    path = write_robomimic(
+        tmp_path / "version.hdf5", change=lambda file: file["data"].create_dataset("version", data=3)
+    )
+    assert len(RobomimicSource(path).units) == 3, "an array beside the demonstrations is no damage"
 
 
 def test_low_dimensional_files_are_refused_with_the_remedy(tmp_path):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_pipelines.convert.write import convert
+from data_pipelines.convert.write import convert, suggest_spec
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, NoDatasetError, UnreachableError
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
@@ -103,6 +103,8 @@ def test_features_have_their_own_names(tmp_path):
     np.testing.assert_array_equal(episode.actions[:, :3], lerobot_actions(1, 9))
     np.testing.assert_array_equal(episode.actions[:, 3:], [[1, t] for t in range(9)])
     assert convert(LeRobotSource(root), tmp_path / "rlds", "toy").spec.action_keys == ("actions",)
+    path.write_text(json.dumps(info | {"features": features | {"action": features["actions"]}}))
+    assert suggest_spec(LeRobotSource(root), "toy").action_keys == ("action",), "not one after the other"
     del features["actions"]
     path.write_text(json.dumps(info | {"features": features}))
     assert open_source(root).episode(1, "observation/image", []).actions.shape == (9, 0), "video without actions"
@@ -203,6 +205,18 @@ def test_the_name_and_the_rate_of_a_robomimic_file_need_no_demonstration(tmp_pat
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_statistics_and_texts_of_a_dataset_are_no_part_of_its_recordings(tmp_path, version):
     root = write_lerobot(tmp_path / "toy-arm", version)
+    pq = pytest.importorskip("pyarrow.parquet")
+
+    def add_statistics(value: float) -> None:
+        if version == "v2.1":
+            (root / "meta" / "episodes_stats.jsonl").write_text(json.dumps({"stats": {"action": {"mean": [value]}}}))
+            return
+        (path,) = (root / "meta" / "episodes").rglob("*.parquet")
+        table = pq.read_table(path)
+        known = [c for c in table.column_names if not c.startswith("stats/")]
+        pq.write_table(table.select(known).append_column("stats/action/mean", [[[0.0] * 3, [value] * 3]]), path)
+
+    add_statistics(0.0)
     before = open_source(root).fingerprint()
     (root / "meta" / "stats.json").write_text('{"action": {"q01": [0]}}')
     (root / "meta" / "README.md").write_text("Task texts were corrected.")
@@ -212,10 +226,19 @@ def test_statistics_and_texts_of_a_dataset_are_no_part_of_its_recordings(tmp_pat
     if version == "v2.1":
         path = root / "meta" / "episodes.jsonl"
         path.write_text(path.read_text().replace('"length": 9', '"length": 8'))
-    else:
-        pq = pytest.importorskip("pyarrow.parquet")
-        (path,) = (root / "meta" / "episodes").rglob("*.parquet")
-        pq.write_table(pq.read_table(path).append_column("stats/action/mean", [[[0.0] * 3, [1.0] * 3]]), path)
+        assert open_source(root).fingerprint() != before
+        path.write_text(path.read_text().replace('"length": 8', '"length": 9'))
+    assert open_source(root).fingerprint() == before
+    add_statistics(1.0)
+    assert open_source(root).fingerprint() != before
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v3.0"])
+def test_statistics_of_a_dataset_stand_for_those_that_its_episodes_lack(tmp_path, version):
+    """Files of other actions can be of equal sizes."""
+    root = write_lerobot(tmp_path / "toy-arm", version)
+    before = open_source(root).fingerprint()
+    (root / "meta" / "stats.json").write_text('{"action": {"mean": [0]}}')
     assert open_source(root).fingerprint() != before
 
 

@@ -255,6 +255,18 @@ def test_every_format_says_how_long_a_recording_is_whether_it_succeeded_and_what
         assert len(set(recorded.ids().tolist())) == len(recorded)
 
 
+def test_recordings_of_other_task_texts_are_others(tmp_path):
+    """The texts are copied into what is generated from them."""
+    place, spec = write_lerobot(tmp_path / "arm", "v2.1"), DatasetSpec("arm", "observation/top", ("action",), (3,), 10)
+
+    def described():
+        return describe(RldsTrajectories(str(place), "train", spec, Robot("arm", 2, *[(0.0,) * 3] * 3), 8))
+
+    before, path = described(), place / "meta" / "tasks.jsonl"
+    path.write_text(path.read_text().replace("push", "pull"))
+    assert described() != before
+
+
 def test_recordings_are_shown_as_their_entry_corrects_them(tmp_path):
     place, robot = str(write_rlds(tmp_path, SPEC, [5])), Robot(SPEC.name, 2, *[(0.0,) * SPEC.action_dim] * 3)
     corrected = replace(SPEC, image_corrections=("swap_red_blue",))
