@@ -220,7 +220,7 @@ def test_the_gradient_of_actions_counts_as_their_loss_does(monkeypatch):
     declared, batch = declare_model(config, TABLE), random_batch(0, config)
     state = init_state(declared, TABLE, 0)
 
-    def total(model, *_):
+    def total(model, *_, **__):
         actions = sum(jnp.sum(x) for x in jax.tree.leaves(nnx.state(model)))
         return LossSums(jnp.zeros(()), jnp.zeros(()), actions)
 
