@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import grain
 import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.loading.endless import iterate
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.mixture import make_mixture
@@ -79,23 +79,20 @@ def make_frame_loader(
                 reasons[spec.name] += f": {skipped if all_held_out.any() else none}; {bound}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)
-        streams[spec.name] = _Stream(source, spec, episodes, order)
+        streams[spec.name] = _FrameStream(source, spec, episodes, order)
     mixture = make_mixture(counts, tau, reasons)
     group = math.gcd(batch, FRAMES_PER_READ)
     draws = Draws(mixture.weights, f"frames/{split}/{seed}")
-    batches = _Batches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)
+    batches = _FrameBatches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)
     threads = decoding_threads() if threads is None else threads
-    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, PREFETCH_BATCHES))
-    iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
-    iterator.set_state({"next_index": start_step})
-    return FrameLoader(batches, iterator)
+    return FrameLoader(batches, iterate(batches, start_step, threads, ahead=max(threads, PREFETCH_BATCHES)))
 
 
 @dataclass(frozen=True)
 class FrameLoader(Iterator[np.ndarray]):
     """Batches one after the other, and what each is made of."""
 
-    batches: _Batches
+    batches: _FrameBatches
     iterator: Iterator[np.ndarray]
 
     def __next__(self) -> np.ndarray:
@@ -113,7 +110,7 @@ class FrameLoader(Iterator[np.ndarray]):
 
 
 @dataclass(frozen=True)
-class _Stream:
+class _FrameStream:
     """Endless shuffled episodes of one dataset."""
 
     source: EpisodeSource
@@ -145,10 +142,10 @@ class _Stream:
 
 
 @dataclass(frozen=True)
-class _Batches:
+class _FrameBatches:
     """Element s: the frames of batch s, in groups of `group` frames of one episode."""
 
-    streams: tuple[_Stream, ...]
+    streams: tuple[_FrameStream, ...]
     draws: Draws
     batch: int
     group: int

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import grain
 import numpy as np
 
+from data_pipelines.loading.endless import iterate
 from data_pipelines.loading.selection import LoaderConfig, TrainingWindows, select_windows
 from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, random_below, stream_seed
@@ -54,11 +54,8 @@ def make_loader(
     grids = {store.manifest(name).tokenizer for name in names}
     require(len(grids) == 1, f"the datasets were tokenised with different tokenizers: {sorted(map(str, grids))}")
     store.check_table(table, names, config.rate)
-    batches = _Batches(store, table, selected, config, wanted)
-    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads * PREFETCH, 1))
-    iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
-    iterator.set_state({"next_index": start_step})
-    return iterator
+    batches = _WindowBatches(store, table, selected, config, wanted)
+    return iterate(batches, start_step, threads, ahead=max(threads * PREFETCH, 1))
 
 
 def describe_batch(store: TokenStore, table: EmbodimentTable, config: LoaderConfig, step: int) -> list[str]:
@@ -66,10 +63,10 @@ def describe_batch(store: TokenStore, table: EmbodimentTable, config: LoaderConf
 
     Raises what `make_loader` raises.
     """
-    return _Batches(store, table, select_windows(store, config), config, np.arange(config.batch)).describe(step)
+    return _WindowBatches(store, table, select_windows(store, config), config, np.arange(config.batch)).describe(step)
 
 
-class _Batches:
+class _WindowBatches:
     """Element s: `rows` of the global batch of step s."""
 
     def __init__(
@@ -81,7 +78,7 @@ class _Batches:
         rows: np.ndarray,
     ):
         sets = [selected.sets[name] for name in selected.mixture.names]
-        self._streams = [_Stream(store, table, windows, config) for windows in sets]
+        self._streams = [_WindowStream(store, table, windows, config) for windows in sets]
         self._draws = Draws(selected.mixture.weights, config.seed)
         self._lengths = np.asarray([len(windows) for windows in sets])
         self._seeds = np.asarray([stream_seed(config.seed, "order", windows.name) for windows in sets])
@@ -104,7 +101,7 @@ class _Batches:
         return zip(dataset.tolist(), draw.tolist(), window.tolist(), strict=True)
 
 
-class _Stream:
+class _WindowStream:
     """The windows of one dataset, as rows of a batch."""
 
     def __init__(self, store: TokenStore, table: EmbodimentTable, windows: WindowSet, config: LoaderConfig):

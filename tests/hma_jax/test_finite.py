@@ -41,8 +41,8 @@ def train(run_dir: Path, at: int):
 def test_a_gradient_that_is_no_number_is_refused_though_the_loss_is_fine(tmp_path: Path, monkeypatch):
     usual = step_module.masked_loss
 
-    def poisoned(model, masked, tokens, *rest):
-        sums = usual(model, masked, tokens, *rest)
+    def poisoned(model, masked, tokens, *rest, **how):
+        sums = usual(model, masked, tokens, *rest, **how)
         nothing = 0 * model.positions.get_value().sum()
         bad = tokens[0, 0, 0] == MARK
         # A root of 0 is 0, and its slope infinite.
