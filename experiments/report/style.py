@@ -80,6 +80,8 @@ body:has(#pause:checked) .still { display: contents; }
   table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; }
   td:nth-child(3).text { min-width: 0; }
   table:has(th:nth-child(13)) .sem { display: block; }  /* errors below their numbers: side by side they do not fit */
+  /* One table wider than the paper would have the browser print the whole page smaller. */
+  table:has(th:nth-child(13)) { font-size: 6pt; } table:has(th:nth-child(13)) :is(th, td) { padding-inline: .1rem; }
   .plot { max-height: 100mm; }
   figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3, h4, summary { break-after: avoid; } }
 """

@@ -188,6 +188,7 @@ def test_paper_has_what_a_page_unfolds_and_no_line_ends_before_an_error():
     paper = CSS[CSS.index("@media print") :]
     assert "details::details-content { content-visibility: visible" in paper and "h3, h4, summary { break-af" in paper
     assert " " not in pm(1.0, 0.1).replace("<span class", "")
+    assert "table:has(th:nth-child(13)) { font-size: 6pt; }" in paper  # else the widest one shrinks all of the page
 
 
 def test_a_figure_on_a_phone_keeps_the_size_of_its_text(drawn):
