@@ -76,13 +76,18 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
         metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
     ran = [c for c in own if c.observed is not None]
+    outcome = (
+        f"{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals contain the outcome."
+        if ran
+        else "None has an outcome yet."
+    )
     known = [c for c in ran if c.expected.known]
     hold = sum(bool(c.inside) for c in known)
     less = f" Of {len(known)} of them, {hold} of which hold, some seeds were known by then." * bool(known)
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
     head = ["curve"] * sweep.has_series + [sweep.axis, "", "predicted", "observed", "", "seeds"]
     return (
-        f"<h4>Preregistered</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals contain the outcome. According "
+        f"<h4>Preregistered</h4><p>{outcome} According "
         f"to the author they were written before the trials ran, in {commits}.{less} Errors are over seeds.</p>"
         f"<details><summary>Predicted and observed</summary>{table(head, lines, text=2 + sweep.has_series)}</details>"
     )

@@ -1,5 +1,6 @@
 """What a study's author wrote down before, and makes of it, stands with its axis on the page."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import pytest
 from experiments import run_study
 from experiments.analysis.preregistered import (
     FILE,
+    ExpectationOutcome,
     Expected,
     compare_expected,
     find_unplanned,
@@ -15,6 +17,7 @@ from experiments.analysis.preregistered import (
 )
 from experiments.analysis.rows import curve, difference, read_rows
 from experiments.report.draw import draw
+from experiments.report.findings import describe_expected
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.workspace import Workspace
 from experiments.study_setup import StudyArguments, make_setup
@@ -111,10 +114,18 @@ def test_what_is_not_planned_yet_is_open(rows, study, wrong, message):
     assert (came.observed, came.planned, came.lacks) == (None, 0, "not planned")
 
 
-def test_an_axis_that_no_study_has_is_refused(rows):
-    for refuse in (compare_expected, find_unplanned):
-        with pytest.raises(ConfigError, match="no axis 'widht'; known: .*width"):
-            refuse([replace(WIDTH, sweep="widht")], [])
+def test_an_axis_that_the_study_does_not_have_yet_is_open(rows):
+    """Of a file that had not run there, no page was drawn."""
+    own = replace(WIDTH, sweep="smoothing")
+    assert find_unplanned([own, replace(own, x="16")], []) == ["no axis 'smoothing'"]
+    assert compare_expected([own], rows) == []
+
+
+def test_expectations_without_an_outcome_are_not_counted(study):
+    """The page had "0 of 0 intervals contain the outcome"."""
+    [sweep] = [s for s in plan_sweeps(study[1].study, study[1].axes) if s.name == "width"]
+    said = describe_expected(sweep, [ExpectationOutcome(WIDTH, None, math.nan, 0, 2, "not run yet")])
+    assert "None has an outcome yet." in said and "0 of 0" not in said
 
 
 def test_what_these_trials_do_not_measure_is_said(rows):
@@ -144,7 +155,9 @@ def test_a_study_reads_what_is_expected_before_it_prepares_anything(tmp_path, mo
     assert "line 2: low must not be above" in run("width,,8,,cross_entropy,7,4,6,abc1234")
     assert run("width,,12,,cross_entropy,5,4,6,abc1234") == "prepares"
     said = " ".join(capsys.readouterr().out.split())
-    assert f"note: {FILE} predicts what this study does not plan: width has no point '12', but 8, 16" in said
+    assert (
+        f"note: {FILE} predicts what this study does not plan, which stays open: width has no point '12', but" in said
+    )
 
 
 @pytest.mark.parametrize(
