@@ -28,6 +28,7 @@ from experiments.study import Study
 from experiments.study_setup import StudySetup
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
+from experiments.terminal.program import PROGRAM
 from experiments.terminal.progress import SweepMonitor, console, say, short
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError
@@ -91,7 +92,7 @@ def run_study(
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
         require_same_windows(study, workspace, replace)
-        earlier = find_earlier(workspace, study, replace)
+        earlier = find_earlier(workspace, study, sweeps, replace)
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
         planned = plan_sweeps(study, tuple(every.values()))
         say_unplanned(workspace, planned)
@@ -140,13 +141,13 @@ def await_lease(workspace: Workspace) -> None:
 def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
     """Names what the user preregistered of points that the study, all of whose sweeps are `planned`, does not have.
 
-    Raises ConfigError, as the page at the end would, for a line that cannot be read or that no study can answer.
+    Raises ConfigError, as the page at the end would, for a line that cannot be read.
     """
     from experiments.analysis.preregistered import FILE, find_unplanned, read_expected
 
     path = workspace.predictions / FILE
     if lines := find_unplanned(read_expected(path), planned):
-        say(f"note: {path.name} predicts what this study does not plan: {few(lines)}. The page says so")
+        say(f"note: {path.name} predicts what this study does not plan, which stays open: {few(lines)}")
 
 
 def prepare_apart(setup: StudySetup, replace: Step | None) -> Provenance:
@@ -230,24 +231,34 @@ def require_agreement(
     require_one_closure(workspace.trials, shown, None if complete else sources, accept_code)
 
 
-def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Record | None:
-    """What was run here before, if `study` goes on with it: its axes then have the same trials under both.
+def find_earlier(workspace: Workspace, study: Study, asked: Sequence[Sweep], replace: Step | None) -> Record | None:
+    """What was run here before, if `study` goes on with it: its axes then have the same trials under both. Where it is
+    replaced, those of its axes that have, and those that are `asked` for again.
 
     Raises ConfigError for a study of other settings, unless `replace` allows it: its report would be drawn over.
     """
-
-    def plans(study: Study) -> list[Sweep]:
-        return plan_sweeps(study, earlier.axes, workspace.root)
-
     try:
         earlier = find_record(workspace)
-        lines = []
-        if earlier and plans(earlier.study) != plans(study):
-            lines = diff(earlier.study, study)
-    except ConfigError as error:  # it cannot be read
-        earlier, lines = None, [str(error)]
+        if earlier is None:
+            return None
+        before, now = (plan_sweeps(s, earlier.axes, workspace.root) for s in (earlier.study, study))
+        lines = diff(earlier.study, study) if before != now else []
+    except ConfigError as error:  # it cannot be read, or one of its axes does not fit
+        require_same("study", workspace.record, [str(error)], replace)
+        return None
     require_same("study", workspace.record, lines, replace)
-    return None if lines else earlier
+    if not lines:
+        return earlier
+    names = [sweep.name for sweep in asked]
+    other = {axis: old.name for axis, old, new in zip(earlier.axes, before, now, strict=True) if old != new}
+    gone = [axis for axis, name in other.items() if name not in names]
+    if gone:
+        paths = [short(workspace.root / axis) if is_file(axis) else axis for axis in gone]
+        say(
+            f"note: the page will leave out what ran with other settings: {few(paths)}. To have it again, run "
+            f"`{PROGRAM} sweep` for it with these settings"
+        )
+    return dataclasses.replace(earlier, axes=tuple(axis for axis in earlier.axes if axis not in gone))
 
 
 def run_jobs(

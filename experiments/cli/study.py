@@ -11,7 +11,7 @@ from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningA
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import AXES, is_file, plan_asked
-from experiments.terminal.progress import console
+from experiments.terminal.progress import console, say
 from hma_jax.config import ConfigError, require
 
 
@@ -87,6 +87,7 @@ def _run(
         from experiments.dry_run.plan_table import Devices, plan_table
         from experiments.dry_run.trainable import check_launched
         from experiments.preparing.sources import check_entries
+        from experiments.run_study import find_earlier
 
         sweeps = plan_asked(setup.study, axes, setup.workspace.root)
         given, trained = bool(setup.data), setup.tokenizer is None
@@ -102,6 +103,10 @@ def _run(
             say_points(setup, sweeps)
         say_average(point.trial.train for sweep in sweeps for point in sweep.points)
         say_prepared_here(setup, launcher_options)
+        try:
+            find_earlier(setup.workspace, setup.study, sweeps, replacement.replace)
+        except ConfigError as error:
+            say(f"note: without --dry-run this command would be refused: {error}")
         return
     from experiments.run_study import run_study
 

@@ -125,7 +125,7 @@ def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | 
     if not lines or may_replace(step, replace):
         return
     after = [IN_WORDS[s] for s in get_args(Step) if may_replace(s, step) and s != step]
-    follows = f", and {', '.join(after)} where they depend on it" if after else ""
+    follows = f", and {', '.join(after)} where they depend on it" if after else ". Finished trials stay"
     raise ConfigError(
         f"{place} holds {IN_WORDS[step]}, made from other inputs (there -> asked for):\n  "
         + "\n  ".join(lines)

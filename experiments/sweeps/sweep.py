@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -141,9 +142,9 @@ def make_sweep(
     name: str,
     axis: str,
     scope: tuple[str, ...],
-    values: Sequence[int],
-    change: Callable[[Trial, int], Trial],
-    reference_x: int,
+    values: Sequence[float],
+    change: Callable[[Trial, Any], Trial],
+    reference_x: float,
     *,
     question: str,
     gain: str,
@@ -174,7 +175,7 @@ def make_sweep(
         f"changed ({'; '.join(lines)}); give the position that it has",
     )
 
-    def trial(x: int, seed: int) -> Trial:
+    def trial(x: float, seed: int) -> Trial:
         reference = reference_trial(study, seed, steps)
         return reference if x == reference_x else change(replace(reference, measure_untrained=False), x)
 

@@ -360,6 +360,24 @@ def test_a_study_of_other_settings_is_not_drawn_over(instant_trials, unrendered,
     assert load_record(Workspace(tmp_path)).axes == ("conditioning",)  # nothing in common
 
 
+def test_axes_whose_trials_stay_the_same_stay_on_the_page_of_a_study_that_is_replaced(no_trials, tmp_path, capsys):
+    """After a width was added, the page had that axis alone."""
+    smoke = ["--preset", "smoke", "--out", str(tmp_path)]
+    assert main(["study", *smoke]) == 0
+    wider = ["sweep", "width", *smoke, "--set", "widths=8,16,32"]
+    capsys.readouterr()
+    assert main([*wider, "--dry-run"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "this command would be refused: " in said and "Finished trials stay" in said
+    assert main([*wider, "--replace", "study"]) == 0
+    assert load_record(Workspace(tmp_path)).axes == ("datasets", "trajectories", "width")
+    assert "leave out" not in capsys.readouterr().out
+    assert main([*wider, "--set", "train.steps=7", "--replace", "study"]) == 0
+    assert load_record(Workspace(tmp_path)).axes == ("width",)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the page will leave out what ran with other settings: datasets, trajectories." in said
+
+
 def test_robots_that_any_seed_is_judged_on_need_held_out_windows(instant_trials, tmp_path, capsys, monkeypatch):
     """Before any trial: on designs over robots every seed judges others."""
     smoke = get_preset("smoke")
