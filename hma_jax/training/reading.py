@@ -107,7 +107,8 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
                 "is read without checking their hashes",
                 checkpoint,
             )
-        return ocp.checkpointables_metadata(checkpoint).custom_metadata or {}
+        # Of a path that is not absolute, Orbax warns for every item.
+        return ocp.checkpointables_metadata(checkpoint.absolute()).custom_metadata or {}
 
 
 def load_items(checkpoint: Path, shapes: Mapping[str, Any], partial: bool = False) -> dict[str, Any]:
@@ -143,7 +144,7 @@ def saved_shapes(checkpoint: Path, item: str, field: str) -> Any:
     folder = WHOLE_STATE if old else item
     with raised_in_all("shapes"), _reading(checkpoint):
         verify(checkpoint, lambda name: name.split("/")[0] == folder, (jax.process_index(), jax.process_count()))
-        found = ocp.checkpointables_metadata(checkpoint).metadata[folder]
+        found = ocp.checkpointables_metadata(checkpoint.absolute()).metadata[folder]
         return jax.tree.map(lambda x: tuple(x.shape), (found[item] if old else found)[field])
 
 

@@ -120,6 +120,14 @@ def test_what_cannot_be_branched(tmp_path: Path):
     assert (new / FILE).exists() and branch(source, new, 3) == 3, "one that was cut short is made again"
 
 
+def test_a_relative_path_is_branched_without_warnings(tmp_path: Path, monkeypatch, caplog):
+    """Orbax warns of paths that are not absolute, once for every item."""
+    train(tmp_path / "source", 2)
+    monkeypatch.chdir(tmp_path)
+    caplog.clear()
+    assert branch(Path("source"), Path("new")) == 2 and not caplog.records
+
+
 def test_checkpoints_of_every_so_many_steps_stay(tmp_path: Path):
     train(tmp_path, 10, checkpoint_every=1, keep_every=5)
     assert list_steps(tmp_path / CHECKPOINTS) == [5, 9, 10]
