@@ -13,11 +13,13 @@ from experiments.running.migration import migrate
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
 from experiments.terminal.program import PROGRAM
+from experiments.terminal.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import EXPIRES, Held, Holder, Lock, exclusive, machine, read_holder
 from hma_jax.runtime.outputs import writing_to
+from hma_jax.training.run_lock import CHECKPOINTS
 
 LOCK = ".lock"
 
@@ -220,8 +222,15 @@ def load_record(workspace: Workspace) -> Record:
     its axes are planned with them. Raises ConfigError if there is none, or one that does not say what its axes are."""
     record = find_record(workspace)
     if record is None:
+        names = sorted(place.parent.name for place in workspace.root.glob(f"*/{CHECKPOINTS}"))
+        single = [name for name in names if name != workspace.tokenizer.name]
+        of_train = (
+            f". There are single runs of `{PROGRAM} train`, whose progress is in their metrics.jsonl: {few(single)}"
+            if single
+            else ""
+        )
         raise ConfigError(
-            f"no study in {workspace.root} (it has no {workspace.record.name}); start one with "
+            f"no study in {workspace.root} (it has no {workspace.record.name}){of_train}; start one with "
             f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
         )
     require(
