@@ -62,7 +62,11 @@ def generate(
     from data_pipelines.sources.convertible import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
-    from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories
+    from experiments.applications.generating.trajectories import (
+        describe_reconstruction,
+        describe_training,
+        open_trajectories,
+    )
     from experiments.applications.simulators import DEAF, load_simulator
     from experiments.running.workspace import Workspace
     from hma_jax.simulator.folder import find_decode
@@ -90,6 +94,8 @@ def generate(
     if note := describe_reconstruction(recorded):
         say(note)
     count = len(recorded) if episodes is None else min(episodes, len(recorded))
+    if note := describe_training(recorded, count, stores):
+        say(note)
     mark = checkpoint_hash(run, simulator.model.step)
     source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)
     called, eta = name or made_name(f"{driven.name}_generated"), Eta()

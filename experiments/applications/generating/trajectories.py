@@ -18,6 +18,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import FILE as MANIFEST
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
+from experiments.terminal.words import counted
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 
@@ -220,6 +221,25 @@ def describe_reconstruction(recorded: Trajectories) -> str:
         f"note: the token store has no frames of {recorded.name}, split {recorded.split}. PSNR is computed against "
         "frames decoded from tokens, so it does not contain the error of the tokenizer; to avoid this, give the "
         "directory of the recordings"
+    )
+
+
+def describe_training(recorded: Trajectories, count: int, stores: Path) -> str:
+    """A note for the user where a study whose tokens are in `stores` trains on some of the first `count` trajectories;
+    '' where it trains on none, or where that is not known."""
+    path = stores / recorded.name / MANIFEST
+    if not path.is_file():
+        return ""
+    manifest = load_manifest(path)
+    if not manifest.runs:
+        return ""
+    trained = episode_ids(manifest.runs)[np.asarray(manifest.train.episodes, np.int64)]
+    seen = int(np.isin(recorded.ids()[:count], trained).sum())
+    if not seen:
+        return ""
+    return (
+        f"note: the run's study trains on {seen:,} of {counted(count, 'episode')}, and PSNR is higher on such than on new "
+        f"ones; `--actions {recorded.name} --split val` replays those that are held out"
     )
 
 

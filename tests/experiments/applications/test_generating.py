@@ -14,9 +14,10 @@ from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.generate import generate_suite
+from data_pipelines.tokens.store import TokenStore
 from experiments.applications.generating import source as source_module
 from experiments.applications.generating import trajectories as trajectories_module
-from experiments.applications.generating.trajectories import describe, open_trajectories
+from experiments.applications.generating.trajectories import describe, describe_training, open_trajectories
 from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
@@ -218,6 +219,27 @@ def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path, caps
         assert (note in said) == (split == "train")
     with pytest.raises(ConfigError, match=f"pusher: no such directory, and {tmp_path} has tokens of pusher_sand$"):
         open_trajectories("pusher", "val", None, robots, tokenizer, tmp_path)
+
+
+def test_how_many_of_the_episodes_a_study_trains_on_is_said(recorded, tmp_path, capsys):
+    own = make_run(tmp_path)
+    tokenizer = load_tokenizer(tmp_path / "tokenizer")
+    spec = get_spec("pusher_sand")
+    tokenize_dataset(spec, recorded, tokenizer, tmp_path / "tokens", min_val=1, keep_frames="val")
+    manifest = TokenStore(tmp_path / "tokens").manifest("pusher_sand")
+    trained, held_out = len(manifest.train.episodes), len(manifest.val.episodes)
+
+    def note(place: str, split: str) -> str:
+        found = open_trajectories(place, split, None, {ROBOT.name: ROBOT}, tokenizer, tmp_path / "tokens")[0]
+        return describe_training(found, len(found), tmp_path / "tokens")
+
+    assert f"trains on {trained} of {trained + held_out} episodes" in note(str(recorded), "train+val")
+    assert note("pusher_sand", "val") == "" and f"{trained} of {trained} " in note("pusher_sand", "train")
+    capsys.readouterr()
+    asked = ["--actions", "pusher_sand", "--episodes", "1", "--clips", "0"]
+    assert main(["generate", str(own), *asked, "--out", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "trains on 1 of 1 episode" in said and "`--actions pusher_sand --split val`" in said
 
 
 def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
