@@ -239,7 +239,7 @@ def test_native_actions_are_no_steps_of_an_environment():
     [
         ({"rate": "model", "history": 3}, "rate, history: only for loading a `run`"),
         ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
-        ({"starts": []}, "there are no starts, so no episode can begin"),
+        ({"starts": []}, r"there are no starts, so no episode can begin: .*make_simulator\('RUN', episodes=1\)"),
         ({"run": "somewhere"}, "either `run` or `simulator`"),
     ],
 )
