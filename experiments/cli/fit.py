@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
-from experiments.running.workspace import Workspace, load_record
+from experiments.running.workspace import Workspace, command_at, load_record
 from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, say, short, wrote
 from hma_jax.config import ConfigError, require
@@ -60,14 +60,14 @@ def _show(root: Path) -> None:
         )
         return
     table = Table(box=None, header_style="bold")
-    for name in ("curve", "over", "L, nats per token", "exponents", "remarks"):
+    for name in ("curve", "over", "L, nats per token", "exponents and E", "remarks"):
         table.add_column(name, overflow="fold")
     for fitted in numbers.fits:
         table.add_row(*map(escape, (fitted.curve.name, ", ".join(fitted.curve.axes), *_words(fitted))))
     if numbers.isoflop is not None:
         laws = {"": numbers.isoflop.exponent, "by three sizes ": numbers.isoflop.near}
         exponent = ", ".join(
-            f"{form}N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" for form, a in laws.items() if a
+            f"{form}N_opt ~ C^{a.value:.3f} [{a.low:.3f}, {a.high:.3f}]" for form, a in laws.items() if a
         )
         doubts = [*numbers.isoflop.doubts]
         doubts += [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
@@ -77,17 +77,20 @@ def _show(root: Path) -> None:
     if left := planned - numbers.results.keys():
         say(
             f"{len(left)} of the {len(planned)} trials of these curves have no result; to run them: "
-            f"`{load_record(Workspace(root.absolute())).command}`"
+            f"`{command_at(root, load_record(Workspace(root.absolute())))}`"
         )
 
 
 def _words(fitted: CurveFit) -> tuple[str, str, str]:
+    from experiments.report.fits import with_constant
+
     fit = fitted.fit
     if fit.refused:
         return "no fit", "", fit.refused
     exponents = [c for c in fit.coefficients if c.name in ("alpha", "beta")]
     intervals = ", ".join(f"{c.name} {c.value:.3g} [{c.low:.3g}, {c.high:.3g}]" for c in exponents)
-    return fit.formula(), intervals, "; ".join(fit.doubts)
+    formula, *constant = with_constant(fitted)
+    return formula, f"{intervals}, E {' '.join(constant)}".rstrip(), "; ".join(fit.doubts)
 
 
 def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...]) -> None:

@@ -34,7 +34,7 @@ def status(
     """
     from experiments.running.attempts import read_states
     from experiments.running.ledger import DIVERGED, FINISHED, MISSING, RUNNING, Ledger
-    from experiments.running.workspace import LOCK, Workspace, load_record
+    from experiments.running.workspace import LOCK, Workspace, command_at, load_record
     from experiments.sweeps.registry import plan_sweeps
     from experiments.sweeps.sweep import titles
     from hma_jax.runtime.locks import find_held
@@ -73,7 +73,7 @@ def status(
         if state.message:
             console.print(Text(f"{names[id]}: {state.message}"), soft_wrap=True)
     if counts[FINISHED] + counts[DIVERGED] < len(names) and running is None:
-        console.print(Text(f"no command runs it; to go on: {record.command}"), soft_wrap=True)
+        console.print(Text(f"no command runs it; to go on: {command_at(study, record)}"), soft_wrap=True)
 
 
 def _place(directory: Path, state: State) -> tuple[str, str]:

@@ -70,8 +70,8 @@ def describe_fits(fits: Sequence[CurveFit], isoflop: IsoFlop | None, outcomes: S
             lines.append([name, axes, "–", "–", "–", f"No fit: {html.escape(fit.refused)}."])
             continue
         exponents = "; ".join(_with_interval(c) for c in fit.coefficients if c.name in ("alpha", "beta"))
-        zero = 10 * FLOOR * float(fitted.measured.value.min())  # as where doubts count bootstraps
-        formula, constant = fit.formula(constant=fit["E"].value >= zero), _constant(fit["E"], zero)
+        formula, constant, interval = with_constant(fitted)
+        constant += f" <span class=sem>{interval}</span>" if interval else ""
         remarks = html.escape(". ".join(d[0].upper() + d[1:] for d in fit.doubts))
         lines.append([
             name, axes, _as_html(formula), exponents, constant, f"{remarks}." if remarks else ""
@@ -96,11 +96,14 @@ def _with_interval(c: Coefficient) -> str:
     return f"{name}{c.value:.3g} <span class=sem>[{c.low:.3g}, {c.high:.3g}]</span>"
 
 
-def _constant(e: Coefficient, zero: float) -> str:
-    """E with its interval; what lies below `zero` is the bound of the search, and no measurement."""
+def with_constant(fitted: CurveFit) -> tuple[str, str, str]:
+    """(formula, E, interval of E) of a fit that is not refused. What lies below `zero` is the bound of the search, and
+    no measurement: the formula lacks it."""
+    e, zero = fitted.fit["E"], 10 * FLOOR * float(fitted.measured.value.min())  # as where doubts count bootstraps
     value, low, high = ("0" if v < zero else f"{v:.3g}" for v in (e.value, e.low, e.high))
-    at_bound = " (at the bound)" * (e.value < zero)
-    return f"{value}{at_bound}" + f" <span class=sem>[{low}, {high}]</span>" * (e.high >= zero)
+    at_bound = e.value < zero
+    interval = f"[{low}, {high}]" if e.high >= zero else ""
+    return fitted.fit.formula(constant=not at_bound), value + " (at the bound)" * at_bound, interval
 
 
 def _outcomes(outcomes: Sequence[Outcome]) -> str:

@@ -195,6 +195,20 @@ def save_record(workspace: Workspace, record: Record) -> None:
     write_file(workspace.record, json.dumps(to_dict(record), indent=1))
 
 
+def command_at(root: Path, record: Record) -> str:
+    """The study's command for its directory `root`, as the user wrote it. The recorded one names the path that it had,
+    where it would begin a new study if the directory was moved or copied since."""
+    words = shlex.split(record.command)
+    at = words.index("--out") + 1 if "--out" in words else None
+    recorded = words[at] if at else str(Path("runs") / record.study.name)
+    if Path(recorded).resolve() == root.resolve():
+        return record.command
+    words = [word.replace(f"{recorded}/axes/", f"{root}/axes/") for word in words]
+    if at:
+        words[at] = str(root)
+    return shlex.join(words if at else [*words, "--out", str(root)])
+
+
 def find_record(workspace: Workspace) -> Record | None:
     """The study that lives there, as this or an earlier version recorded it; None without any, and where a file is in
     place of the directory.

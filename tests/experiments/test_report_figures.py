@@ -16,7 +16,7 @@ from experiments.analysis.rows import TRAINING, TRAINING_LOSS, Row, curve
 from experiments.analysis.scaling import Curve, CurveFit
 from experiments.presets import CPU_FULL
 from experiments.report import plot_fits
-from experiments.report.fits import describe_fits
+from experiments.report.fits import describe_fits, with_constant
 from experiments.report.pieces import pm
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
@@ -318,10 +318,13 @@ def test_an_E_at_the_bound_of_the_search_is_no_number(high, interval):
     """The page had 0.000314 [0.000314, 0.000314] of it."""
     coefficients = (Coefficient("E", 3.1e-4, 3.1e-4, high), Coefficient("A", 7.5, 7.4, 7.6), Coefficient("alpha", 0.082, 0.08, 0.084))  # fmt: skip
     fit = PowerFit(("training steps",), ("t",), coefficients=coefficients)
-    said = describe_fits([curve_fit(fit, SimpleNamespace(value=np.array([3.14, 4.4])))], None, [], "")
+    fitted = curve_fit(fit, SimpleNamespace(value=np.array([3.14, 4.4])))
+    said = describe_fits([fitted], None, [], "")
     assert "<td class=text>L = 7.5 x<sup>\u22120.082</sup></td>" in said
     assert f"<td class=text>0 (at the bound){interval}</td>" in said and "0.00031" not in said
     assert fit.formula() == "L = 0.00031 + 7.5 x^-0.082"  # as predictions keep it
+    formula, constant, _ = with_constant(fitted)  # as `hma fit` prints it
+    assert (formula, constant) == ("L = 7.5 x^-0.082", "0 (at the bound)")
 
 
 @pytest.fixture(autouse=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from experiments.cli.main import main
 from experiments.running.attempts import PROGRESS, STARTED, attempt
-from experiments.running.workspace import Workspace, save_record
+from experiments.running.workspace import Workspace, command_at, save_record
 from tests.experiments.fakes import finished_study, record_of
 
 
@@ -56,6 +57,23 @@ def test_a_study_whose_data_are_being_prepared_says_so(tmp_path: Path, capsys):
     with Workspace(tmp_path).locked():
         assert main(["status", str(tmp_path)]) == 2
     assert f"no trial yet: process {os.getpid()} on" in capsys.readouterr().err
+
+
+def test_the_command_of_a_study_that_was_moved_names_where_it_is(tmp_path: Path, capsys, monkeypatch):
+    """It named the old path, where it began another study."""
+    monkeypatch.chdir(tmp_path)
+    words = "hma study --preset smoke --out {0} --set axes=width,{0}/axes/own.py"
+    there = replace(record_of(), command=words.format("/old/place"))
+    assert command_at(Path("runs/a b"), there) == (
+        "hma study --preset smoke --out 'runs/a b' --set 'axes=width,runs/a b/axes/own.py'"
+    )
+    here = replace(there, command=words.format(tmp_path / "new"))
+    assert command_at(Path("new"), here) == here.command  # not moved
+    plain = replace(there, command="hma study --preset smoke")
+    assert command_at(Path("runs/smoke"), plain) == plain.command
+    (tmp_path / "new").mkdir()
+    save_record(Workspace(tmp_path / "new"), plain)
+    assert "to go on: hma study --preset smoke --out new" in said(capsys, "new")
 
 
 def test_no_command_is_named_where_what_is_missing_diverged(tmp_path: Path, capsys):

@@ -80,7 +80,7 @@ def test_the_law_of_best_sizes_stands_under_exponents(monkeypatch, tmp_path, cap
     assert command(tmp_path) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert lines[0].index("N_opt ~ C^0.500") == head.index("exponents")
-    assert "by three sizes N_opt ~" in lines[1] and "C^0.600" in lines[2] and "another exponent" in lines[2]
+    assert "by three sizes N_opt ~ C^0.600" in lines[1] and "another exponent" in lines[2]
 
 
 def predict(root, *words):
@@ -102,6 +102,7 @@ def test_the_command_shows_the_fit(before, capsys):
     assert command(before) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "trunk parameters" in shown and ("alpha 0.4" in shown or "alpha 0.5" in shown)
+    assert re.search(r"E [\d.]+ \[[\d.]+, [\d.]+\]", shown)
 
 
 def test_a_prediction_comes_true(root, capsys):
