@@ -136,6 +136,10 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
     tokenise = shlex.split(here.removeprefix("next: hma "))
     small = ["--set", "tokenizer_train.steps=1", "--set", "store.min_val=2"]
     assert main([*tokenise, *small]) == 0
+    write_rlds(tmp_path / "data", make_spec("another_robot"), [12] * 4)
+    for name, out in (("my_robot", "runs/cpu"), ("another_robot", "runs/cpu_another_robot")):  # runs/cpu is taken
+        assert main(["data", "inspect", f"data/{name}", *arguments]) == 0
+        assert f"next: hma tokenize --preset cpu --out {out} --data " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("damaged, limit", [(1, ""), (17, " --set store.max_skipped=17")])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.text import Text
 
 from experiments.presets import ON_ACCELERATORS, get_preset
+from experiments.running.workspace import Workspace
 from experiments.study_setup import Preset, StudyArguments, command
 from experiments.terminal.program import PROGRAM
 from experiments.terminal.progress import console
@@ -66,7 +68,20 @@ def tokenize_command(
     arguments = StudyArguments(
         preset_name, data=tuple(facts.directory for facts in datasets), registry=registry, set=settings
     ).anywhere()
+    if out := _another_out(arguments.out, [facts.name for facts in datasets]):
+        arguments = replace(arguments, out=out)
     return command("tokenize", *arguments.words())
+
+
+def _another_out(default: Path, names: Sequence[str]) -> Path | None:
+    """Where to tokenise datasets if the `default` directory has tokens of others, which a command there would be
+    refused for; None if it has none."""
+    from data_pipelines.registry import find_reader
+    from data_pipelines.tokens.manifest import FILE
+
+    asked = {name if (known := find_reader(name)) is None else known.name for name in names}
+    there = {path.parent.name for path in Workspace(default).store.glob(f"*/{FILE}")}
+    return default.with_name(f"{default.name}_{min(asked)}") if there - asked else None
 
 
 def print_next(words: str, name: str = "") -> None:
