@@ -155,7 +155,7 @@ def verdict(effect: Effect, names: Sequence[str]) -> str:
     """In words."""
     change = effect.better
     if change is None:
-        return "ignored" if effect.ignored else "as recorded"
+        return "no effect found" if effect.ignored else "as recorded"
     if change.kind == "negated":
         return "negated"
     if change.kind == "swapped":

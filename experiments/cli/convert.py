@@ -144,7 +144,10 @@ def from_safetensors(directory: Annotated[Positional[Path], arg(metavar="DIR")],
     run = read_neutral(directory)
     write_run(run, out)
     _describe(run)
-    wrote(out, about=f"`hma evaluate {_quoted(out)} --preset PRESET --out OUT` evaluates it, with those of its study")
+    wrote(
+        out,
+        about=f"`hma evaluate {_quoted(out)} --preset PRESET --out OUT` evaluates it, with the preset and --out of its study",
+    )
 
 
 @convert_app.command(name="to-stablehlo")

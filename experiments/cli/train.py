@@ -449,10 +449,13 @@ def say_data(trial: Trial, prepared: PreparedData) -> None:
     chosen = select_windows(prepared.store, loader_of(trial))
     used = [chosen.sets[name] for name in chosen.mixture.names]
     episodes = sum(len(prepared.store.manifest(name).train.episodes) for name in trial.datasets)
+    windows = sum(map(len, used))
+    passes = trial.train.steps * trial.train.batch / max(windows, 1)
     limit = "" if trial.max_trajectories is None else f" (at most {trial.max_trajectories:,} of each robot)"
     console.print(
         f"training on {len(used)} of {counted(len(trial.datasets), 'robot')}: {sum(len(s.episodes) for s in used):,} of "
-        f"{episodes:,} trajectories{limit}, {sum(map(len, used)):,} windows of {trial.model.frames} frames",
+        f"{episodes:,} trajectories{limit}, {windows:,} windows of {trial.model.frames} frames, each "
+        f"seen {passes:,.{0 if passes >= 10 else 1}f} times on average",
         soft_wrap=True,
     )
     for name, reason in chosen.mixture.dropped.items():

@@ -129,13 +129,15 @@ def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before:
     hours = devices.each * trials / 3600
     held = f"{hours:,.{0 if hours >= 100 else 1}f} device-hours"
     judged = "to train and to evaluate, sampler steps included" if evaluated else "to train"
-    shared = "" if len(plans) == 1 else " Training that trials share is counted once."
+    several = len(plans) > 1
+    shared = " Training that trials share is counted once." if several else ""
+    control = " 'Control': trained on shuffled actions." if several else ""
     return (
         f"{whole}. {_flops(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
         f"{_flops(study.flops_per_second)}/s each (flops_per_second); {held} "
         f"with {study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). "
         f"Checkpoints: {size_of(sum(map(checkpoint_bytes, plans)))}.{shared} 'One robot': parameters with a single "
-        "embodiment of 2 action dimensions. 'Videos' are per dataset. 'Control': trained on shuffled actions."
+        f"embodiment of 2 action dimensions. 'Videos' are per dataset.{control}"
     )
 
 

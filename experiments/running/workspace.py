@@ -244,7 +244,7 @@ def load_record(workspace: Workspace) -> Record:
             else ""
         )
         raise ConfigError(
-            f"no study in {workspace.root} (it has no {workspace.record.name}){of_train}; start one with "
+            f"no study in {workspace.root} (it has no {workspace.record.name}){of_train}; start a study with "
             f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
         )
     require(

@@ -147,7 +147,8 @@ def test_the_plan_prices_the_devices_that_trials_run_on(capsys, monkeypatch):
         ("--launcher slurm --launcher-set gpus=8", "for 8 devices at 100.0 EFLOP/s each (flops_per_second); 40.0 dev"),
     ):
         assert main([*plan, *more.split()]) == 0
-        assert said in " ".join(capsys.readouterr().out.split())
+        printed = " ".join(capsys.readouterr().out.split())
+        assert said in printed and "'Control': trained on shuffled actions." in printed
 
 
 def test_several_devices_are_as_many_times_faster():

@@ -69,7 +69,10 @@ def test_all_trajectories_unless_told_otherwise(train, tmp_path):
     """The smoke study has at most 4 of each robot; no sweep's bound holds for a single model."""
     said, trial, _ = train()
     assert trial.max_trajectories is None
-    assert "training on 1 of 2 robots: 10 of 13 trajectories, 30 windows of 4 frames" in said
+    assert (
+        "training on 1 of 2 robots: 10 of 13 trajectories, 30 windows of 4 frames, each seen 0.4 times on average"
+        in said
+    )
     assert f"\nlogs: {tmp_path / 'run'} (tensorboard --logdir {tmp_path / 'run'})\n" in said
     assert list((tmp_path / "run" / "tensorboard").iterdir())
     assert (
@@ -92,6 +95,7 @@ def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch,
         assert main([*dry, *more.split()]) == 0
         printed = " ".join(capsys.readouterr().out.split())
         assert "1 trial of 3 steps" in printed and " to evaluate" not in printed and said in printed
+        assert "'Control'" not in printed, "one model has no such trial"
     monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", tuple("01234567")))
     assert main([*dry, *"--coordinator host0:29400 --processes 2 --process 1".split()]) == 0
     assert "priced for 16 devices at" in " ".join(capsys.readouterr().out.split())

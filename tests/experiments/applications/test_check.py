@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.applications.check import choose_robots, shortage
+from experiments.applications.check import choose_robots, shortage, verdict
 from experiments.cli.check import check
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
+from hma_jax.evaluation.effects import Difference, Effect
 from tests.data_pipelines.windows.test_evalset import small_store
 from tests.experiments.applications.runs import make_run
 
@@ -87,3 +88,8 @@ def test_a_policy_has_no_frames_to_be_judged(tmp_path):
         ConfigError, match="'policy', which predicts no frames, so there are none to judge. .*`hma evaluate`"
     ):
         check(policy)
+
+
+@pytest.mark.parametrize(("sem", "said"), [(0.034, "no effect found"), (0.004, "as recorded")])
+def test_a_dimension_with_too_little_data_is_not_called_ignored(sem, said):
+    assert verdict(Effect(0, Difference(0.039, sem, 8), None, None), ["x"]) == said
