@@ -67,7 +67,7 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
     lines = []
     for c in own:
         e = c.expected
-        where = f"{e.x} beside {e.against}" if e.against else e.x
+        where = f"{e.x} minus {e.against}" if e.against else e.x
         for what, seeds in (("seed {}", e.seeds), ("seed {} known before", e.known)):
             where += f", {what.format(', '.join(map(str, seeds)))}" if seeds else ""
         predicted = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")

@@ -237,7 +237,7 @@ def test_the_page_shows_both_at_the_axis(study):
     assert "Of 1 of them, 1 of which hold, some seeds were known by then." in of_axis
     assert (
         "not planned" in of_axis
-        and "8 beside 16, seed 0 known before" in of_axis
+        and "8 minus 16, seed 0 known before" in of_axis
         and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
     )
     assert "<strong>Wide</strong> pays &lt;script&gt;." in of_axis and "<td>1</td>" in of_axis
