@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shlex
 from contextlib import suppress
 from pathlib import Path
@@ -417,9 +418,20 @@ def _train(setup: StudySetup, trial: Trial, run: Path, options: RunOptions, **st
     if not is_writer():
         return
     loss = f"{result.losses[-1]:.4f}" if result.losses else "unknown (the log is lost)"
-    console.print(f"loss {loss} after {counted(steps, 'step')}")
+    console.print(f"loss {loss} after {counted(steps, 'step')}{_held_out(run)}")
     profiles = _say_profiled(run, options.trace or 0, result.resumed_from, steps)
     wrote(run, *profiles, then=setup.command("evaluate", run.absolute()))
+
+
+def _held_out(run: Path) -> str:
+    """The latest held-out loss of a run, and its lowest, after which the run may have overfitted; '' without any."""
+    file = run / "validation.jsonl"
+    seen = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    if not seen:
+        return ""
+    best = min(seen, key=lambda line: line["loss"])
+    lowest = f", lowest {best['loss']:.4f} at step {best['step']:,}" if best["step"] != seen[-1]["step"] else ""
+    return f"; held-out loss {seen[-1]['loss']:.4f}{lowest}"
 
 
 def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:

@@ -198,11 +198,18 @@ def test_checkpoints_are_saved_by_the_minute_and_kept_as_asked_for(train, tmp_pa
     ("asked", "steps"), [("", list(range(2, 41, 2))), pytest.param("30", [30, 40], marks=pytest.mark.slow), ("0", [])]
 )
 def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, steps, train, tmp_path):
-    train("--set", "train.steps=40", *(["--validate-every", asked] if asked else []))
+    said, _, _ = train("--set", "train.steps=40", *(["--validate-every", asked] if asked else []))
     file = tmp_path / "run" / "validation.jsonl"
     lines = [json.loads(line) for line in file.read_text().splitlines()] if steps else []
     assert [line["step"] for line in lines] == steps and file.exists() == bool(steps)
     assert all(0 < line["loss"] < 10 and 0 <= line["accuracy"] <= 1 for line in lines)
+    if steps:
+        losses = {line["step"]: line["loss"] for line in lines}
+        best = min(losses, key=losses.get)
+        assert f"held-out loss {losses[steps[-1]]:.4f}" in said
+        assert (f"lowest {losses[best]:.4f} at step {best}" in said) == (best != steps[-1])
+    else:
+        assert "held-out" not in said
     assert train.phases[0] == "training"
     assert train.phases[-1] == (f"training, held-out loss {lines[0]['loss']:.4f}" if steps else "training")
 
