@@ -51,24 +51,18 @@ def status(
     names = titles(plan_sweeps(record.study, record.axes, workspace.root), record.provenance)
     states = read_states(list(names), workspace.trials, Ledger(workspace.ledger))
     counts = Counter(state.event for state in states.values())
-    order = [
-        RUNNING,
-        *sorted(counts.keys() - {RUNNING, FINISHED, MISSING}),
-        *((FINISHED, MISSING) if everything else ()),
-    ]
+    words = {event: event for event in counts} | {MISSING: "not begun"}
+    order = [RUNNING, *sorted(counts.keys() - {RUNNING, FINISHED, MISSING})] + [FINISHED, MISSING] * everything
     table = Table("trial", "state", "done", "on", "directory", title=short(study), title_justify="left")
     for event in order:
-        for id, state in states.items():
-            if state.event == event:
-                table.add_row(
-                    names[id], state.event, *_place(workspace.trials / id, state), short(workspace.trials / id)
-                )
+        for id in (id for id, state in states.items() if state.event == event):
+            directory = workspace.trials / id
+            where = str(directory.relative_to(workspace.root))
+            table.add_row(names[id], words[event], *_place(directory, states[id]), where)
     if table.row_count:
         console.print(table)
-    others = [f"{n:,} {event if event != MISSING else 'not begun'}" for event, n in counts.items() if event != FINISHED]
-    console.print(
-        f"{counts[FINISHED]:,} of {counted(len(names), 'trial')} finished" + "".join(f", {o}" for o in others)
-    )
+    others = [f"{n:,} {words[event]}" for event, n in counts.items() if event != FINISHED]
+    console.print(", ".join([f"{counts[FINISHED]:,} of {counted(len(names), 'trial')} finished", *others]))
     for id, state in states.items():
         if state.message:
             console.print(Text(f"{names[id]}: {state.message}"), soft_wrap=True)
