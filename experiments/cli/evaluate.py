@@ -84,8 +84,6 @@ def evaluate_model(
 
 
 def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: bool) -> None:
-    import jax
-
     from experiments.running.provenance import closure_hash, trial_closure
     from experiments.running.run_trial import evaluate_on, open_prepared_data, write_evaluation
     from hma_jax.evaluation.parts import Parts
@@ -132,7 +130,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     # may have other weights at the same step.
     weights = read_list(run / CHECKPOINTS / str(trained.step))
     depends = lambda: [made_from.identity(), weights, protocol.batch, to_dict(execution), closure_hash(trial_closure())]
-    parts = Parts(place / EVALUATING, depends) if jax.process_count() == 1 else None
+    parts = Parts(place / EVALUATING, depends)
     with step(f"evaluate {short(run)}") as update:
         evaluation = evaluate_on(
             names,
@@ -158,8 +156,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     write_evaluation(place, evaluation)
     write_file(place / MEANS, to_strict_json(summary.to_dict()))
     made_from.save(place, STAMP)
-    if parts is not None:
-        parts.remove()
+    parts.remove()
     wrote(place / MEANS, place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
 
 

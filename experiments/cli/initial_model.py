@@ -1,20 +1,22 @@
 """The trained model that a training run begins with: the study that follows from its architecture, tokenizer and
-robots."""
+robots, and what the run remembers of it."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from experiments.cli.evaluate import check_tokenizer, tokenizer_mismatch
 from experiments.running.workspace import Workspace
 from experiments.study_setup import StudyArguments, StudySetup, make_setup
-from experiments.terminal.progress import short
+from experiments.terminal.progress import say, short
 from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.config.json import diff
+from hma_jax.training.run_lock import CHECKPOINTS
 
 if TYPE_CHECKING:
     from hma_jax.training.runs import Run
@@ -88,3 +90,56 @@ def _find_tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Pa
     found = next((place for place in places if not tokenizer_mismatch(trained, tokenizers[place])), places[0])
     check_tokenizer(trained, tokenizers[found], advice)
     return found
+
+
+def newest_description(run: Path) -> tuple[int, dict[str, Any]]:
+    """(step, description) of the newest checkpoint of a run that says what it is; (0, {}) without any."""
+    from hma_jax.training.reading import CheckpointError, list_steps, read_description
+
+    checkpoints = run.absolute() / CHECKPOINTS
+    for newest in reversed(list_steps(checkpoints)):
+        with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
+            return newest, read_description(checkpoints / str(newest))
+    return 0, {}
+
+
+def origin_of(run: Path, initial: Run | None) -> dict[str, Any] | None:
+    """The origin of a run: step and provenance of the model `initial` that it begins with. Of a run that exists, those
+    that it began with, which may be an earlier step of that model; None without an initial model. Raises ConfigError
+    for a run that began with another one."""
+    _, described = newest_description(run)
+    origin = None if initial is None else {"step": initial.step, "provenance": initial.provenance}
+    if "table" not in described:  # it has not begun, or is none, of which the restoring speaks
+        return origin
+    taken, place = described["provenance"].get("origin"), "give the new run a directory of its own with --run NEW"
+    if taken is None or origin is None:
+        began, how = "with the weights of another model", "name that model again, as `hma train --from` or `hma adapt`"
+        if taken is None:
+            began, how = "by itself, not with the weights of another model", "leave out --from"
+        require(taken == origin, f"{short(run)} began {began}: {how}, or {place}")
+        return None
+    lines = diff(taken["provenance"], origin["provenance"])
+    lines += [f"step: {taken['step']:,} -> {origin['step']:,}"] if taken["step"] > origin["step"] else []
+    require(
+        not lines,
+        f"{short(run)} began with another model than the one that is asked for (there -> asked for): "
+        f"{'; '.join(lines)}; name that one, or {place}",
+    )
+    if taken["step"] < origin["step"]:
+        say(
+            f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and "
+            "goes on from its own checkpoint"
+        )
+    return taken
+
+
+def load_initial(source: Path, run: Path) -> Run:
+    """The trained model in `source`. Where that was removed and `run` began with it, what the run recorded of it, which
+    with its own checkpoint is enough to go on."""
+    from hma_jax.training.runs import load_run
+
+    origin = None if source.exists() else newest_description(run)[1].get("provenance", {}).get("origin")
+    if origin is None:
+        return load_run(source, "auto")
+    say(f"note: {short(source)} is gone; {short(run)} goes on from its own checkpoint, and was not compared with it")
+    return dataclasses.replace(load_run(run), step=origin["step"], provenance=origin["provenance"])

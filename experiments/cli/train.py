@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,10 @@ from experiments.cli.arguments import ModelOptions, ReplaceOptions, SavingOption
 from experiments.cli.hosts import Hosts
 from experiments.cli.initial_model import (
     known_datasets,
+    load_initial,
     new_datasets,
+    newest_description,
+    origin_of,
     require_known,
     require_other_directory,
     setup_of,
@@ -29,8 +31,7 @@ from experiments.sweeps.sweep import reference_trial
 from experiments.terminal.progress import console, say, short, step, wrote
 from experiments.terminal.words import counted, few
 from hma_jax.config import require
-from hma_jax.config.json import diff
-from hma_jax.training.run_lock import CHECKPOINTS, require_plain
+from hma_jax.training.run_lock import require_plain
 
 if TYPE_CHECKING:
     from experiments.running.run_trial import PreparedData
@@ -70,7 +71,7 @@ def train(
     if not dry_run:
         hosts.join()
     run = model.directory() or arguments.anywhere().out / "model"
-    trained = None if initial is None else _load_initial(initial, run)
+    trained = None if initial is None else load_initial(initial, run)
     setup = make_setup(arguments) if trained is None else setup_of(initial, trained, arguments)
     _say_swept(setup)
     _say_average(setup)
@@ -168,7 +169,7 @@ def adapt_model(
     from experiments.running.run_trial import open_prepared_data
 
     run = run or arguments.anywhere().out / "model"
-    trained, gone = _load_initial(source, run), not source.exists()
+    trained, gone = load_initial(source, run), not source.exists()
     setup = setup_of(source, trained, arguments)
     study = setup.study
     # Of a source that is gone `run` itself is read, which has the new robots already.
@@ -202,7 +203,7 @@ def adapt_model(
 def _check(
     setup: StudySetup, run: Path, trajectories: int | None, options: RunOptions, initial: Run | None
 ) -> dict[str, Any] | None:
-    """The origin of the run (`_origin_of`). Raises ConfigError, before any work, for invalid options and for a run that
+    """The origin of the run (`origin_of`). Raises ConfigError, before any work, for invalid options and for a run that
     was not trained here, or began with another model."""
     from experiments.dry_run.trainable import require_only
     from hma_jax.training.optimizer import check_schedule
@@ -215,7 +216,7 @@ def _check(
     require_only(setup.study.train, setup.study.dataset_names(), setup.study.rate)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setup, run)
-    return _origin_of(run, initial)
+    return origin_of(run, initial)
 
 
 def _require_free(setup: StudySetup, run: Path) -> None:
@@ -244,7 +245,7 @@ def _require_no_trial(setup: StudySetup, run: Path) -> None:
 
 def _require_trained_here(setup: StudySetup, run: Path) -> None:
     """Raises ConfigError for a run that was converted: it was trained on no data that training could go on with."""
-    step, described = _newest(run)
+    step, described = newest_description(run)
     # What has no table is no model, of which the restoring speaks too. Training saves nothing before its first step:
     # weights of step 0 are another run's, under its description perhaps (`hma convert from-safetensors`).
     require(
@@ -252,59 +253,6 @@ def _require_trained_here(setup: StudySetup, run: Path) -> None:
         f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
         f"{setup.command('train', '--from', run)} --run NEW",
     )
-
-
-def _newest(run: Path) -> tuple[int, dict[str, Any]]:
-    """(step, description) of the newest checkpoint of a run that says what it is; (0, {}) without any."""
-    from hma_jax.training.reading import CheckpointError, list_steps, read_description
-
-    checkpoints = run.absolute() / CHECKPOINTS
-    for newest in reversed(list_steps(checkpoints)):
-        with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
-            return newest, read_description(checkpoints / str(newest))
-    return 0, {}
-
-
-def _origin_of(run: Path, initial: Run | None) -> dict[str, Any] | None:
-    """The origin of a run: step and provenance of the model `initial` that it begins with. Of a run that exists, those
-    that it began with, which may be an earlier step of that model; None without an initial model. Raises ConfigError
-    for a run that began with another one."""
-    _, described = _newest(run)
-    origin = None if initial is None else {"step": initial.step, "provenance": initial.provenance}
-    if "table" not in described:  # it has not begun, or is none, of which the restoring speaks
-        return origin
-    taken, place = described["provenance"].get("origin"), "give the new run a directory of its own with --run NEW"
-    if taken is None or origin is None:
-        began, how = "with the weights of another model", "name that model again, as `hma train --from` or `hma adapt`"
-        if taken is None:
-            began, how = "by itself, not with the weights of another model", "leave out --from"
-        require(taken == origin, f"{short(run)} began {began}: {how}, or {place}")
-        return None
-    lines = diff(taken["provenance"], origin["provenance"])
-    lines += [f"step: {taken['step']:,} -> {origin['step']:,}"] if taken["step"] > origin["step"] else []
-    require(
-        not lines,
-        f"{short(run)} began with another model than the one that is asked for (there -> asked for): "
-        f"{'; '.join(lines)}; name that one, or {place}",
-    )
-    if taken["step"] < origin["step"]:
-        say(
-            f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and "
-            "goes on from its own checkpoint"
-        )
-    return taken
-
-
-def _load_initial(source: Path, run: Path) -> Run:
-    """The trained model in `source`. Where that was removed and `run` began with it, what the run recorded of it, which
-    with its own checkpoint is enough to go on."""
-    from hma_jax.training.runs import load_run
-
-    origin = None if source.exists() else _newest(run)[1].get("provenance", {}).get("origin")
-    if origin is None:
-        return load_run(source, "auto")
-    say(f"note: {short(source)} is gone; {short(run)} goes on from its own checkpoint, and was not compared with it")
-    return dataclasses.replace(load_run(run), step=origin["step"], provenance=origin["provenance"])
 
 
 def _require_devices(setup: StudySetup) -> None:
