@@ -1,4 +1,4 @@
-"""`hma data convert` and `hma data import-tokens` from the command line."""
+"""`hma data convert`, `export` and `import-tokens` from the command line."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import pytest
 from data_pipelines.tokens.store import TokenStore
 from experiments.cli.main import main
 from tests.data_pipelines.convert.sources import hand, write_epic, write_lerobot, write_robomimic
+from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.data_pipelines.tokens.test_import_tokens import write_folder
 
 FORMATS = ("robomimic", "lerobot", "epic-kitchens", "ego4d", "egoexo4d")
 
 
-@pytest.mark.parametrize("command", ["convert", *(f"convert {f}" for f in FORMATS), "import-tokens"])
+@pytest.mark.parametrize("command", ["convert", *(f"convert {f}" for f in FORMATS), "export", "import-tokens"])
 def test_help_of_every_command(command, capsys):
     with pytest.raises(SystemExit) as end:
         main(["data", *command.split(), "--help"])
@@ -48,6 +49,18 @@ def test_a_conversion_says_what_it_wrote_the_entry_and_what_is_next(tmp_path, ca
     assert f"wrote {tmp_path}/rlds/robomimic_lift/1.0.0" in out
     assert f"next: hma data inspect {tmp_path}/rlds/robomimic_lift/1.0.0\n" in out
     assert main(command) == 0 and "3 episodes" in said(capsys)  # found done
+
+
+def test_an_export_says_what_it_wrote_and_what_is_lacking(tmp_path, capsys):
+    place = write_rlds(tmp_path, make_spec("toy"), [3, 4])
+    command = ["data", "export", str(place), "--out", str(tmp_path / "new")]
+    assert main(command) == 2 and "its files do not say how many frames a second it has" in capsys.readouterr().err
+    assert main([*command, "--hz", "4"]) == 0
+    out = said(capsys)
+    assert "2 episodes, 7 frames at 4 Hz" in out and "action: 3 values of action" in out
+    assert "note: there is no observation.state" in out and f"next: hma data inspect {tmp_path}/new\n" in out
+    assert main(["data", "inspect", str(tmp_path / "new"), "--out", str(tmp_path / "seen")]) == 0
+    assert main([*command, "--hz", "5"]) == 2 and "with other settings" in capsys.readouterr().err
 
 
 def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):

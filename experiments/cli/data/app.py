@@ -5,11 +5,12 @@ from __future__ import annotations
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.cli.command_line import Commands
 from experiments.cli.data import convert, registry, sim
+from experiments.cli.data.export import data_export
 from experiments.cli.data.view import view
 from experiments.study_setup import make_setup
 from experiments.terminal.progress import wrote
 
-HELP = "List, inspect, view, convert and simulate datasets."
+HELP = "List, inspect, view, convert, export and simulate datasets."
 
 CONVERT_HELP = (
     "Convert other formats into an RLDS directory, for other programs: this one also reads LeRobot and robomimic "
@@ -41,6 +42,7 @@ data_app.command(name="inspect")(registry.data_inspect)
 data_app.command(name="view")(view)
 data_app.command(name="suite")(suite)
 data_app.command(name="import-tokens")(convert.import_tokens)
+data_app.command(name="export")(data_export)
 data_app.command(name="sim")(sim.data_sim)
 data_app.command(name="sim-table")(sim.data_sim_table)
 data_app.command(convert_app, name="convert", help=CONVERT_HELP)

@@ -1,0 +1,1 @@
+"""Writing any `EpisodeSource` in a format that other programs train on."""

@@ -1,0 +1,79 @@
+"""Which fields of a source become which features of a LeRobot dataset."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from data_pipelines.sources.rlds.schema import field_slice, step_key
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.source import EpisodeSource
+
+ACTION, STATE = "action", "observation.state"
+
+USED = re.compile(r"steps/(?:observation/|action)")
+"""Vectors that are written; besides them sources have flags, rewards and embeddings of texts."""
+
+STATES = ("observation/state", "observation/proprio")
+"""What sources call the robot's state; the first that there is becomes `observation.state`."""
+
+
+@dataclass(frozen=True)
+class LeRobotFields:
+    """Features by the names that LeRobot gives them.
+
+    `cameras`: the flat key of each. `vectors`: the keys that are concatenated to each, which may be sliced
+    ("steps/action[:7]"). `names`: of the values of each vector.
+    """
+
+    cameras: Mapping[str, str]
+    vectors: Mapping[str, tuple[str, ...]]
+    names: Mapping[str, tuple[str, ...]]
+
+
+def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequence[str] = ()) -> LeRobotFields:
+    """All cameras and vectors of `source`; `action` and `state` are the keys, relative to a step, of what becomes
+    `action` and `observation.state`, where other fields of these names are left out. By default the field `action` or
+    `actions`, or all `action/...`; and one of STATES.
+
+    Raises ConfigError for unknown keys, and for a source without a camera.
+    """
+    images = [key for key, feature in source.features.items() if feature.camera]
+    numbers = {key: f.size for key, f in source.features.items() if f.size and not f.image and not f.encoding}
+    vectors = [key for key in numbers if USED.match(key) and "embedding" not in key]
+    require(bool(images), f"{source.location}: it has no camera, so it cannot be written as a LeRobot dataset")
+    actions = [step_key(key) for key in action] or default_actions(vectors)
+    states = [step_key(key) for key in state] or [step_key(key) for key in STATES if step_key(key) in vectors][:1]
+    source.check_keys(images[0], [*actions, *states])
+    chosen = {ACTION: tuple(actions), STATE: tuple(states)}
+    taken = {field_slice(key)[0] for key in (*actions, *states)}
+    chosen = {**{_feature(key): (key,) for key in vectors if key not in taken}, **chosen}
+    chosen = {name: keys for name, keys in chosen.items() if keys}
+    names = {
+        name: tuple(value for key in keys for value in _value_names(key, numbers)) for name, keys in chosen.items()
+    }
+    return LeRobotFields({_camera(key): key for key in images}, chosen, names)
+
+
+def default_actions(keys: Sequence[str]) -> list[str]:
+    """The flat keys of an action, by their names."""
+    one = [key for key in map(step_key, ("action", "actions")) if key in keys][:1]
+    return one or [key for key in keys if key.startswith(step_key("action/"))]
+
+
+def _value_names(key: str, sizes: Mapping[str, int]) -> list[str]:
+    field, part = field_slice(key)
+    name, numbers = field.rpartition("/")[2], range(sizes[field])[part]
+    return [name] if sizes[field] == 1 else [f"{name}_{i}" for i in numbers]
+
+
+def _camera(key: str) -> str:
+    return f"observation.images.{key.removeprefix('steps/').removeprefix('observation/').replace('/', '_')}"
+
+
+def _feature(key: str) -> str:
+    return key.removeprefix("steps/").replace("/", ".")
