@@ -321,8 +321,6 @@ def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:
     )
     if not latents:
         sizes = {"factors": tokenizer.factors, "factor_vocab": tokenizer.factor_vocab}
-    elif study.model.diffusion.token_channels == tokenizer.token_channels:
-        sizes = {}
     else:
         patch = tokenizer.patch if isinstance(tokenizer, Latents) else 1
         cells = tokenizer.token_channels // patch**2

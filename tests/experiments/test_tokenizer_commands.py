@@ -118,6 +118,7 @@ def test_importing_again_overwrites_nothing(tmp_path, capsys):
         ("paper", Magvit2Config(), {"tokens": 256, "factors": 2, "factor_vocab": 512}),
         ("cpu", TokenizerConfig(image_size=64, bits=8), {"tokens": 64, "factors": 2, "factor_vocab": 16}),
         ("smoke-continuous", SvdVaeConfig(), {"tokens": 256, "channels": 4, "patch": 2}),
+        ("cpu-continuous", SvdVaeConfig(), {"tokens": 256, "channels": 4, "patch": 2}),  # as many values as its own
         ("smoke-continuous", SvdVaeConfig(patch=1), {"tokens": 1024, "channels": 4, "patch": 1}),
         ("smoke-continuous", PixelsConfig(), {"tokens": 64, "channels": 3, "patch": 8}),
     ],
