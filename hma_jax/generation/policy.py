@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
 from hma_jax.kernels.random import Tag
+from hma_jax.model.given import Array, checked_window
 from hma_jax.model.hma import HMA, Outputs
 from hma_jax.model.teacher_forcing import teacher_forcing_mask
 from hma_jax.objective.diffusion import sample
@@ -16,10 +17,10 @@ from hma_jax.objective.process import make_process, sampling_process
 
 def predict_actions(
     model: HMA,
-    frames: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
-    action_hidden_BT: jax.Array,
+    frames: Array,
+    actions_BTU: Array,
+    embodiment_B: Array,
+    action_hidden_BT: Array,
     key_B: jax.Array,
     decode: DecodeConfig,
     *,
@@ -30,8 +31,10 @@ def predict_actions(
 
     As a policy a frame's chunk is predicted from frames up to it and what is shown of the
     actions; with `causally` False from the whole window (inverse dynamics), of which frames that are not
-    `real_BT` (None: all are) are no part. Padding is 0.
+    `real_BT` (None: all are) are no part. Padding is 0. Raises ConfigError as `next_frame_outputs`, and for a model
+    without an action head.
     """
+    frames = _checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT)
     count = frames.shape[1]
     visible = None if causally else bidirectional_mask(count, real_BT)
     hidden = model.align_hidden(action_hidden_BT, frames.shape[:2])
@@ -41,9 +44,9 @@ def predict_actions(
 
 def predict_next_actions(
     model: HMA,
-    frames: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
+    frames: Array,
+    actions_BTU: Array,
+    embodiment_B: Array,
     key_B: jax.Array,
     decode: DecodeConfig,
 ) -> jax.Array:
@@ -51,8 +54,9 @@ def predict_next_actions(
     actions before.
 
     One pass. With causal alignment no frame is shown its own chunk; otherwise the window is followed by a copy of
-    itself whose actions are hidden, under the mask of teacher forcing.
+    itself whose actions are hidden, under the mask of teacher forcing. Raises ConfigError as `predict_actions`.
     """
+    frames = _checked_window(model, frames, actions_BTU, embodiment_B, None)
     batch, count = frames.shape[:2]
     if model.config.action_alignment == "causal":
         nothing = jnp.zeros((batch, count), bool)
@@ -72,6 +76,13 @@ def predict_next_actions(
     features_BTD = out.action_features_BTD
     own = out._replace(action_features_BTD=None if features_BTD is None else features_BTD[:, count:])
     return read_actions(model, own, embodiment_B, key_B, decode)
+
+
+def _checked_window(
+    model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, action_hidden_BT: Array | None
+) -> Array:
+    given = (frames, actions_BTU, embodiment_B, action_hidden_BT)
+    return checked_window(model.config, model.table, *given, shortest=1, subject="actions")
 
 
 def read_actions(

@@ -5,11 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import DecodeConfig, require
-from hma_jax.config.base import require_shapes
+from hma_jax.config import DecodeConfig
 from hma_jax.generation.decoding import Frame, decode_frame
 from hma_jax.generation.rollout import fold_in
-from hma_jax.model.given import Array, as_frames, require_keys, require_known
+from hma_jax.model.given import Array, checked_window, require_keys
 from hma_jax.model.hma import HMA, Outputs, causal_mask
 from hma_jax.model.teacher_forcing import teacher_forced_pass
 
@@ -78,23 +77,8 @@ def next_frames(
 def _checked_window(
     model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, action_hidden_BT: Array | None
 ) -> Array:
-    """`frames` in the type that the model takes; ConfigError if they, or what comes with them, are not the model's."""
-    batch_time, most = frames.shape[:2], model.config.frames
-    wanted = {
-        "frames": (*batch_time, *model.config.frame_shape),
-        "chunks": (*batch_time, model.table.action_width),
-        "robots": batch_time[:1],
-    }
-    if action_hidden_BT is not None:
-        wanted["hidden"] = batch_time
-    found = {"frames": frames, "chunks": actions_BTU, "robots": embodiment_B, "hidden": action_hidden_BT}
-    require_shapes("next frames are predicted of", found, wanted)
-    require(
-        2 <= frames.shape[1] <= most,
-        f"next frames are predicted in windows of 2 to {most} frames, got {frames.shape[1]}; cut longer episodes",
-    )
-    require_known(model.config, model.table, frames, actions_BTU, embodiment_B)
-    return as_frames(model.config, frames)
+    given = (frames, actions_BTU, embodiment_B, action_hidden_BT)
+    return checked_window(model.config, model.table, *given, shortest=2, subject="next frames")
 
 
 def _fully_masked_pass(

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import ModelConfig, require
+from hma_jax.config.base import require_shapes
 from hma_jax.model.embodiments import EmbodimentTable
 
 Array = jax.Array | np.ndarray
@@ -53,6 +54,38 @@ def as_frames(config: ModelConfig, frames: Array) -> Array:
     kind, dtype = (jnp.floating, jnp.float32) if config.diffusion else (jnp.integer, jnp.int32)
     require(jnp.issubdtype(frames.dtype, kind), f"this model's frames are {dtype.__name__}, got {frames.dtype}")
     return frames.astype(dtype)
+
+
+def checked_window(
+    config: ModelConfig,
+    table: EmbodimentTable,
+    frames: Array,
+    actions_BTU: Array,
+    embodiment_B: Array,
+    action_hidden_BT: Array | None,
+    *,
+    shortest: int,
+    subject: str,
+) -> Array:
+    """A recorded window's frames in the type that the model takes. Raises ConfigError, which begins with `subject`, for
+    fewer than `shortest` frames, for more than the model's, and for shapes that fit neither the model nor each other;
+    as `require_known` for unknown values."""
+    batch_time, most = frames.shape[:2], config.frames
+    wanted = {
+        "frames": (*batch_time, *config.frame_shape),
+        "chunks": (*batch_time, table.action_width),
+        "robots": batch_time[:1],
+    }
+    if action_hidden_BT is not None:
+        wanted["hidden"] = batch_time
+    found = {"frames": frames, "chunks": actions_BTU, "robots": embodiment_B, "hidden": action_hidden_BT}
+    require_shapes(f"{subject} are predicted of", found, wanted)
+    require(
+        shortest <= frames.shape[1] <= most,
+        f"{subject} are predicted in windows of {shortest} to {most} frames, got {frames.shape[1]}; cut longer episodes",
+    )
+    require_known(config, table, frames, actions_BTU, embodiment_B)
+    return as_frames(config, frames)
 
 
 def require_keys(key_B: jax.Array, batch: int) -> None:

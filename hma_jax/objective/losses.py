@@ -188,17 +188,18 @@ def frame_diffusion_loss(
     process = make_process(config.steps)
     shift, cap = (config.time_shift, config.weight_cap) if training else (1.0, 0.0)
 
-    def one(key: jax.Array, z: jax.Array, x0: jax.Array) -> jax.Array:
-        time, noise = draw_noise(key, x0.shape, config.steps, shift)
-        mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z), x0, time, noise, process)
+    x0 = tokens_BTSC.astype(jnp.float32)
+
+    def noised_copy(r: int) -> jax.Array:
+        keys = jax.vmap(lambda key: jax.random.fold_in(key, r))(key_B)
+        time, noise = jax.vmap(lambda key: draw_noise(key, x0.shape[1:], config.steps, shift))(keys)
+        mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z_BTSD), x0, time, noise, process)
         if cap:
             mse *= jnp.asarray(process.noise_over_signal(cap), jnp.float32)[time]
         return mse + vb
 
     # The trunk's work is shared by all noised copies of a token.
-    keys = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]
-    x0 = tokens_BTSC.astype(jnp.float32)
-    return jnp.stack([jax.vmap(one)(key, z_BTSD, x0) for key in keys]).mean(axis=0)
+    return jnp.stack([noised_copy(r) for r in range(config.repeats)]).mean(axis=0)
 
 
 def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float = 1.0) -> tuple[jax.Array, jax.Array]:

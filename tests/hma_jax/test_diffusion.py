@@ -257,6 +257,19 @@ def test_the_loss_of_a_token_is_the_mean_over_repeats_that_noise_it_anew():
     assert np.all(np.abs(each[0] - each[1]) > 1e-4)
 
 
+def test_the_gradient_of_a_weight_is_one_product_over_all_tokens_of_a_batch():
+    """With a product for each example XLA's CPU compiler runs the sum over them as a slow loop."""
+    config = shallow_config(diffusion=DiffusionConfig(channels=3, patch=1, width=8, depth=1))
+    declared = declare_model(config, TABLE)
+    z, x0, keys = jnp.zeros((2, 3, 4, config.width)), jnp.ones((2, 3, 4, 3)), jax.random.split(jax.random.key(0), 2)
+
+    def loss(params):
+        return frame_diffusion_loss(declared.merge(params), z, x0, keys, training=True).sum()
+
+    program = jax.jit(jax.grad(loss)).lower(declared.init(0)).as_text()
+    assert program.count("dot_general") > 10 and "batching_dims" not in program
+
+
 def test_shifted_steps_are_drawn_as_often_as_the_shift_says():
     """P(time < t) = u with k u / (1 + (k - 1) u) = t / steps; without a shift, evenly."""
     key, shape = jax.random.key(0), (20_000, 1)

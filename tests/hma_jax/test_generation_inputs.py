@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig
-from hma_jax.generation import advance, next_frame_outputs, next_frames, rollout, start
+from hma_jax.generation import (
+    advance,
+    next_frame_outputs,
+    next_frames,
+    predict_actions,
+    predict_next_actions,
+    rollout,
+    start,
+)
 from tests.tiny import TABLE, lively_params, model_config, shallow_config
 
 
@@ -147,3 +155,28 @@ def test_next_frames_are_predicted_of_nothing_that_the_model_does_not_know(chang
     if "keys" not in changes:
         with pytest.raises(ConfigError, match=message):
             jax.eval_shape(lambda p: next_frame_outputs(declared.merge(p), *window, hidden), params)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": 7}, "actions are predicted in windows of 1 to 6 frames, got 7; cut longer episodes"),
+        ({"ids": 64}, "got ids from 64 to 64, but the model allows 0 to 63"),
+        ({"robot": 3}, "got robots from 3 to 3, but the model allows 0 to 2"),
+        ({"width": 13}, r"actions are predicted of chunks \(1, 6, 14\), got \(1, 6, 13\)"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_actions_are_predicted_in_windows_that_the_model_knows(changes, message):
+    """Beyond the window and for unknown robots they were not a number; for unknown ids they were numbers."""
+    given = {"frames": 6, "ids": 0, "robot": 0, "width": 14} | changes
+    declared, params = lively_params(model_config())
+    window = (
+        np.full((1, given["frames"], 9), given["ids"], np.int32),
+        np.zeros((1, given["frames"], given["width"]), np.float32),
+        np.full(1, given["robot"], np.int32),
+    )
+    hidden, keys = np.zeros((1, given["frames"]), bool), jax.random.split(jax.random.key(0), 1)
+    for predict, more in ((predict_actions, (hidden, keys)), (predict_next_actions, (keys,))):
+        with pytest.raises(ConfigError, match=message):
+            jax.eval_shape(lambda p, f=predict, m=more: f(declared.merge(p), *window, *m, DecodeConfig()), params)
