@@ -7,16 +7,20 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/study
 PRESET ?= cpu
-WORKERS ?= 2
 PORT ?= 8765
 EXTRA ?=
+COMMA := ,
+GIVEN := $(subst $(COMMA), ,$(EXTRA))
 ifneq ($(EXTRA),)
 EXTRAS := $(shell sed -n '/^.project.optional/,/^\[/s/^\([a-z0-9]*\) = .*/\1/p' pyproject.toml)
-COMMA := ,
-ifneq ($(word 2,$(EXTRA))$(filter-out $(EXTRAS),$(subst $(COMMA), ,$(EXTRA))),)
+ifneq ($(word 2,$(EXTRA))$(filter-out $(EXTRAS),$(GIVEN)),)
 $(error EXTRA is '$(EXTRA)': give any of $(EXTRAS), separated by commas without spaces, or leave it out)
 endif
 endif
+
+# Trials at a time: two on a processor, and one on GPUs or TPU chips, which it has for itself.
+OF_PROCESSORS := smoke smoke-continuous cpu cpu-full cpu-continuous cpu-full-continuous play
+WORKERS ?= $(if $(filter cuda cuda12 tpu,$(GIVEN))$(filter-out $(OF_PROCESSORS),$(PRESET)),1,2)
 
 # What is imported is compiled once and kept in .venv: hundreds of processes of the tests would each compile it again.
 unexport PYTHONDONTWRITEBYTECODE

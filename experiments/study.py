@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
 
+PROCESSOR = 1e12
+"""FLOP/s of one device that no processor sustains."""
+
 
 @dataclass(frozen=True)
 class SuiteConfig:
@@ -255,6 +258,11 @@ class Study:
             f"tokenizer makes {channels}; set model.diffusion.patch=1 and "
             f"model.diffusion.channels={channels}, or tokenizer.bits={diffusion.token_channels}",
         )
+
+    @property
+    def for_accelerators(self) -> bool:
+        """Whether its estimates are for devices that are faster than any processor."""
+        return self.flops_per_second >= PROCESSOR
 
     def dataset_names(self) -> tuple[str, ...]:
         """Every dataset of the study, in the order in which the datasets axis adds them."""

@@ -21,7 +21,7 @@ import pytest
 from tyro.extras import SubcommandApp
 
 from experiments.cli import main as program
-from experiments.presets import get_preset
+from experiments.presets import PRESETS, get_preset
 from experiments.user_input.override import override
 
 ROOT = Path(__file__).parents[1]
@@ -217,6 +217,17 @@ def test_make_install_takes_the_extras_that_there_are(extra, said, tmp_path):
         assert done.returncode and f"EXTRA is '{extra}': give any of cuda cuda12 tpu remote convert " in done.stderr
     else:
         assert not done.returncode and said in done.stdout
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+def test_make_study_runs_one_trial_at_a_time_where_trials_have_an_accelerator(tmp_path):
+    """Two shared a GPU, each with less than half of its memory, and could not share a TPU chip."""
+    expected = {(name, ""): 1 if study.for_accelerators else 2 for name, study in PRESETS.items()}
+    expected |= {("cpu", "cuda"): 1, ("cpu", "convert,tpu"): 1, ("cpu", "slurm"): 2}
+    for (preset, extra), workers in expected.items():
+        words = ["make", "-n", "study", f"PRESET={preset}", f"EXTRA={extra}", f"VENV={tmp_path}"]
+        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert f"hma study --preset {preset} --out runs/study --workers {workers}\n" in done.stdout
 
 
 def test_blocks_are_read_as_a_shell_does():

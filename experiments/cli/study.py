@@ -93,7 +93,9 @@ def _run(
         given, trained = bool(setup.data), setup.tokenizer is None
         if given:
             check_entries(setup.study, setup.data)
-        each = check_launched(setup.study, sweeps, launcher_options) * launcher_options.cores_each()
+        each = check_launched(setup.study, sweeps, launcher_options)
+        if not setup.study.for_accelerators:
+            each *= launcher_options.cores_each()
         devices = Devices(each, launcher_options.at_once)
         done = find_done(setup, sweeps, running.retry_failed, running.accept_code)
         console.print(plan_table(setup.study, sweeps, devices, given=given, trained=trained, done=done))

@@ -17,9 +17,6 @@ from experiments.terminal.progress import say
 from experiments.terminal.words import counted, few, in_thousands
 from hma_jax.config import TrainConfig
 
-PROCESSOR = 1e12
-"""FLOP/s of one device that no processor sustains: a study with more is made for accelerators."""
-
 
 def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
     """One line on the largest model of `trials`, and another preset where this one is made for a processor."""
@@ -62,7 +59,7 @@ def say_average(configs: Iterable[TrainConfig]) -> None:
 def say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> None:
     """A line where a study for accelerators trains its tokenizer on this machine without one, while its trials run on
     others."""
-    elsewhere = launcher_options.name != "local" and setup.study.flops_per_second >= PROCESSOR
+    elsewhere = launcher_options.name != "local" and setup.study.for_accelerators
     made = setup.tokenizer is not None or setup.workspace.tokenizer.exists()
     if elsewhere and not made and find_accelerators() is None:
         say(

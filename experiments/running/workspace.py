@@ -237,7 +237,8 @@ def load_record(workspace: Workspace) -> Record:
     record = find_record(workspace)
     if record is None:
         names = sorted(place.parent.name for place in workspace.root.glob(f"*/{CHECKPOINTS}"))
-        single = [name for name in names if name != workspace.tokenizer.name]
+        # An unfinished tokenizer is called tokenizer.ID.
+        single = [name for name in names if Path(name).stem != workspace.tokenizer.name]
         of_train = (
             f". There are single runs of `{PROGRAM} train`, whose progress is in their metrics.jsonl: {few(single)}"
             if single

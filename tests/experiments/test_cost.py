@@ -136,13 +136,19 @@ def test_every_launcher_says_which_devices_a_trial_runs_on(gpus, launching, mesh
 
 def test_the_plan_prices_the_devices_that_trials_run_on(capsys, monkeypatch):
     """Before, a rate was that of a whole machine, for each worker."""
+    monkeypatch.setattr(local, "find_accelerators", lambda: None)
     monkeypatch.setattr(registry, "usable_cores", lambda: 4)
-    plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=3600", "--set", "flops_per_second=1e20"]
-    plan += ["--set", "train.batch=8"]
+    plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=3600", "--set", "train.batch=8"]
+    plan += ["--set", "flops_per_second=1e20"]
     for more, said in (
         ("", "priced for 1 device at 100.0 EFLOP/s each (flops_per_second); 5.0 device-hours"),
         ("--workers 4", "priced for 4 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
-        ("--workers 5", "priced for 4 devices, 0.8 for each trial, at 100.0 EFLOP/s each (flops_per_second); 4.0 dev"),
+        # A rate of accelerators, where there is none: they are another machine's, which these cores do not limit.
+        ("--workers 5", "priced for 5 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
+        (
+            "--workers 5 --set flops_per_second=9e11",
+            "priced for 4 devices, 0.8 for each trial, at 900.0 GFLOP/s each (flops_per_second); 4.0 dev",
+        ),
         ("--launcher slurm --launcher-set gpus=8", "if the cluster runs all at the same time"),
         ("--launcher slurm --launcher-set gpus=8", "for 8 devices at 100.0 EFLOP/s each (flops_per_second); 40.0 dev"),
     ):
