@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +19,12 @@ import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError, without_advice
 from data_pipelines.export.fields import LeRobotFields
-from data_pipelines.export.statistics import COMBINED, PixelCounts, Statistics, combine, of_values, quantiles
+from data_pipelines.export.statistics import COMBINED, combine, of_values, quantiles
+from data_pipelines.export.tables import arrow, arrow_type, vectors, write_table
+from data_pipelines.export.video import VideoWriter, pixel_format
 from data_pipelines.json_file import read_object
 from data_pipelines.publishing.files import publish, sync
 from data_pipelines.publishing.output_lock import lock_output
-from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.lerobot import EPISODE, REWARD, SUCCESS, TASK, TIME
 from data_pipelines.sources.source import (
     INSTRUCTION_KEYS,
@@ -52,9 +52,6 @@ FILE_BYTES = 2**31
 CHUNK = 1000
 """Files in a folder."""
 
-SAMPLED = 128
-"""At most about so many frames of an episode are counted in the statistics of a camera."""
-
 FRAME, INDEX, DONE, END = "frame_index", "index", "next.done", "dataset_to_index"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -62,9 +59,6 @@ EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 ORIGIN = "meta/origin.json"
 NUMBER = "source_episode"
 """Column of `meta/episodes`: the episode's number in the source."""
-
-ENCODING = {"crf": "18", "g": "2", "bf": "0"}
-"""Every second frame can be decoded alone: policies are trained on frames in random order."""
 
 Progress = Callable[[int, int, str], None]
 """Called with (episodes of the source that were read, of how many, a note)."""
@@ -189,7 +183,7 @@ class _Writer:
         steps = len(next(iter(frames.values())))
         for name, of in frames.items():
             if not steps or len(of) != steps or isinstance(of, np.ndarray):
-                raise unusable(f"{self._fields.cameras[name]!r} has {len(of)} frames of {steps}")
+                raise unusable(f"{self._fields.cameras[name]!r} has {len(of)} frames of {steps}.")
         columns = {
             name: join_actions(record, keys, self._source.features, steps, unusable)
             for name, keys in self._fields.vectors.items()
@@ -197,7 +191,7 @@ class _Writer:
         if REWARD_KEY in record:
             rewards = np.asarray(record[REWARD_KEY], np.float32).reshape(-1, 1)
             if len(rewards) != steps:
-                raise unusable(f"it has {len(rewards)} rewards for {steps} steps")
+                raise unusable(f"it has {len(rewards)} rewards for {steps} steps.")
             columns[REWARD] = rewards
         last = (np.arange(steps) == steps - 1)[:, None]
         columns[DONE] = last
@@ -206,22 +200,25 @@ class _Writer:
         columns[FRAME] = np.arange(steps)[:, None]
         columns[TIME] = (columns[FRAME] / self._hz).astype(np.float32)
         dtypes = {name: values.dtype.name for name, values in columns.items()}
-        self._dtypes = self._dtypes or dtypes
-        if dtypes != self._dtypes:
-            lacking = ", ".join(sorted(self._dtypes.keys() ^ dtypes.keys()))
-            raise unusable(f"it differs from the first one: only one of them has {lacking}")
-        for name, of in frames.items():  # decoded here, before anything of the episode is written
-            self._check(name, of, unusable)
+        if lacking := dtypes.keys() ^ (self._dtypes or dtypes).keys():
+            raise unusable(f"it differs from the first one: only one of them has {', '.join(sorted(lacking))}.")
+        # Every frame is decoded here, before anything of the episode is written.
+        shapes = {name: self._shape(name, of, unusable) for name, of in frames.items()}
+        self._dtypes, self._shapes = dtypes, shapes
         return _Episode(i, columns, frames, _texts(record, steps))
 
-    def _check(self, camera: str, frames: Sequence[SourceFrame], unusable: Callable[[str], Exception]) -> None:
+    def _shape(
+        self, camera: str, frames: Sequence[SourceFrame], unusable: Callable[[str], EpisodeError]
+    ) -> tuple[int, ...]:
+        """(H, W, 3) of every frame, in this episode and those before."""
         shape = self._shapes.get(camera)
         for step, frame in enumerate(frames):
-            found = decode_frame(frame, lambda what, step=step: unusable(f"step {step} of {camera!r} {what}")).shape
-            shape = self._shapes.setdefault(camera, found)
+            found = decode_frame(frame, lambda what, step=step: unusable(f"step {step} of {camera!r} {what}.")).shape
+            shape = shape or found
             if found != shape:
                 sizes = " and ".join(f"{height} x {width}" for height, width, _ in (shape, found))
-                raise unusable(f"frames of {camera!r} have two sizes ({sizes}), but a LeRobot video has one")
+                raise unusable(f"frames of {camera!r} have two sizes ({sizes}), but a LeRobot video has one.")
+        return shape
 
     # --- writing ---------------------------------------------------------------------------------
 
@@ -251,7 +248,13 @@ class _Writer:
         place = _place(self._files)
         data, rows, begin = self._root / DATA.format(**place), [], self._frames
         with ExitStack() as stack:
-            writer, videos = None, {name: _Video(self._root, name, place, self._hz) for name in self._fields.cameras}
+            writer, videos = (
+                None,
+                {
+                    name: VideoWriter(self._root / VIDEO.format(video_key=name, **place), self._hz)
+                    for name in self._fields.cameras
+                },
+            )
             for episode in episodes:
                 index, steps, start = self._episodes + len(rows), len(episode.texts), self._frames
                 columns = {
@@ -262,11 +265,11 @@ class _Writer:
                 }
                 if writer is None:
                     data.parent.mkdir(parents=True, exist_ok=True)
-                    schema = pa.schema([(name, _arrow_type(values)) for name, values in columns.items()])
+                    schema = pa.schema([(name, arrow_type(values)) for name, values in columns.items()])
                     writer = stack.enter_context(pq.ParquetWriter(data, schema))
                     for video in videos.values():
                         stack.enter_context(video)
-                writer.write_table(pa.table([_arrow(values) for values in columns.values()], schema=schema))
+                writer.write_table(pa.table([arrow(values) for values in columns.values()], schema=schema))
                 found = {name: of_values(values) for name, values in columns.items()}
                 found |= {camera: videos[camera].add(frames) for camera, frames in episode.frames.items()}
                 shown = (start - begin) / self._hz, (start - begin + steps) / self._hz
@@ -284,7 +287,7 @@ class _Writer:
             return
         for path in (data, *(video.path for video in videos.values())):
             sync(path)
-        _write_table(self._root / EPISODES.format(**place), pa.Table.from_pylist(rows))
+        write_table(self._root / EPISODES.format(**place), pa.Table.from_pylist(rows))
         self._episodes, self._files = self._episodes + len(rows), self._files + 1
 
     def finish(self, settings: Mapping[str, Any]) -> None:
@@ -310,7 +313,7 @@ class _Writer:
         }
         meta = self._root / "meta"
         tasks = pa.table({"task_index": range(len(self._tasks)), "task": list(self._tasks)})
-        _write_table(meta / "tasks.parquet", tasks.replace_schema_metadata({"pandas": _INDEXED_BY_TASK}))
+        write_table(meta / "tasks.parquet", tasks.replace_schema_metadata({"pandas": _INDEXED_BY_TASK}))
         write_file(meta / "stats.json", to_strict_json({name: self._statistics(name) for name in features}))
         write_file(meta / "info.json", to_strict_json(info))
         left_out = sum(run.count for run in self._source.runs) - self._episodes
@@ -333,7 +336,7 @@ class _Writer:
                 "video.height": height,
                 "video.width": width,
                 "video.codec": "h264",
-                "video.pix_fmt": _pixel_format(height, width),
+                "video.pix_fmt": pixel_format(height, width),
                 "video.fps": self._hz,
                 "video.channels": channels,
                 "video.is_depth_map": False,
@@ -352,7 +355,7 @@ class _Writer:
         found = dict(combine([{key: np.asarray(row[column]) for key, column in keys.items()} for row in rows]))
         if feature in self._fields.vectors:
             files = (self._root / DATA.format(**_place(number)) for number in range(self._files))
-            found |= quantiles(np.concatenate([_vectors(pq.read_table(f, columns=[feature])[feature]) for f in files]))
+            found |= quantiles(np.concatenate([vectors(pq.read_table(f, columns=[feature])[feature]) for f in files]))
         return {key: value.tolist() for key, value in found.items()}
 
 
@@ -366,47 +369,6 @@ _INDEXED_BY_TASK = to_strict_json({
     "pandas_version": "2.2.0",
 })  # fmt: skip
 """pandas, with which LeRobot reads the tasks, takes this column for the index."""
-
-
-class _Video:
-    """The video of one camera in one file, while it is written."""
-
-    def __init__(self, root: Path, camera: str, place: Mapping[str, int], hz: float):
-        self.path = root / VIDEO.format(video_key=camera, **place)
-        self._rate = Fraction(hz).limit_denominator(1000)
-
-    def __enter__(self) -> _Video:
-        av = require_module("av", "writing videos")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(self.path), "w", format="mp4")
-        self._stream = self._container.add_stream("libx264", rate=self._rate, options=dict(ENCODING))
-        self._begun = False
-        return self
-
-    def add(self, frames: Sequence[SourceFrame]) -> Statistics:
-        """Adds the frames of the next episode; returns their statistics."""
-        import av
-
-        counts, every = PixelCounts(), max(len(frames) // SAMPLED, 1)
-        for step, frame in enumerate(frames):
-            image = decode_frame(frame, ValueError)
-            if not self._begun:
-                self._stream.height, self._stream.width = image.shape[:2]
-                self._stream.pix_fmt, self._begun = _pixel_format(*image.shape[:2]), True
-            if step % every == 0:
-                counts.add(image)
-            self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        return counts.statistics()
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None and self._begun:
-            self._container.mux(self._stream.encode())
-        self._container.close()
-
-
-def _pixel_format(height: int, width: int) -> str:
-    """Colours at half the size, which every player decodes, need even sizes."""
-    return "yuv444p" if height % 2 or width % 2 else "yuv420p"
 
 
 def _place(number: int) -> dict[str, int]:
@@ -424,42 +386,3 @@ def _texts(record: Mapping[str, Any], steps: int) -> list[str]:
         if len(texts) == steps and isinstance(texts[0], bytes):
             return [text.decode(errors="replace") for text in texts]
     return [""] * steps
-
-
-def _arrow_type(values: np.ndarray) -> pa.DataType:
-    """The type of a column [N, size]; LeRobot stores vectors of one value as numbers."""
-    import pyarrow as pa
-
-    number, size = pa.from_numpy_dtype(values.dtype), values.shape[1]
-    return number if size == 1 else pa.list_(number, size)
-
-
-def _arrow(values: np.ndarray) -> pa.Array:
-    import pyarrow as pa
-
-    flat = pa.array(values.ravel())
-    return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-
-
-def _vectors(column: pa.ChunkedArray) -> np.ndarray:
-    """float32 [N, size]; the reverse of `_arrow`."""
-    rows = len(column)
-    return np.concatenate(
-        [np.asarray(chunk.flatten() if _is_list(chunk) else chunk) for chunk in column.chunks]
-    ).reshape(rows, -1)
-
-
-def _is_list(chunk: pa.Array) -> bool:
-    import pyarrow as pa
-
-    return pa.types.is_fixed_size_list(chunk.type) or pa.types.is_list(chunk.type)
-
-
-def _write_table(path: Path, table: pa.Table) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink)
-    write_file(path, sink.getvalue().to_pybytes())

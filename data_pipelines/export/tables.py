@@ -1,0 +1,52 @@
+"""Columns of vectors in Parquet, as LeRobot stores them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hma_jax.runtime.files import write_file
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def arrow_type(values: np.ndarray) -> pa.DataType:
+    """The type of a column [N, size]; LeRobot stores vectors of one value as numbers."""
+    import pyarrow as pa
+
+    number, size = pa.from_numpy_dtype(values.dtype), values.shape[1]
+    return number if size == 1 else pa.list_(number, size)
+
+
+def arrow(values: np.ndarray) -> pa.Array:
+    import pyarrow as pa
+
+    flat = pa.array(values.ravel())
+    return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def vectors(column: pa.ChunkedArray) -> np.ndarray:
+    """float32 [N, size]; the reverse of `arrow`."""
+    rows = len(column)
+    return np.concatenate(
+        [np.asarray(chunk.flatten() if _is_list(chunk) else chunk) for chunk in column.chunks]
+    ).reshape(rows, -1)
+
+
+def _is_list(chunk: pa.Array) -> bool:
+    import pyarrow as pa
+
+    return pa.types.is_fixed_size_list(chunk.type) or pa.types.is_list(chunk.type)
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    write_file(path, sink.getvalue().to_pybytes())
