@@ -178,7 +178,8 @@ def _write_results(judged: Judgement, counts: Mapping[str, Count] | None, out: P
     """Tables, figure and pages of a judgement; `counts` of the real robot; `again`: the command that repeats it."""
     from experiments.applications.judging.blind import write_blind
     from experiments.applications.judging.outcomes import write_outcomes
-    from experiments.applications.judging.page import draw_scatter, write_page
+    from experiments.applications.judging.page import write_page
+    from experiments.applications.judging.scatter import draw_scatter
     from experiments.applications.judging.summary import summarise, write_summary
 
     summary = summarise(judged, counts)
@@ -193,14 +194,7 @@ def _write_results(judged: Judgement, counts: Mapping[str, Count] | None, out: P
 
 
 def _print_summary(summary: dict) -> None:
-    from experiments.applications.judging.page import (
-        NOTHING,
-        describe_clipping,
-        describe_control,
-        describe_few_policies,
-        describe_head,
-        describe_recorded_head,
-    )
+    from experiments.applications.judging.doubts import NOTHING, describe_head, describe_recorded_head, doubts_of_rates
     from experiments.applications.judging.summary import shown
 
     columns = list(next(iter(summary["policies"].values())))
@@ -210,13 +204,7 @@ def _print_summary(summary: dict) -> None:
     console.print(table)
     agreement = summary["agreement"]
     say(f"The success head. {describe_head(summary)}")
-    for text in (
-        describe_recorded_head(summary["head"]),
-        describe_control(summary),
-        describe_clipping(summary),
-        describe_few_policies(summary),
-        "" if agreement else NOTHING,
-    ):
+    for text in (describe_recorded_head(summary["head"]), *doubts_of_rates(summary), "" if agreement else NOTHING):
         if text:
             say(text)
     if not agreement:

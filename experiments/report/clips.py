@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +40,8 @@ def describe_clips(path: Path, prompt: int, order: Sequence[str]) -> str:
     figures = [_figure(name, kinds, prompt) for name, kinds in clips.items()]
     rest = "".join(figures[SHOWN:])
     more = f"<details class=more><summary>{len(figures) - SHOWN} more robots</summary><div class=trios>{rest}</div></details>"
-    paper = "".join(_strip(name, kinds, prompt) for name, kinds in list(clips.items())[:ON_PAPER])
+    printed = ((name, {KINDS[k]: clip for k, clip in kinds.items()}) for name, kinds in list(clips.items())[:ON_PAPER])
+    paper = "".join(strip(name, rows, prompt) for name, rows in printed)
     return (
         f"<p>The first validation window of each robot. Of its frames the first {prompt} are given (grey bar); the "
         "rest is predicted from actions alone: once from those that were recorded, once from others, drawn at random. "
@@ -86,7 +87,7 @@ def animate(clips: Sequence[np.ndarray], prompt: int) -> bytes:
     return buffer.getvalue()
 
 
-def _strip(name: str, kinds: dict[str, np.ndarray], prompt: int) -> str:
-    """Rows of frames."""
-    rows = "".join(f"<div><span>{KINDS[k]}</span>{frames(clip, prompt)}</div>" for k, clip in kinds.items())
-    return f"<figure class=strip><figcaption>{html.escape(name)}</figcaption>{rows}</figure>"
+def strip(title: str, rows: Mapping[str, np.ndarray], prompt: int) -> str:
+    """Rows of frames, for paper: label -> clip."""
+    lines = "".join(f"<div><span>{label}</span>{frames(clip, prompt)}</div>" for label, clip in rows.items())
+    return f"<figure class=strip><figcaption>{html.escape(title)}</figcaption>{lines}</figure>"

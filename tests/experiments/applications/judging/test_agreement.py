@@ -17,8 +17,8 @@ from experiments.applications.judging.agreement import (
     share,
     spearman,
 )
+from experiments.applications.judging.doubts import describe_few_starts, describe_one_apart
 from experiments.applications.judging.head import auroc
-from experiments.applications.judging.page import describe_few_starts, describe_one_apart
 
 
 def test_measures_of_known_cases():

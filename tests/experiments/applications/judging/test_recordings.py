@@ -19,9 +19,9 @@ from experiments.applications.generating.trajectories import (
     rewards_of_frames,
 )
 from experiments.applications.judging.agreement import agree, agree_with_counts, mean_above
+from experiments.applications.judging.doubts import describe_control, describe_head, describe_recorded_head
 from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
-from experiments.applications.judging.page import describe_control, describe_head, describe_recorded_head
 from experiments.applications.judging.real import read_real
 from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
