@@ -12,6 +12,7 @@ from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
 from experiments.study_setup import StudySetup, command, make_setup
 from experiments.terminal.progress import console, short, step, wrote
+from hma_jax.config import require
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.shared import BaseTokenizer
@@ -84,6 +85,11 @@ def train_tokenizer(setup: StudySetup, replace: Step | None) -> None:
     from experiments.preparing.tokenizer import make_tokenizer
 
     study, workspace = setup.study, setup.workspace
+    require(
+        setup.tokenizer is None,
+        "a tokenizer is given with --tokenizer, so none is trained; to use it: "
+        f"{setup.command('tokenize')}; to train another, leave out --tokenizer",
+    )
     with workspace.locked():
         sources = find_sources(study, setup.data) if setup.data else make_suite(study, workspace, replace)
         make_tokenizer(study, workspace, sources, replace)

@@ -108,6 +108,21 @@ def test_importing_again_overwrites_nothing(tmp_path, capsys):
     assert (tokenizer / "weights.npz").read_bytes() == before
 
 
+def test_no_tokenizer_is_trained_where_one_is_given(tmp_path, monkeypatch, capsys):
+    """Another one was trained beside it, or the advice was to give it. What comes after the suite says so too."""
+    monkeypatch.chdir(tmp_path)
+    assert hma("tokenizer", "pixels", "--out", "tok", "--image-size", 16, "--patch", 4) == 0
+    given = ("--preset", "smoke-continuous", "--out", "out", "--tokenizer", "tok")
+    assert hma("tokenizer", "train", *given) == 2
+    assert not Path("out").exists()
+    on = f"hma tokenize {' '.join(given)}"
+    said = f"given with --tokenizer, so none is trained; to use it: {on}; to train another, leave out --tokenizer"
+    assert capsys.readouterr().err.strip().endswith(said)
+    monkeypatch.setattr("experiments.preparing.suite.make_suite", lambda *_: [])
+    assert hma("data", "suite", *given) == 0
+    assert capsys.readouterr().out.strip().endswith(on)
+
+
 # --- Studies -----------------------------------------------------------------------------------
 
 

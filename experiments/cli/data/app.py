@@ -26,7 +26,7 @@ def suite(arguments: StudyOptions, replacement: ReplaceOptions) -> None:
     setup = make_setup(arguments)
     with setup.workspace.locked():
         make_suite(setup.study, setup.workspace, replacement.replace)
-    wrote(setup.workspace.suite, then=setup.command("tokenizer train"))
+    wrote(setup.workspace.suite, then=setup.command("tokenize" if setup.tokenizer else "tokenizer train"))
 
 
 convert_app = Commands()
