@@ -11,7 +11,7 @@ from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
 from experiments.study_setup import StudySetup, command, make_setup
-from experiments.terminal.progress import console, short, step, wrote
+from experiments.terminal.progress import console, say, short, step, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -35,28 +35,37 @@ def import_(
     image_size: Annotated[int, arg(name="image-size")] = 256,
     patch: int = 2,
     dtype: Literal["float32", "bfloat16"] = "float32",
+    weights: Literal["last", "ema"] = "last",
 ) -> None:
     """Make a tokenizer from published weights: magvit2.ckpt, or the VAE of Stable Video Diffusion.
 
-    Every tensor must be present, with the shape that the configuration requires; those needed only for training
-    (loss.*, model_ema.*) are left out. No code of a file is run. Give --tokenizer OUT to other commands.
+    Every tensor must be present, with the shape that the configuration requires; the discriminator's (loss.*) are left
+    out. No code of a file is run. Give --tokenizer OUT to other commands.
 
     Args:
-        source: magvit2.ckpt or a safetensors file of it, or a directory of the diffusers library.
+        source: magvit2.ckpt or a safetensors file of it (1X's, or an Open-MAGVIT2 without adaptive normalisation), or a
+            directory of the diffusers library.
         out: Directory to write.
         image_size: Side of the square images in pixels: a multiple of 16.
         patch: VAE only: latent cells along the side of one token; released models take 2.
         dtype: Number format of the computation; bfloat16 is faster on accelerators, and the release used it.
+        weights: MAGVIT2 only: last: the last weights, as the release takes them; ema: their moving average
+            (model_ema.*), with which Open-MAGVIT2 makes its own tokens if it keeps one.
     """
-    from hma_jax.convert import find_reader, read_svd_vae, require_free
+    from hma_jax.convert import find_reader, has_average, read_svd_vae, require_free
 
     require_free(out)
     reader = find_reader(source)
     options = {"image_size": image_size, "compute_dtype": dtype}
     if reader is read_svd_vae:
+        require(weights == "last", f"{source} is a VAE, which has no averaged weights; leave out --weights")
         options["patch"] = patch
+    else:
+        options["weights"] = weights
     with step(f"read {short(source)}"):
         tokenizer = reader(source, **options)
+    if weights == "last" and has_average(source):
+        say("note: averaged weights (model_ema.*) are left out, as the release does; --weights ema reads them instead")
     _write(tokenizer, out)
 
 

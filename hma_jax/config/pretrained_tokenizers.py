@@ -56,7 +56,8 @@ class Latents(TokenGrid):
 
 @dataclass(frozen=True)
 class Magvit2Config(Ids):
-    """The 1X / Open-MAGVIT2 image tokenizer; defaults are the published one (2^18 codes).
+    """The MAGVIT2 image tokenizer of 1X, and of Open-MAGVIT2 without adaptive normalisation; defaults are the one that
+    1X published (2^18 codes).
 
     Reference appendix A. Every level but the last halves the image.
     """

@@ -1,9 +1,9 @@
 """Tokenizers that others trained, read from the files they are published in.
 
-The 1X / Open-MAGVIT2 tokenizer comes as `magvit2.ckpt`, a torch file of a training run, or its tensors
-as safetensors; a directory with a config.json beside them may have other sizes. The VAE of Stable
-Video Diffusion comes as a directory of the diffusers library. Reading is strict: a tensor too few,
-too many or of another shape is refused by name, and no code of a file is run.
+The MAGVIT2 tokenizer, 1X's or an Open-MAGVIT2 without adaptive normalisation, comes as `magvit2.ckpt`, a torch file
+of a training run, or its tensors as safetensors; a directory with a config.json beside them may have other sizes. The
+VAE of Stable Video Diffusion comes as a directory of the diffusers library. Reading is strict: a tensor too few, too
+many or of another shape is refused by name, and no code of a file is run.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,9 +26,10 @@ from hma_jax.model.params import Declared, Params, ParamSpec
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 from hma_jax.tokenizers.shared import BaseTokenizer
 
-IGNORED = ("loss.", "model_ema.")
-"""What a training run of the MAGVIT2 tokenizer keeps besides: discriminator and averaged weights, of
-which the release uses neither."""
+LOSS, AVERAGE, ADAPTIVE = "loss.", "model_ema.", "decoder.adaptive."
+"""Tensors in the file of a MAGVIT2 training, by how their names begin: of the discriminator, which no tokenizer needs;
+the moving average of the weights, under their names without dots, which the release does not use; and what later
+Open-MAGVIT2 models have in their decoder."""
 
 FILES = (
     "diffusion_pytorch_model.safetensors",
@@ -136,10 +137,17 @@ def tokenizer_params(source: Source, declared: Declared, tensors: Mapping[str, S
 # --- Files -----------------------------------------------------------------------------------
 
 
-def read_magvit2(path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtype = "float32") -> Magvit2Tokenizer:
+def read_magvit2(
+    path: Path,
+    *,
+    image_size: ImageSize = 256,
+    compute_dtype: Dtype = "float32",
+    weights: Literal["last", "ema"] = "last",
+) -> Magvit2Tokenizer:
     """From `magvit2.ckpt`, a safetensors file, or a directory of either with config.json.
 
-    `image_size` has to suit the number of levels: any multiple of 2^(levels - 1), 16 for the published one.
+    `image_size` has to suit the number of levels: any multiple of 2^(levels - 1), 16 for the published one. `weights`:
+    the last ones of the training, as the release takes them, or their moving average.
     Raises ConfigError naming what of the file is not as it should be.
     """
     path = Path(path)
@@ -153,9 +161,27 @@ def read_magvit2(path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtyp
     else:
         config = Magvit2Config(**given)
     tensors = read_tensors(path)
-    kept = {name: t for name, t in tensors.items() if not name.startswith(IGNORED)}
+    kept = {name: t for name, t in tensors.items() if not name.startswith((LOSS, AVERAGE))}
+    require(
+        not any(name.startswith(ADAPTIVE) for name in kept),
+        f"{path}: an Open-MAGVIT2 whose decoder has adaptive normalisation ({ADAPTIVE}*), which is not supported; "
+        "supported is the one without, such as 1X's magvit2.ckpt",
+    )
+    if weights == "ema":
+        averages = {name: AVERAGE + name.replace(".", "") for name in kept}
+        lacking = [name for name, average in averages.items() if average not in tensors]
+        require(
+            not lacking,
+            f"{path} has no averaged weights ({AVERAGE}*) for {len(lacking)} of {len(kept)} tensors; read the last ones",
+        )
+        kept = {name: tensors[average] for name, average in averages.items()}
     declared = Magvit2Tokenizer.declare(config)
     return Magvit2Tokenizer(config, tokenizer_params(MAGVIT2, declared, kept, str(path)))
+
+
+def has_average(path: Path) -> bool:
+    """Whether the weights that `read_magvit2` reads have their moving average beside them."""
+    return any(name.startswith(AVERAGE) for name in read_tensors(Path(path)))
 
 
 def read_svd_vae(

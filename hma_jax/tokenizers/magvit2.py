@@ -1,6 +1,6 @@
-"""The networks of the 1X / Open-MAGVIT2 tokenizer: images to latents whose signs are the bits, and back.
+"""The networks of the MAGVIT2 tokenizer: images to latents whose signs are the bits, and back.
 
-Reference appendix A. NHWC throughout.
+Those of 1X, and of Open-MAGVIT2 before its decoder got adaptive normalisation. Reference appendix A. NHWC throughout.
 """
 
 from __future__ import annotations

@@ -18,12 +18,13 @@ from experiments.study import on_tokenizer
 from experiments.user_input.override import override
 from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
 from hma_jax.config.json import from_dict, to_json, to_strict_json
+from hma_jax.convert.tensors import write_safetensors
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.data_pipelines.fakes import write_rlds
 from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensors, write_checkpoint
-from tests.hma_jax.pretrained import write_published
+from tests.hma_jax.pretrained import official_tensors, write_published
 
 ARM = get_spec("berkeley_gnm_cory_hall")
 LENGTHS = [12, 12, 13, 13, 14, 15]
@@ -106,6 +107,20 @@ def test_importing_again_overwrites_nothing(tmp_path, capsys):
     assert hma("tokenizer", "import", tmp_path / "published", "--out", tokenizer) == 2
     assert "exists already" in capsys.readouterr().err
     assert (tokenizer / "weights.npz").read_bytes() == before
+
+
+def test_averaged_weights_are_left_out_with_a_note_or_read_instead(tmp_path, capsys):
+    source = write_published(tmp_path / "published", "magvit2")
+    tensors = official_tensors("magvit2")
+    averages = {f"model_ema.{name.replace('.', '')}": 0.5 * x for name, x in tensors.items()}
+    write_safetensors(source / "model.safetensors", tensors | averages)
+    assert hma("tokenizer", "import", source, "--out", tmp_path / "last", "--image-size", 16) == 0
+    assert "note: averaged weights (model_ema.*) are left out, as the release does" in capsys.readouterr().out
+    arguments = ("--out", tmp_path / "ema", "--image-size", 16, "--weights", "ema")
+    assert hma("tokenizer", "import", source, *arguments) == 0
+    assert "note" not in capsys.readouterr().out
+    last, average = (load_tokenizer(tmp_path / name).params["encoder"]["conv_in"]["kernel"] for name in ("last", "ema"))
+    np.testing.assert_array_equal(average, 0.5 * last)
 
 
 def test_no_tokenizer_is_trained_where_one_is_given(tmp_path, monkeypatch, capsys):

@@ -10,7 +10,7 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.convert import find_reader, read_magvit2
-from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, tokenizer_params, tokenizer_shapes
+from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, has_average, tokenizer_params, tokenizer_shapes
 from hma_jax.convert.tensors import Stored, write_safetensors
 from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
 from tests.hma_jax.convert.test_torch_file import Call, Global, Malicious, state_dict, write_torch
@@ -30,7 +30,8 @@ def checkpoint(folder: Path, others: dict | None = None, tensors: dict | None = 
     (folder / "config.json").write_text(json.dumps(OFFICIAL["magvit2"][1]))
     weights = tensors or official_tensors("magvit2")
     besides = {"loss.logvar": np.zeros(3, np.float32), "model_ema.decay": np.ones((), np.float32)}
-    state, elements = state_dict(weights | besides)
+    averages = {f"model_ema.{name.replace('.', '')}": 0.5 * x for name, x in weights.items()}
+    state, elements = state_dict(weights | besides | averages)
     write_torch(folder / "magvit2.ckpt", {"epoch": 3, "state_dict": state, **(others or {})}, elements)
     return folder
 
@@ -56,6 +57,25 @@ def test_checkpoint_of_a_training_run_is_the_same_tokenizer(tmp_path):
     folder = checkpoint(tmp_path / "a", {"callbacks": {"checkpoint": trainer}, "lr_schedulers": [{"t": 1}]})
     plain = write_published(tmp_path / "b", "magvit2")
     assert small(folder).identity == small(plain).identity
+
+
+def test_averaged_weights_of_a_training_run_are_read_on_request(tmp_path):
+    """Those of the parameters that are read, under their names without dots."""
+    last, plain = checkpoint(tmp_path / "a"), write_published(tmp_path / "b", "magvit2")
+    halved = {name: 0.5 * x for name, x in official_tensors("magvit2").items()}
+    expected = small(checkpoint(tmp_path / "c", tensors=halved))
+    assert read_magvit2(last, image_size=16, weights="ema").identity == expected.identity != small(last).identity
+    assert has_average(last) and not has_average(plain)
+    with pytest.raises(ConfigError, match=r"b has no averaged weights \(model_ema.\*\) for (\d+) of \1 tensors"):
+        read_magvit2(plain, image_size=16, weights="ema")
+
+
+def test_a_decoder_with_adaptive_normalisation_is_refused_as_such(tmp_path):
+    """Later Open-MAGVIT2: a list of names did not tell it from a wrong file."""
+    more = {"decoder.adaptive.0.gamma.weight": np.zeros((8, 6), np.float32)}
+    folder = checkpoint(tmp_path / "a", tensors=official_tensors("magvit2") | more)
+    with pytest.raises(ConfigError, match=r"adaptive normalisation \(decoder.adaptive.\*\), which is not supported"):
+        small(folder)
 
 
 def test_a_file_alone_is_of_the_published_size(tmp_path):
