@@ -27,6 +27,9 @@ from hma_jax.evaluation.windows import WindowTable
 
 DRAWS = 1000
 
+ROUNDED = 1e-12
+"""Share of the largest value: draws that scatter less do so by rounding alone, and are equal."""
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -165,10 +168,13 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list
     quantiles of the draws would be.
     """
     sums, counts, ends = summed = _by_episode(panel)
-    both, by_seed, by_episode = (
-        _resample(panel.seeds, summed, draws, seed, over_seeds=s, over_episodes=e).drawn.std(0, ddof=1)
-        for s, e in ((True, True), (True, False), (False, True))
-    )
+    equal = ROUNDED * np.array([np.abs(values).max() for values in panel.points])
+
+    def scatter(over_seeds: bool, over_episodes: bool) -> np.ndarray:
+        found = _resample(panel.seeds, summed, draws, seed, over_seeds, over_episodes).drawn.std(0, ddof=1)
+        return np.where(found <= equal, 0.0, found)
+
+    both, by_seed, by_episode = scatter(True, True), scatter(True, False), scatter(False, True)
     episodes, value, intervals, row = sums.shape[1], _mean_of_robots(sums, counts, ends), [], 0
     for i, seeds in enumerate(panel.seeds):
         own = slice(row, row + len(seeds))

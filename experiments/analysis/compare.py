@@ -85,6 +85,14 @@ def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
     return np.array_equal(of_a, of_b, equal_nan=True)
 
 
+def other_sequences(side: Side, robots: Sequence[str]) -> list[int]:
+    """Under how many action sequences of other episodes windows of `robots` were evaluated; [] where none says so."""
+    tables = [table.among(robots).metrics for table in side.seeds.values()]
+    chances = [metrics["retrieval_chance"] for metrics in tables if "retrieval_chance" in metrics]
+    found = np.unique(np.concatenate([np.zeros(0), *chances]))
+    return sorted({round(1 / chance) - 1 for chance in found[~np.isnan(found)].tolist()})
+
+
 def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:
     """The difference of one metric, averaged over `robots`; None where no window of either model has it. Raises
     NotComparable, and NoNumbers where the windows of one model alone have it, or where none has a metric that every

@@ -23,8 +23,11 @@ from experiments.sweeps.sweep import POINT
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
 
-METRICS = ("delta_psnr", "action_nats", "retrieval", "counterfactual_gain")
-"""Metrics that are 0 for a deaf model; retrieval is at chance."""
+RETRIEVAL = "retrieval"
+"""A share of windows, which is at chance for a deaf model."""
+
+METRICS = ("delta_psnr", "action_nats", RETRIEVAL, "counterfactual_gain")
+"""The others are 0 for a deaf model."""
 
 FOLLOWING_SEMS = 2.0
 """Standard errors above a deaf model beyond which a robot counts as following actions."""
@@ -82,10 +85,13 @@ def count_following(rows: Iterable[Controllability], metric: str) -> tuple[int, 
     return sum(row.errors > FOLLOWING_SEMS for row in own), len(own)
 
 
-def expected_by_chance(rows: Iterable[Controllability], metric: str) -> float:
-    """How many of these robots would be counted for a deaf model, on average: by Student's t with as many degrees of
-    freedom as episodes less one, since few episodes make a rough standard error. A robot without actions, which has
-    the value of a deaf model in every window, is never counted."""
+def expected_by_chance(rows: Iterable[Controllability], metric: str) -> float | None:
+    """How many of these robots would be counted for a model that follows nothing, on average: by Student's t with as
+    many degrees of freedom as episodes less one, since few episodes make a rough standard error. A robot without
+    actions, which has the value of a deaf model in every window, is never counted. None of retrieval: hits and misses
+    of a few windows are not distributed like that."""
+    if metric == RETRIEVAL:
+        return None
     own = [row for row in rows if row.metric == metric and row.episodes > 1]
     freedom = [row.episodes - 1 for row in own if max(abs(row.mean - row.deaf), row.sem) > ROUNDING]
     return float(stdtr(freedom, -FOLLOWING_SEMS).sum())
@@ -97,9 +103,10 @@ def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, 
     if not known.any():
         return ()
     first = next(iter(tables.values()))
-    deaf = float(np.mean(first.metrics["retrieval_chance"][known])) if metric == "retrieval" else 0.0
+    deaf = float(np.mean(first.metrics["retrieval_chance"][known])) if metric == RETRIEVAL else 0.0
     panel = Panel(first.dataset[known], first.episode[known], (values[:, known],), (tuple(tables),))
     (interval,) = bootstrap_intervals(panel)
+    interval = interval.of_share() if metric == RETRIEVAL else interval
     excess = interval.mean - deaf
     errors = standard_errors(0.0 if abs(excess) < ROUNDING else excess, interval.sem)
     return (

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scipy.special import stdtrit
 
@@ -49,6 +49,19 @@ class Interval:
     def errors(self) -> float:
         """`standard_errors` of the mean."""
         return standard_errors(self.mean, self.sem)
+
+    def of_share(self) -> Interval:
+        """The interval of a mean of shares, each from 0 to 1, which it does not leave.
+
+        Windows that are all 0, or all 1, do not scatter, and Student's t would be sure after a few of them. Their
+        interval is that of Clopper and Pearson 1934 for as many independent trials as there are episodes, all of which
+        failed or succeeded. nan stays nan.
+        """
+        low, high = max(self.low, 0.0), min(self.high, 1.0)
+        if self.sem == 0 and self.mean in (0, 1):
+            beyond = 1 - ((1 - LEVEL) / 2) ** (1 / self.episodes)
+            low, high = (0.0, beyond) if self.mean == 0 else (1 - beyond, 1.0)
+        return replace(self, low=low, high=high)
 
     def exp(self) -> Interval:
         """The interval of exp(x), by transforming the ends: perplexity beside nats, a ratio of perplexities beside a

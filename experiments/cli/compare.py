@@ -84,7 +84,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
 
 def _caption(rows: list[Difference], a: Side, b: Side) -> str:
     """What the errors count, whose training differs, and which seeds, robots and metrics were not compared."""
-    from experiments.analysis.compare import NOT_OF_MODELS
+    from experiments.analysis.compare import NOT_OF_MODELS, other_sequences
     from experiments.analysis.paired import OF_TOKENS
 
     seeds = max((row.seeds for row in rows), default=1)
@@ -112,6 +112,14 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
         caption += f" Steps of training when they were evaluated: {', '.join(made)}."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         caption += f" No error of {few(alone)}: one held-out episode."
+    compared = [row.scope for row in rows if row.metric == "action_nats"]
+    others = [other_sequences(side, compared) for side in (a, b)]
+    if all(others) and others[0] != others[1]:
+        of_a, of_b = (" or ".join(map(str, counts)) for counts in others)
+        caption += (
+            f" Action-nats are over other numbers of sequences: for each window {of_a} of {escape(a.name)}, {of_b} of "
+            f"{escape(b.name)}, the longer list beginning with the shorter one."
+        )
     explained = {row.metric for row in rows} | set(NOT_OF_MODELS)
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
         caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."

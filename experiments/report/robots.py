@@ -171,14 +171,17 @@ def are_sorted(robots: Sequence[Robot]) -> bool:
 
 def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames: bool) -> str:
     lines = [line for robot in robots for line in robot.follows.values()]
-    counted = {m: (*count_following(lines, m), expected_by_chance(lines, m)) for m in follows}
-    parts = [
-        f"{FOLLOWS[m].split(' (')[0]} of {more} of {of} robots (by chance {deaf:.1f})"
-        for m, (more, of, deaf) in counted.items()
-    ]
+
+    def counted(metric: str) -> str:
+        (more, of), chance = count_following(lines, metric), expected_by_chance(lines, metric)
+        beside = "" if chance is None else f" (by chance {chance:.1f})"
+        return f"{FOLLOWS[metric].split(' (')[0]} of {more} of {of} robots{beside}"
+
     order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
     text = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
-    text += f"More than two standard errors above zero are: {'; '.join(parts)}. " if parts else ""
+    if follows:
+        parts = "; ".join(map(counted, follows))
+        text += f"More than two standard errors above a model that ignores actions are: {parts}. "
     if shares:
         text += "<em>Explained by actions</em>: the share of the true change of pixels that actions explain. "
     if "retrieval" in follows:

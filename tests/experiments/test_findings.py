@@ -276,6 +276,18 @@ def test_how_many_robots_a_deaf_model_has_far_from_zero_is_as_findings_say():
     assert f"two or more come in {100 * (1 - none - one):.0f} of 100 cases" in page
 
 
+@pytest.mark.parametrize("study", ["cpu", "cpu-full", "cpu-full-continuous", "cpu-full-horizon"])
+def test_intervals_of_retrieval_are_those_of_a_share(study):
+    """Some reached beyond 1, some had no width at 1, and rounding made errors of 1e-16."""
+    with open(RESULTS / study / "controllability.csv", newline="") as file:
+        rows = [{k: float(r[k]) for k in ("sem", "low", "high", "mean")} for r in csv.DictReader(file)]
+        file.seek(0)
+        retrieval = [row for row, r in zip(rows, csv.DictReader(file), strict=True) if r["metric"] == "retrieval"]
+    assert all(row["sem"] == 0 or row["sem"] > 1e-14 for row in rows)
+    assert retrieval and all(0 <= row["low"] <= row["mean"] <= row["high"] <= 1 for row in retrieval)
+    assert all(row["low"] < row["high"] for row in retrieval if row["mean"] in (0, 1))
+
+
 def test_what_sharing_and_company_cost_is_as_findings_say():
     found, page = gains(), findings().splitlines()
     expected = expectations()

@@ -95,6 +95,15 @@ def test_robots_count_equally_however_many_windows_they_have():
     np.testing.assert_allclose(resample(panel_of("aaabb", episode, [[3] * 5]), 50).drawn, 3)
 
 
+@pytest.mark.parametrize("value", [1.0, 0.1, 1 / 3, -7e5])
+def test_values_that_are_all_equal_have_no_error(value):
+    """Rounding gave them one of 1e-16, and a mean of 1 was 6e15 standard errors from zero."""
+    (interval,) = bootstrap_intervals(panel_of("a" * 8, range(8), np.full((3, 8), value)))
+    assert interval.sem == 0 and interval.low == interval.mean == interval.high == pytest.approx(value)
+    (small,) = bootstrap_intervals(panel_of("a" * 8, range(8), value * (1 + 1e-9 * np.arange(8.0)[None])))
+    assert small.sem > 0
+
+
 def test_half_an_interval_is_the_t_of_each_level_times_its_error():
     seeds = panel_of("aabb", [0, 1, 0, 1], [[0] * 4, [1] * 4, [5] * 4])
     # Each seed finds the episodes of another robot hard; on average over seeds those of both are, three freedoms each.

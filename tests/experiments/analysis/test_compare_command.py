@@ -147,6 +147,21 @@ def test_metrics_that_are_left_out_are_named(table, tmp_path, capsys):
         assert any(metric == "retrieval" for _, metric in rows_of(tmp_path / "c.csv")) == kept
 
 
+@pytest.mark.parametrize(("of_a", "of_b", "said"), [
+    (16, 4, "for each window 15 of a, 3 of b, the longer list beginning with the shorter one."), (4, 4, ""), (4, None, ""),
+])  # fmt: skip
+def test_action_nats_over_other_numbers_of_sequences_are_said_to_be(table, of_a, of_b, said):
+    """They were subtracted without a word."""
+
+    def among(number):
+        chance = {} if number is None else {"retrieval_chance": np.full(len(table), 1 / number)}
+        return {0: replace(table, metrics=table.metrics | {"action_nats": np.ones(len(table))} | chance)}
+
+    a, b = Side("a", among(of_a), ""), Side("b", among(of_b), "")
+    caption = _table(compare(a, b), a, b).caption
+    assert ("Action-nats are over other numbers of sequences" in caption) == bool(said) and said in caption
+
+
 def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path, capsys):
     trial = reference_trial(STUDY, 0)
     a = write_trial(tmp_path / "a", trial, table)

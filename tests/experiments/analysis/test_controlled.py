@@ -48,6 +48,23 @@ def test_a_deaf_model_has_as_many_robots_beyond_as_is_said():
     assert found == pytest.approx(said, abs=3 * said**0.5)
 
 
+def test_hits_of_a_few_windows_are_compared_with_no_number_of_robots():
+    """They are not distributed as Student's t: chance was said to have 1.6 of 40 robots beyond two standard errors, and
+    has 0.03."""
+    rows = controllability({0: model(1.0)}, rate=2.0)
+    assert expected_by_chance(rows, "retrieval") is None
+    assert expected_by_chance(rows, "action_nats") > 0
+
+
+def test_retrieval_that_never_failed_might_have():
+    table = model(1.0)
+    always = replace(table, metrics=table.metrics | {"retrieval": np.ones(len(table))})
+    own = [r for r in controllability({0: always, 1: always}, rate=2.0) if r.metric == "retrieval"]
+    assert len(own) == 3 and all((r.mean, r.sem, r.high, r.errors) == (1, 0, 1, np.inf) for r in own)
+    assert all(r.low == pytest.approx(0.025 ** (1 / 8)) for r in own)
+    assert count_following(own, "retrieval") == (3, 3)
+
+
 def test_a_robot_without_actions_is_never_there_by_chance():
     """It has the value of a deaf model in every window; it was counted as one that might be far from it."""
     table = judged(np.random.default_rng(3), robots=6, episodes=4)

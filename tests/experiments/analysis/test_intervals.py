@@ -29,6 +29,27 @@ def test_few_episodes_need_t_and_windows_are_no_episodes():
     assert hits["normal"] < 0.92 * 400 and hits["windows"] < 0.75 * 400
 
 
+@pytest.mark.parametrize("truth", [0.04, 0.2, 0.8, 0.9, 0.96])
+def test_the_interval_of_a_share_holds_its_truth_where_windows_agree(truth):
+    """Eight windows of eight episodes. Where all succeeded or all failed, Student's t had an interval of no width, and
+    of those that should hold a share of 0.96 in 95 of 100 cases it held 28."""
+    hits, rng = [], np.random.default_rng(0)
+    for _ in range(500):
+        interval = interval_of(mean_and_sem(rng.random(8) < truth, np.arange(8))).of_share()
+        assert 0 <= interval.low < interval.high <= 1
+        hits.append(held(interval, truth))
+    assert np.mean(hits) >= 0.93
+
+
+def test_only_a_share_that_windows_agree_on_is_taken_for_luck():
+    """A model that ignores actions finds the true ones one time in sixteen, in every window."""
+    for share, low, high in ((1 / 16, 1 / 16, 1 / 16), (1.0, 0.025 ** (1 / 8), 1.0), (0.0, 0.0, 1 - 0.025 ** (1 / 8))):
+        interval = interval_of(mean_and_sem(np.full(16, share), np.arange(16) // 2)).of_share()
+        assert (interval.low, interval.high) == pytest.approx((low, high))
+    unknown = interval_of(mean_and_sem([1.0, 1.0], [5, 5])).of_share()
+    assert math.isnan(unknown.low) and math.isnan(unknown.high)
+
+
 @pytest.mark.parametrize(("spread", "share", "holds"), [(0.0, 0.24, 0.93), (1.0, 0.39, 0.89)])
 def test_an_episode_of_most_windows_makes_intervals_narrow(spread, share, holds):
     """As docs/statistics.md says: 24 windows are drawn among eight episodes, whose lengths differ by `spread` in the
