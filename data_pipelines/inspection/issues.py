@@ -34,12 +34,12 @@ def find_issues(
     windows: WindowFacts | None,
     duplicates: Sequence[tuple[Fingerprint, ...]],
 ) -> list[Issue]:
-    """All issues of the sampled episodes. `entry`: how the dataset would be read."""
+    """All issues of the sampled episodes, errors first. `entry`: how the dataset would be read."""
     issues = [*_damaged(facts), *_misfits(facts, entry), *_rate(facts, entry)]
     issues += [*_windows(facts, windows), *_cameras(facts, entry)]
     for field in chosen_actions(facts, entry):
         issues += _actions(field, entry)
-    return [*issues, *_duplicates(duplicates)]
+    return sorted([*issues, *_duplicates(duplicates)], key=lambda issue: issue.severity != "error")
 
 
 def chosen_actions(facts: Facts, entry: DatasetSpec | None) -> list[ActionFacts]:

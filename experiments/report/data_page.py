@@ -47,7 +47,7 @@ CORRECTED = {"rotate_180": "turned by 180 degrees", "swap_red_blue": "red and bl
 PAGE_CSS = """
 .error, .warning { border-left: 4px solid var(--bad); background: var(--soft); border-radius: 4px;
   padding: .45rem .8rem; margin: .4rem 0; max-width: 52rem; overflow-wrap: anywhere; }
-.warning { border-color: #d8902a; } .error b { color: var(--bad); } .fine { color: var(--good); }
+.warning { border-color: #d8902a; color: inherit; } .error b { color: var(--bad); } .fine { color: var(--good); }
 .gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1rem; }
 .episode { background: var(--soft); border-radius: 8px; padding: .7rem; min-width: 0; }
 .episode p { margin: .35rem 0; font-size: .86rem; line-height: 1.35; overflow-wrap: anywhere; }

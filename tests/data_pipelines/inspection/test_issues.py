@@ -67,6 +67,15 @@ def test_constant_actions(tmp_path):
     assert issues_of(tmp_path, change) == {"constant action": "warning: action: value 1 never changes"}
 
 
+def test_errors_come_first(tmp_path):
+    def change(episode, features):
+        features["steps/observation/image"] = [png(np.full((8, 8, 3), 7, np.uint8))] * len(features["steps/action"])
+
+    found = issues_of(tmp_path, change, lengths=[20, 1, 20, 20])
+    severities = [text.partition(":")[0] for text in found.values()]
+    assert {"single steps", "blank camera"} <= found.keys() and severities == sorted(severities), found
+
+
 def test_blank_camera_in_use(tmp_path):
     def change(episode, features):
         features["steps/observation/image"] = [png(np.full((8, 8, 3), 7, np.uint8))] * 20
