@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,17 +12,33 @@ from PIL import Image
 
 from experiments.applications.endurance.films import SHOWN, Film
 from experiments.applications.endurance.tables import Row, over_robots
-from experiments.report.plot_style import CONTROL_LINE, MUTED, STYLE, save, show_legend
+from experiments.report.plot_style import CONTROL_LINE, STYLE, save, show_caption, show_legend
+
+
+class Panel(NamedTuple):
+    title: str
+    reference: str = ""
+    """Measure of `REFERENCE` in the same panel."""
+    ends: tuple[float, float] = (0.0, 1.0)
+    """Range of the measure."""
+
 
 PANELS = {
-    "psnr": ("PSNR against the truth (dB)", "psnr_still", "PSNR of a still picture"),
-    "tool_close": ("tools found where they are (share)", "true_tool_close", "true simulator"),
-    "object_found": ("objects found at all (share)", "", ""),
-    "object_close": ("objects found where they are (share)", "true_object_close", "true simulator"),
-    "follows": ("motion follows commands (correlation)", "true_follows", "true simulator"),
-    "histogram": ("colours differ from the truth's (share)", "", ""),
+    "psnr": Panel("PSNR against the truth (dB)", "psnr_still", (-np.inf, np.inf)),
+    "tool_close": Panel("tools found where they are (share)", "true_tool_close"),
+    "object_found": Panel("objects found at all (share)"),
+    "object_close": Panel("objects found where they are (share)", "true_object_close"),
+    "follows": Panel("motion follows commands (correlation)", "true_follows", (-1.0, 1.0)),
+    "histogram": Panel("colours differ from the truth's (share)"),
 }
-"""Measure -> title, and the reference measure in the same panel with its label."""
+"""By measure. High values are good, but for colours."""
+
+REFERENCE = "true simulator (PSNR: a still picture)"
+
+CAPTION = (
+    "bands: 95 % intervals over robots, by Student's t, cut where shares and correlations end; high values are good, but "
+    "low ones for colours"
+)
 
 
 def draw_curves(rows: Sequence[Row], path: Path) -> None:
@@ -29,19 +46,21 @@ def draw_curves(rows: Sequence[Row], path: Path) -> None:
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(2, 3, figsize=(11, 6), layout="constrained")
         variants = list(dict.fromkeys(str(row["variant"]) for row in rows))
-        for panel, (name, (title, reference, reference_label)) in zip(panels.flat, PANELS.items(), strict=True):
+        for panel, (name, of) in zip(panels.flat, PANELS.items(), strict=True):
+            lowest = 0.0
             for variant in variants:
                 t, mean, half = _curve([row for row in rows if row["variant"] == variant], name)
+                low, high = (np.clip(end, *of.ends) for end in (mean - half, mean + half))
                 (line,) = panel.plot(t, mean, marker="o", markersize=3, label=variant)
-                panel.fill_between(t, mean - half, mean + half, color=line.get_color(), alpha=0.12, linewidth=0)
-            if reference:
-                t, mean, _ = _curve([row for row in rows if row["variant"] == variants[0]], reference)
-                panel.plot(t, mean, **CONTROL_LINE, label=reference_label)
-            panel.set(title=title, xlabel="minutes of simulated time", xlim=(0, None))
-            if name != "psnr":
-                panel.set_ylim(0, 1.02)
-        words = "bands: 95 % intervals over robots, by Student's t, cut where shares and correlations end"
-        figure.supxlabel(words, fontsize=8.5, color=MUTED)
+                panel.fill_between(t, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
+                lowest = np.nanmin([lowest, *low, *mean])
+            if of.reference:
+                t, mean, _ = _curve([row for row in rows if row["variant"] == variants[0]], of.reference)
+                panel.plot(t, mean, **CONTROL_LINE, label=REFERENCE)
+            panel.set(title=of.title, xlabel="minutes of simulated time", xlim=(0, None))
+            if np.isfinite(of.ends).all():
+                panel.set_ylim(lowest - 0.02 * (lowest < 0), 1.02)
+        show_caption(figure, CAPTION)
         show_legend(figure, panels.flat)
         path.parent.mkdir(parents=True, exist_ok=True)
         save(figure, path)
