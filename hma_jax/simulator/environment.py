@@ -13,7 +13,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
@@ -22,7 +23,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from hma_jax.config import require
-from hma_jax.simulator.interface import AnySimulator, Judge, no_judge
+from hma_jax.simulator.interface import Actions, AnySimulator, Judge, no_judge
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -43,11 +44,12 @@ def observation_space(simulator: AnySimulator) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(0, 255, simulator.images.shape[1:], np.uint8)
 
 
+_driven_by: WeakKeyDictionary[AnySimulator, object] = WeakKeyDictionary()
+"""The key of the environment that began the episodes of a simulator; others must not step them."""
+
+
 class _Task:
     """What both environments need: a simulator, one of its robots, where its episodes start and who judges them."""
-
-    loaded_in: ClassVar[int | None] = None
-    """The process in which a run was loaded first; those forked from it have JAX's state, but not its threads."""
 
     def __init__(
         self,
@@ -68,13 +70,8 @@ class _Task:
         require(
             run is not None or not options, f"{told}: only for loading a `run`; a given `simulator` is used unchanged"
         )
+        _refuse_forked(simulator)
         if simulator is None:
-            _Task.loaded_in = _Task.loaded_in or os.getpid()
-            require(
-                _Task.loaded_in == os.getpid(),
-                "this process was forked from one that had loaded a run, and JAX does not work in forked processes: "
-                "leave out vectorization_mode (make_vec then steps all episodes in one batch), or spawn processes",
-            )
             simulator = Simulator.load(run, episodes=episodes, **options)
         require(
             getattr(simulator, "rate", "model") == "model",
@@ -93,7 +90,7 @@ class _Task:
             "recordings",
         )
         robot = names[0] if robot is None else robot
-        self.simulator, self.judge = simulator, judge
+        self.simulator, self.judge, self._key = simulator, judge, object()
         require(robot in names, f"no start of robot {robot!r}; there are starts of {', '.join(names)}")
         self.robot = simulator.robots[robot]
         self.starts = [start for start in starts if start.robot == robot]
@@ -110,7 +107,11 @@ class _Task:
     def begin(
         self, rngs: Sequence[np.random.Generator], episodes: Sequence[int], options: dict[str, Any] | None
     ) -> np.ndarray:
-        """Starts and seeds of `episodes`, a pair drawn from each of `rngs`; `options` may name the start."""
+        """Starts and seeds of `episodes`, a pair drawn from each of `rngs`; `options` may name the start. Once it began
+        all of them, other environments cannot step them."""
+        _refuse_forked(self.simulator)
+        if len(episodes) < len(self.simulator):
+            self._refuse_others_episodes()
         chosen, seeds = [], []
         for rng in rngs:
             drawn = int(rng.integers(len(self.starts)))
@@ -120,9 +121,35 @@ class _Task:
             chosen.append(self.starts[number])
             seeds.append(int(rng.integers(2**32)))
         images = self.simulator.reset(chosen, seeds=seeds, episodes=episodes)
+        _driven_by[self.simulator] = self._key
         if hasattr(self.judge, "begin"):
             self.judge.begin(self.simulator, episodes)
         return images
+
+    def step(self, actions: Actions) -> np.ndarray:
+        """As the simulator's."""
+        self._refuse_others_episodes()
+        return self.simulator.step(actions)
+
+    def _refuse_others_episodes(self) -> None:
+        """They would go on under actions that are not theirs, and look like this environment's."""
+        require(
+            _driven_by.get(self.simulator, self._key) is self._key,
+            "another environment has begun its episodes in this one's simulator, where this one's are lost: give each "
+            "environment a simulator of its own, or leave out vectorization_mode (make_vec then steps all episodes in "
+            "one batch)",
+        )
+
+
+def _refuse_forked(simulator: AnySimulator | None) -> None:
+    """Raises ConfigError where a model (None: one to be loaded) would wait for ever: a process that was forked has
+    JAX's state, but not its threads."""
+    if simulator is None or isinstance(simulator, Simulator):
+        require(
+            Simulator.made_in in (None, os.getpid()),
+            "this process was forked from one that had made a model's simulator, and JAX does not work in forked "
+            "processes: leave out vectorization_mode (make_vec then steps all episodes in one batch), or spawn processes",
+        )
 
 
 class RobotEnv(gymnasium.Env):
@@ -160,9 +187,8 @@ class RobotEnv(gymnasium.Env):
         return self._task.begin([self.np_random], [0], options)[0].copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        simulator = self._task.simulator
-        image = simulator.step([action])[0].copy()
-        rewards, done = self._task.judge(simulator)
+        image = self._task.step([action])[0].copy()
+        rewards, done = self._task.judge(self._task.simulator)
         return image, float(rewards[0]), bool(done[0]), False, {"clipped": self._task.clipped()[0]}
 
     def render(self) -> np.ndarray | None:
@@ -241,7 +267,7 @@ class RobotVectorEnv(VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         simulator, again = self._task.simulator, self._over.copy()
         which = np.flatnonzero(again).tolist()
-        simulator.step([None if b in which else action for b, action in enumerate(actions)])
+        self._task.step([None if b in which else action for b, action in enumerate(actions)])
         info = {"clipped": self._task.clipped(), "_clipped": ~again}
         rewards, done = self._task.judge(simulator)  # before others begin: a start does not count, as after `reset`
         if which:

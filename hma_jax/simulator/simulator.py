@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import copy
 import logging
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import jax
 import numpy as np
@@ -45,6 +46,9 @@ class Simulator:
     again (`counts` is 0 then).
     """
 
+    made_in: ClassVar[int | None] = None
+    """The process in which the first one was made."""
+
     def __init__(
         self,
         model: Model,
@@ -77,6 +81,7 @@ class Simulator:
             decode is None or isinstance(decode, DecodeConfig),
             f"decode must be a DecodeConfig, got {type(decode).__name__}",
         )
+        Simulator.made_in = Simulator.made_in or os.getpid()
         self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
         self.update_robots(robots)

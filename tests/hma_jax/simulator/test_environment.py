@@ -15,7 +15,7 @@ from gymnasium.wrappers.vector import DictInfoToList  # noqa: E402
 
 from data_pipelines.suite.simulator import SuiteSimulator, suite_robot  # noqa: E402
 from hma_jax.config import ConfigError  # noqa: E402
-from hma_jax.simulator import environment  # noqa: E402
+from hma_jax.simulator import Simulator  # noqa: E402
 from hma_jax.simulator.environment import ID, MAX_STEPS, RobotEnv, RobotVectorEnv  # noqa: E402
 from tests.hma_jax.simulator.small import ROBOTS, simulator, start  # noqa: E402
 
@@ -248,10 +248,48 @@ def test_what_cannot_be_made_is_said(options: dict, message: str):
         RobotEnv(**{"simulator": simulator(), "starts": STARTS, "robot": "arm", **options})
 
 
-def test_a_forked_process_does_not_load_a_run_again(monkeypatch, tmp_path):
-    monkeypatch.setattr(environment._Task, "loaded_in", os.getpid() + 1)
-    with pytest.raises(ConfigError, match="forked from one that had loaded a run, .* leave out vectorization_mode"):
-        environment.RobotEnv(tmp_path)
-    monkeypatch.setattr(environment._Task, "loaded_in", os.getpid())
-    with pytest.raises(ConfigError, match="no checkpoints"):
-        environment.RobotEnv(tmp_path)
+def test_environments_that_share_a_simulator_do_not_step_each_other_s_episodes():
+    """All of a vector in mode "sync", or training and evaluation, drove the same one without a word."""
+    train, evaluate = (gymnasium.make(NAME, simulator=sim, starts=STARTS, robot="arm") for sim in [Still(1)] * 2)
+    low = train.action_space.low
+    for one, other in ((train, evaluate), (evaluate, train)):
+        one.reset(seed=0)
+        one.step(low)
+        other.reset(seed=0)
+        with pytest.raises(ConfigError, match="another environment has begun its episodes in this one's simulator"):
+            one.step(low)
+        other.step(low)
+    several = gymnasium.make_vec(
+        NAME, num_envs=2, vectorization_mode="sync", simulator=Still(1), starts=STARTS, robot="arm"
+    )
+    several.reset(seed=0)
+    with pytest.raises(ConfigError, match="simulator of its own, or leave out vectorization_mode"):
+        several.step(several.action_space.sample())
+
+
+def test_a_part_of_a_vector_does_not_begin_in_another_s_simulator():
+    sim = Still(2)
+    first, second = (RobotVectorEnv(2, simulator=sim, starts=STARTS, robot="arm") for _ in range(2))
+    first.reset(seed=0)
+    second.reset(seed=0)
+    with pytest.raises(ConfigError, match="another environment has begun its episodes"):
+        first.reset(options={"reset_mask": np.array([True, False])})
+    second.step(second.action_space.sample())
+
+
+def test_a_forked_process_uses_no_model_of_the_process_that_it_was_forked_from(monkeypatch, tmp_path):
+    """Neither one that it loads nor one that it is given; JAX would wait there for ever."""
+    given, before = simulator(), RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
+    monkeypatch.setattr(Simulator, "made_in", os.getpid() + 1)
+    for use in (
+        lambda: RobotEnv(tmp_path),
+        lambda: RobotEnv(simulator=given, starts=STARTS, robot="arm"),
+        lambda: before.reset(seed=0),
+    ):
+        with pytest.raises(ConfigError, match="forked from one that had made a model's simulator, .* leave out vector"):
+            use()
+    RobotEnv(simulator=Still(1), starts=STARTS, robot="arm").reset(seed=0)  # a true one computes without JAX
+    for made_in in (None, os.getpid()):
+        monkeypatch.setattr(Simulator, "made_in", made_in)
+        with pytest.raises(ConfigError, match="no checkpoints"):
+            RobotEnv(tmp_path)
