@@ -133,6 +133,12 @@ def compare_expected(expected: Sequence[Expected], rows: Sequence[Row]) -> list[
     return [_compare_one(e, points[e.sweep]) for e in expected if e.sweep in points]
 
 
+def count_inside(outcomes: Sequence[ExpectationOutcome]) -> tuple[int, int]:
+    """(how many lie inside their interval, how many there are) of those that have been observed."""
+    known = [o.inside for o in outcomes if o.inside is not None]
+    return sum(known), len(known)
+
+
 def _why_unplanned(e: Expected, points: Collection[tuple[str, float, str, int]]) -> str:
     """What is expected and not among the axis's `points` (series, x, label, seed); '' if all is."""
     where = f"{e.sweep}, {e.series}" if e.series else e.sweep

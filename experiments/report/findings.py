@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.analysis.preregistered import ExpectationOutcome
+from experiments.analysis.preregistered import ExpectationOutcome, count_inside
 from experiments.report.fits import VERDICTS
 from experiments.report.pieces import pm, section, table
 from experiments.report.sweeps import CHANGED
@@ -75,15 +75,10 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
         curve = [html.escape(e.series)] if sweep.has_series else []
         metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
-    ran = [c for c in own if c.observed is not None]
-    outcome = (
-        f"{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals contain the outcome."
-        if ran
-        else "None has an outcome yet."
-    )
-    known = [c for c in ran if c.expected.known]
-    hold = sum(bool(c.inside) for c in known)
-    less = f" Of {len(known)} of them, {hold} of which hold, some seeds were known by then." * bool(known)
+    inside, ran = count_inside(own)
+    outcome = f"{inside} of {ran} intervals contain the outcome." if ran else "None has an outcome yet."
+    hold, known = count_inside([c for c in own if c.expected.known])
+    less = f" Of {known} of them, {hold} of which hold, some seeds were known by then." * bool(known)
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
     head = ["curve"] * sweep.has_series + [sweep.axis, "", "predicted", "observed", "", "seeds"]
     return (

@@ -92,7 +92,7 @@ def _as_html(formula: str) -> str:
 
 
 def _with_interval(c: Coefficient) -> str:
-    name = {"alpha": "\u03b1 = ", "beta": "\u03b2 = "}.get(c.name, "")
+    name = {"alpha": "\u03b1\u00a0=\u00a0", "beta": "\u03b2\u00a0=\u00a0"}.get(c.name, "")
     return f"{name}{c.value:.3g} <span class=sem>[{c.low:.3g}, {c.high:.3g}]</span>"
 
 

@@ -74,13 +74,13 @@ def write_report(
     name, aside = (shown.name, shown.aside) if shown else (REFERENCE, "")
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
-    checks = check_study(sweeps, rows, optima, states, robots, name, numbers.outcomes, checked, vocabulary)
+    expected = compare_expected(read_expected(workspace.predictions / PREREGISTERED), rows)
+    checks = check_study(sweeps, rows, optima, states, robots, name, numbers.outcomes, expected, checked, vocabulary)
     findings = read_findings(workspace.findings, [s.name for s in sweeps])
-    outcomes = compare_expected(read_expected(workspace.predictions / PREREGISTERED), rows)
     headline = _headline(workspace, record, sweeps, rows, states, shown, _finished_when(numbers.results, finished))
     body = [
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, optima, along, outcomes, findings),
+        *_curves(workspace, sweeps, rows, optima, along, expected, findings),
         _fits(workspace, numbers),
         findings.rest,
         _clips(workspace.trials / first / SAMPLES, record, robots, aside) if has_reference else "",
@@ -204,7 +204,7 @@ def _curves(
     rows: Sequence[Row],
     optima: Sequence[Optimum],
     along: AxisStatistics,
-    outcomes: Sequence[ExpectationOutcome],
+    expected: Sequence[ExpectationOutcome],
     findings: Findings,
 ) -> list[str]:
     """A section for the scaling curves, which share a figure, and one for each other sweep.
@@ -214,7 +214,7 @@ def _curves(
 
     def say(sweep: Sweep) -> str:
         said = findings.of_axes.get(sweep.name, "")
-        return describe(sweep, rows, optima, along) + describe_expected(sweep, outcomes) + said
+        return describe(sweep, rows, optima, along) + describe_expected(sweep, expected) + said
 
     note = TWO_PERPLEXITIES if "perplexity" in {r.metric for r in rows} else ""
     sections = []
@@ -275,21 +275,28 @@ def _trial_table(
     provenance: Provenance,
     results: Mapping[str, Mapping[str, Any]],
 ) -> str:
-    lines, names = [], titles(sweeps, provenance)
-    for id, name in names.items():
-        state = states[id]
-        cells = ["–", "–", "–", "–"]
+    """Trials without a result, and the finished ones folded: there may be hundreds."""
+    finished, others = [], []
+    for id, name in titles(sweeps, provenance).items():
+        trial, state = [f"<code>{id}</code>", html.escape(name)], states[id]
         if state.event == FINISHED:
             result = results[id]
             run, loss = result["run"], training_loss(result)
-            cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
-                     f"{loss.mean:.3f}"]  # fmt: skip
-        message = html.escape(name_within(workspace.root, state.message))
-        status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
-        lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
-    done = sum(states[id].event == FINISHED for id in names)
-    head = ["id", "trial", "status", "parameters", "train FLOPs", "time, last attempt", "training loss"]
-    return f"<p>{done} of {len(lines)} finished.</p>" + table(head, lines, text=3)
+            finished.append([
+                *trial, f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
+                f"{loss.mean:.3f}",
+            ])  # fmt: skip
+        else:
+            message = html.escape(name_within(workspace.root, state.message))
+            status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
+            others.append([*trial, status])
+    said = f"<p>{len(finished)} of {len(finished) + len(others)} finished.</p>"
+    if others:
+        said += table(["id", "trial", "status"], others, text=3)
+    if finished:
+        head = ["id", "trial", "parameters", "train FLOPs", "time, last attempt", "training loss"]
+        said += f"<details><summary>Finished trials</summary>{table(head, finished, text=2)}</details>"
+    return said
 
 
 def _origin(

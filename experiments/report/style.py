@@ -23,6 +23,13 @@ p { margin: .4rem 0 .8rem; max-width: 46rem; }
 .plot { display: block; max-width: 100%;
   max-height: 46rem; margin: 0 auto; border-radius: 8px; background: white; padding: .5rem; }
 .scroll { overflow-x: auto; }
+@media screen {
+  /* A table wider than the text goes on to the edge of the window; where it is cut even so, there is a shadow. */
+  .scroll:has(table) { width: max-content; min-width: 100%;
+    max-width: calc(100vw - 2.5rem - max(0px, (100vw - 1060px) / 2)); }
+  .scroll { background: linear-gradient(to left, var(--paper) 1rem, transparent) right / 2rem 100% no-repeat local,
+    linear-gradient(to left, var(--line), transparent) right / 1rem 100% no-repeat; }
+}
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; margin: .5rem 0 .8rem; }
 th, td { text-align: right; padding: .28rem .8rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { color: var(--muted); font-weight: 500; }
@@ -55,6 +62,8 @@ code, pre { font: .86em/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, mono
 pre { background: var(--soft); padding: 1rem; border-radius: 8px; overflow-x: auto; }
 summary { cursor: pointer; color: var(--muted); margin: .8rem 0; }
 td.text:last-child:nth-child(n+4) { white-space: normal; min-width: 11rem; }
+#section-fits td.text { white-space: normal; }
+@media screen { #section-fits td.text:last-child { min-width: 18rem; } }
 nav ul { columns: 15rem; padding: 0; margin: 0 0 1.4rem; list-style: none; font-size: .9rem; }
 nav li { break-inside: avoid; } nav a { color: inherit; text-decoration-color: var(--muted); }
 tbody th { color: inherit; font-weight: inherit; } .sem { white-space: nowrap; }

@@ -205,12 +205,13 @@ def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> 
     columns = _columns(sweep, rows)
     apart = {(c.metric, c.last): c for c in differences}
     controls = {m: list(column.values()) for m, column in _columns(sweep, rows, CONTROL).items()}
-    lines = []
+    lines, seeds = [], {}
     for x, label in enumerate(sweep.labels):
         here = {m: column.get(x) for m, column in columns.items()}
         known = next((p for p in here.values() if p), None)
         if known is None:
             continue
+        seeds[x] = set(known.seeds)
         cells = [_bold(label, x == sweep.reference_x)]
         for metric, p in here.items():
             cells.append(pm(p.mean, p.sem) if p else "–")
@@ -225,6 +226,11 @@ def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> 
     head = [sweep.axis]
     for metric in columns:
         head += [HEADINGS[metric], *["minus the default"] * (metric != "perplexity")]
+    unequal = any(own != seeds.get(sweep.reference_x, own) for own in seeds.values())
+    shared = (
+        " Where a variant and the default have different seeds (column seeds), the difference is over the seeds that both "
+        "have, and not that of the two means."
+    ) * unequal
     over, whose = "seeds and episodes, of one seed over episodes alone", ""
     if sweep.robots_vary:
         over = "seeds, each of which evaluates robots of its own"
@@ -232,7 +238,7 @@ def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> 
             " The default trained on shuffled actions has one seed and its robots: do not compare it with the means."
         )
     return _with_parameters([*head, "seeds"], lines) + (
-        f"<p>Bold: the default. Differences are paired by seed and window. Errors are standard errors over {over}."
+        f"<p>Bold: the default. Differences are paired by seed and window.{shared} Errors are standard errors over {over}."
         f"{whose * any(controls.values())}</p>"
     )
 

@@ -1,6 +1,6 @@
 """The checks by which a reader can tell whether a study's numbers may be believed, at the top of its page.
 
-Each is a sentence with a verdict. What cannot be checked says so and counts as open, never as passed.
+Each is a sentence with a verdict. What is not decided says why and counts as open, never as passed.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from experiments.analysis.controllability import ROUNDING
 from experiments.analysis.intervals import HELD_OUT_LOSS, standard_errors
 from experiments.analysis.optima import Optimum, ends
 from experiments.analysis.predictions import Outcome
+from experiments.analysis.preregistered import ExpectationOutcome, count_inside
 from experiments.analysis.rows import OVERALL, TRAINING_LOSS, UNTRAINED, Row
 from experiments.report.pieces import section
 from experiments.report.robots import Robot
@@ -56,10 +57,10 @@ class Check:
 
 def draw_box(checks: Sequence[Check]) -> str:
     bad = sum(c.verdict == "bad" for c in checks)
-    unknown = sum(c.verdict == "open" for c in checks)
-    verdicts = [f"{len(checks) - bad - unknown} of {len(checks)} hold"]
+    undecided = sum(c.verdict == "open" for c in checks)
+    verdicts = [f"{len(checks) - bad - undecided} of {len(checks)} hold"]
     verdicts += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad)
-    verdicts += [f"{unknown} cannot be checked"] * bool(unknown)
+    verdicts += [f"{undecided} {'is' if undecided == 1 else 'are'} undecided"] * bool(undecided)
     lines = "".join(
         f"<li class={c.verdict}><span class=mark>{MARKS[c.verdict]}</span><div><b>{html.escape(c.name)}</b> "
         f"{html.escape(c.text)}</div></li>"
@@ -76,17 +77,18 @@ def check_study(
     robots: Sequence[Robot],
     whose: str,
     outcomes: Sequence[Outcome],
+    expected: Sequence[ExpectationOutcome],
     numbers: Check,
     vocabulary: int | None,
 ) -> list[Check]:
-    """`robots` are those of the trials called `whose`; `numbers` is what `check_numbers` found; `vocabulary` V of a
-    discrete model."""
+    """`robots` are those of the trials called `whose`; `outcomes` are of predictions of fits, `expected` of the
+    author's; `numbers` is what `check_numbers` found; `vocabulary` V of a discrete model."""
     checks, measured = [_trials(states), _seeds(sweeps, rows), numbers], {r.metric for r in rows}
     if "psnr" in measured or "action_error" not in measured:  # else no frames were predicted
         checks += _untrained(rows, vocabulary)
         checks += [_controls(rows, metric) for metric in CONTROLLED if metric in measured]
         checks.append(_copying(robots, whose))
-    checks += _optima(optima, rows) + [_prediction(o) for o in outcomes]
+    checks += _optima(optima, rows) + [_prediction(o) for o in outcomes] + check_expected(expected)
     return checks
 
 
@@ -301,4 +303,25 @@ def _prediction(outcome: Outcome) -> Check:
         text += f"; observed {outcome.observed:.3f} ({counted(outcome.seeds, 'seed')}), {'inside' if outcome.inside else 'outside'}."
     if outcome.marks:
         verdict, text = "bad", f"{text} But: {'; '.join(outcome.marks)}."
-    return Check("A preregistered prediction holds.", verdict, text)
+    return Check("A preregistered prediction of a fit holds.", verdict, text)
+
+
+def check_expected(outcomes: Sequence[ExpectationOutcome]) -> list[Check]:
+    """All of the author's intervals together: they have no stated level, so one that misses its outcome is one too
+    many."""
+    if not outcomes:
+        return []
+    inside, known = count_inside(outcomes)
+    open_ones = len(outcomes) - known
+    text = f"{inside} of {known} do" if known else "None has an outcome yet"
+    axes: dict[str, list[ExpectationOutcome]] = defaultdict(list)
+    for outcome in outcomes:
+        if outcome.inside is not None:
+            axes[outcome.expected.sweep].append(outcome)
+    if len(axes) > 1:
+        text += ": " + ", ".join("{} {} of {}".format(axis, *count_inside(own)) for axis, own in axes.items())
+    text += "."
+    if known and open_ones:
+        text += f" {open_ones} more {'has' if open_ones == 1 else 'have'} no outcome yet."
+    verdict: Verdict = "bad" if inside < known else "open" if open_ones else "good"
+    return [Check("The author's preregistered intervals contain the outcomes.", verdict, text)]

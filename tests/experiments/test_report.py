@@ -303,7 +303,7 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     assert {p.get_ylabel() for p in kept[1].axes} == {p.get_ylabel() for p in kept[0].axes}
     said = describe(sweep, rows, [], AxisStatistics())
     assert "perplexity" not in said and all(name.removeprefix("squared ") in said for name in shown)
-    checked = check_study([sweep], rows, [], {}, [], "reference", [], Check("", "good", ""), None)
+    checked = check_study([sweep], rows, [], {}, [], "reference", [], [], Check("", "good", ""), None)
     assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
     cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._ShownTrials(sweep, "reference"), "")
     assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
@@ -479,10 +479,20 @@ def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():
     assert "nan" not in said
 
 
+def test_the_table_of_finished_trials_is_folded_and_what_lacks_a_result_is_not(drawn):
+    """Of the largest study a fifth of the page was lines that all said "finished"."""
+    page = drawn.report.read_text()
+    trials = page[page.index("<h2>Trials</h2>") : page.index("<h2>How to repeat it</h2>")]
+    unfolded, folded = trials.split("<details><summary>Finished trials</summary>")
+    assert unfolded.count("<tr>") == 2 and 'class="diverged"' in unfolded and "10 of 11 finished." in unfolded
+    assert folded.count("<tr>") == 1 + 10 and "<th scope=col>parameters</th>" in folded
+
+
 def test_page_without_any_finished_trial(unrendered, tmp_path):
     workspace = finished_study(tmp_path, broken={"": "failed"})
     draw(workspace, record_of())
-    assert "0 of 11 finished" in workspace.report.read_text()
+    page = workspace.report.read_text()
+    assert "0 of 11 finished" in page and "Finished trials" not in page
 
 
 def test_unreadable_result_names_its_file(tmp_path):

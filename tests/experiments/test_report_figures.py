@@ -71,6 +71,16 @@ def test_tables_have_nats_beside_the_perplexity():
     )
 
 
+def test_a_difference_over_fewer_seeds_than_the_mean_beside_it_is_said_to_be():
+    """Of one seed beside a default of three it contradicted the two means, even in sign, and nothing said why."""
+    sweep = plan_conditioning(replace(WIDE, ablation_seeds=(0, 1, 2)))
+    rows = rows_of(sweep, lambda p: {"cross_entropy": 4 + 0.1 * p.trial.train.seed})
+    fewer = [r for r in rows if r.x == sweep.reference_x or r.seed == 0]
+    for own, told in ((rows, False), (fewer, True)):
+        said = describe(sweep, own, [], AxisStatistics())
+        assert ("the difference is over the seeds that both have" in said) == told
+
+
 def test_errors_of_variants_count_seeds_and_episodes():
     """They were those of seeds alone, since all are judged on the same windows; but how much a variant helps differs
     from episode to episode."""

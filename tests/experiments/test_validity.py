@@ -1,6 +1,7 @@
 """What makes a study's numbers unbelievable shows at the top of its page."""
 
 import csv
+import html
 import json
 import shutil
 from dataclasses import replace
@@ -8,6 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.analysis.preregistered import FILE as PREREGISTERED
+from experiments.analysis.preregistered import ExpectationOutcome, Expected
+from experiments.report import validity
 from experiments.report.draw import draw
 from experiments.running.attempts import RESULT
 from experiments.running.result_file import write_result
@@ -211,7 +215,7 @@ def test_trials_that_kept_no_windows_leave_the_question_open(copied):
     write_result(directory, result)
     draw(workspace, record)
     verdict, text = verdicts(workspace)["numbers"]
-    assert verdict == "open" and "1 of 7" in text and "1 cannot be checked" in workspace.report.read_text()
+    assert verdict == "open" and "1 of 7" in text and "5 of 6 hold, 1 is undecided." in workspace.report.read_text()
 
 
 def test_a_control_that_follows_actions_is_bad(copied):
@@ -279,3 +283,39 @@ def test_an_untrained_model_that_knows_something_is_bad(copied):
     workspace.results.unlink()
     draw(workspace, record)
     assert verdicts(workspace)["untrained"][0] == "bad"
+
+
+def test_the_box_counts_the_intervals_of_the_author(copied):
+    """It spoke of predictions of fits alone, which held, above pages on which most of the author's did not."""
+    workspace, record = copied
+    workspace.predictions.mkdir(exist_ok=True)
+    (workspace.predictions / PREREGISTERED).write_text(
+        "sweep,series,x,against,metric,mean,low,high,commit\n"
+        "width,,8,,cross_entropy,50,40,60,abc1234\nwidth,,8,16,cross_entropy,0,-9,9,abc1234\n"
+    )
+    draw(workspace, record)
+    page = html.unescape(workspace.report.read_text())
+    assert "<b>The author's preregistered intervals contain the outcomes.</b> 1 of 2 do." in page
+    assert "6 of 7 hold, 1 does not." in page
+
+
+WIDTH = Expected("width", "", "8", "", "cross_entropy", 5, 4, 6, "abc1234")
+
+
+@pytest.mark.parametrize(
+    ("observed", "verdict", "said"),
+    [
+        ({"width": [5, 4], "horizon": [6]}, "good", "3 of 3 do: width 2 of 2, horizon 1 of 1."),
+        ({"width": [5, 7], "horizon": [3]}, "bad", "1 of 3 do: width 1 of 2, horizon 0 of 1."),
+        ({"width": [5, None]}, "open", "1 of 1 do. 1 more has no outcome yet."),
+        ({"width": [7, None, None]}, "bad", "0 of 1 do. 2 more have no outcome yet."),
+        ({"width": [None]}, "open", "None has an outcome yet."),
+    ],
+)  # fmt: skip
+def test_intervals_of_the_author_hold_if_all_contain_what_came(observed, verdict, said):
+    outcomes = [
+        ExpectationOutcome(replace(WIDTH, sweep=axis), value, 0.1, 3, 3) for axis, v in observed.items() for value in v
+    ]
+    [check] = validity.check_expected(outcomes)
+    assert (check.verdict, check.text) == (verdict, said)
+    assert validity.check_expected([]) == []

@@ -119,7 +119,7 @@ def test_a_prediction_comes_true(root, capsys):
     assert width < 0.1 * prediction.mean and abs(outcome.observed - prediction.mean) < width
     draw(Workspace(root), load_record(Workspace(root)))
     page = (root / "report.html").read_text()
-    assert "A preregistered prediction holds." in page and "Preregistered predictions" in page
+    assert "A preregistered prediction of a fit holds." in page and "Preregistered predictions" in page
 
 
 def test_a_part_of_what_was_predicted_is_on_the_level_of_all_seeds_and_has_no_verdict():
