@@ -20,7 +20,9 @@ from experiments.analysis.rows import OVERALL, Row, curve, read_csv
 from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
+from experiments.presets import PRESETS
 from hma_jax.config import EvalConfig
+from hma_jax.evaluation.effects import MIN_EPISODES
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
 from tests.pages import table
@@ -91,7 +93,9 @@ def test_a_power_law_is_quoted_with_an_interval_and_with_what_is_doubtful():
         (row,) = (r for r in csv.DictReader(file) if (r["curve"], r["coefficient"]) == ("width", "alpha"))
     value, low, high = (f"{float(row[name]):.2f}" for name in ("value", "low", "high"))
     without = re.fullmatch(r"without the first position alpha is ([\d.]+) and E [\d.]+", row["doubts"])[1]
-    said = f"falls as N^-{value} in trunk parameters N ({low} to {high}; {without} without the narrowest width, so the"
+    said = (
+        f"falls as N^-{value} in trunk parameters N ({low} to {high} with 90 %; {without} without the narrowest width,"
+    )
     assert said in RESULTS.read_text()
     for path in (README, RESULTS):
         for line in path.read_text().splitlines():
@@ -118,6 +122,29 @@ def test_the_model_that_is_driven_is_as_good_as_readme_says():
     assert f"| {report['frames_per_second']:.0f} frames a second on {cores} |" in text
 
 
+def test_the_glossary_names_the_simulators_that_there_are():
+    """It said four when there were five."""
+    shipped = (path.parent.name for path in (ROOT / "experiments" / "results").glob("simulator*/checkpoints"))
+    names = {name.partition("_")[2] or "first" for name in shipped}
+    (label,) = (label for label in table(ROOT / "docs" / "glossary.md", "| term |") if "weighed" in label)
+    assert set(label.strip("*").split(", ")) == names
+
+
+def test_how_many_episodes_are_held_out_is_as_the_page_on_own_data_says():
+    page = " ".join((ROOT / "docs" / "own_data.md").read_text().split())
+    for name, study in PRESETS.items():
+        kept, enough = study.store.held_out, {"paper": 350}.get(name, 70)
+        if kept.min_val == 8:
+            assert name.startswith(("cpu", "play")) and (kept.count(16), kept.count(32)) == (4, 8)
+            enough = 16
+        assert (kept.count(enough - 1), kept.count(enough)) == (MIN_EPISODES - 1, MIN_EPISODES), name
+        assert kept.count(7) == 1
+    assert (
+        "Of fewer than 70 episodes (`paper`, which holds out 1 % instead of 5 %: of fewer than 350) at most 3" in page
+    )
+    assert f"of fewer than 8 a single one: too few for `hma check`, which needs {MIN_EPISODES}." in page
+
+
 JUDGED = {
     "fifteen policies, a pusher reaches": ("pusher_sand-reach-grown", 15),
     "eleven, an arm reaches": ("arm_chalk-reach-grown", 11),
@@ -130,16 +157,23 @@ def test_policies_and_plans_are_as_readme_says():
     rows = table(README, "| | model |")
     for said, (task, policies) in JUDGED.items():
         judged = json.loads((ROOT / f"experiments/results/judge-{task}/agreement.json").read_text())
-        learned, control = (
-            judged["agreement"][world]["policies and starts"]["pearson"]
-            for world in ("learned model", "control: actions of other episodes")
-        )
+        learned, control = correlations(task)
         (cells,) = (cells for label, cells in rows.items() if label.startswith(said))
         assert len(judged["policies"]) == policies
         assert cells[0] == f"r = {learned['mean']:.2f} ({learned['low']:.2f} to {learned['high']:.2f})"
-        assert cells[1] in (f"given other actions: {control['mean']:.2f}", "trained without actions: undefined")
+        assert cells[1].partition(",")[0] == f"given other actions: {control['mean']:.2f}"
+    learned, _ = correlations("metaworld_drawer-without_actions")
+    assert cells[1].endswith("; trained without actions: undefined") and learned["mean"] is None
     (cells,) = (cells for label, cells in rows.items() if label.startswith("goals reached by MPPI"))
-    assert cells == [f"{100 * planned_by_mppi().mean():.0f} %", f"behaviour cloning {100 * cloned().mean():.0f} %"]
+    said = f"behaviour cloning, mean of sixteen: {100 * cloned().mean():.0f} %"
+    assert cells == [f"{100 * planned_by_mppi().mean():.0f} %", said] and len(cloned()) == 16
+
+
+def correlations(task: str) -> list[dict[str, float | None]]:
+    """Pearson's r over policies and starts, in the model and under other episodes' actions, of success with the true one."""
+    judged = json.loads((ROOT / f"experiments/results/judge-{task}/agreement.json").read_text())["agreement"]
+    worlds = "learned model", "control: actions of other episodes"
+    return [judged[world]["policies and starts"]["pearson"] for world in worlds]
 
 
 def planned_by_mppi() -> np.ndarray:
@@ -311,6 +345,18 @@ def test_the_page_of_the_simulator_gives_what_its_windows_say():
         name: [d for d, s in by.datasets.items() if s["lpips"].mean > s["lpips_copy"].mean] for name, by in of.items()
     }
     assert beaten == {"grown": [], **dict.fromkeys(("hours", "weighed", "first"), ["omni_chalk"])}
+
+
+def test_claims_of_robots_and_actions_come_with_their_controls():
+    """The gain of more robots and of actions stood without what the same page says of it."""
+    rows = table(RESULTS, "| the paper | here |")
+    robots, actions, new = (
+        next(said for claim, (said, _) in rows.items() if claim.startswith(start))
+        for start in ("more robots", "models conditioned", "pre-training")
+    )
+    assert "alone, trained for as long, are 0.61 ahead" in robots and "no transfer is claimed" in robots
+    assert "0.08 also come with shuffled actions" in actions
+    assert "After 5 robots it is 0.09 behind" in new and "Frames do not show a difference yet" in new
 
 
 def test_readme_is_read_in_a_few_minutes():
