@@ -170,7 +170,7 @@ def test_policies_and_plans_are_as_readme_says():
 
 
 def correlations(task: str) -> list[dict[str, float | None]]:
-    """Pearson's r of true success, over policies and starts, with that in the model and under other episodes' actions."""
+    """Pearson's r, over policies and starts, of true success and that in the model or under other episodes' actions."""
     judged = json.loads((ROOT / f"experiments/results/judge-{task}/agreement.json").read_text())["agreement"]
     worlds = "learned model", "control: actions of other episodes"
     return [judged[world]["policies and starts"]["pearson"] for world in worlds]
