@@ -5,6 +5,7 @@ test-slow`. All tables are held by their hashes, and trials by those in their re
 """
 
 import hashlib
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -81,6 +82,15 @@ def test_what_is_kept_is_drawn_again(name, tmp_path):
     assert not workspace.trials.exists() or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in text, (
         "see it"
     )
+
+
+def test_no_two_pages_have_one_title():
+    """Studies of the suite's first version had those of today's, with other numbers and no word of it."""
+    pages = {path.parent.name: path.read_text() for path in RESULTS.glob("*/report.html")}
+    names = {study: re.search("<title>HMA-JAX study: (.*?)</title>", page)[1] for study, page in pages.items()}
+    assert len(pages) > 1 and len(set(names.values())) == len(pages), names
+    for study, name in names.items():
+        assert f"<h1>HMA study <em>{name}</em></h1>" in pages[study]
 
 
 def test_the_model_that_two_cores_train_was_trained_as_its_preset_says():
