@@ -64,6 +64,27 @@ def test_an_episode_of_most_windows_makes_intervals_narrow(spread, share, holds)
     assert np.mean(shares) == pytest.approx(share, abs=0.01) and np.mean(hits) == pytest.approx(holds, abs=0.015)
 
 
+@pytest.mark.parametrize(("of_other", "alike", "held_out", "others", "holds"), [
+    (0.35, 0.7, 24, 3, 0.94), (0.35, 0.7, 24, 15, 0.93), (0.35, 0.7, 8, 7, 0.91), (1.0, 1.0, 24, 15, 0.86),
+    (1.0, 1.0, 8, 7, 0.67),
+])  # fmt: skip
+def test_other_sequences_of_the_same_episodes_make_intervals_narrow(of_other, alike, held_out, others, holds):
+    """As docs/statistics.md says of action-nats: eight windows are judged under `others` of the episodes that are held
+    out. What an episode does as a window has a standard deviation of 1, what it does as another `of_other`; the two
+    correlate by `alike`. First as measured, then as of a distance between two episodes."""
+    rng, draws, windows = np.random.default_rng(0), 5000, 8
+    own, apart = rng.standard_normal((2, draws, held_out))
+    other = of_other * (alike * own + np.sqrt(1 - alike**2) * apart)
+    order = rng.random((draws, windows, held_out))
+    order[:, np.arange(windows), np.arange(windows)] = np.inf  # none is its own other
+    chosen = np.argsort(order)[..., :others].reshape(draws, -1)
+    of_pair = 1.6 * (alike < 1) * rng.standard_normal((draws, windows, others))
+    under = np.take_along_axis(other, chosen, 1).reshape(of_pair.shape) + of_pair
+    values = own[:, :windows] + under.mean(2)
+    half = critical(windows - 1) * values.std(1, ddof=1) / np.sqrt(windows)  # of `interval_of`
+    assert np.mean(np.abs(values.mean(1)) < half) == pytest.approx(holds, abs=0.01)
+
+
 def test_the_mean_over_robots_holds_its_truth():
     """Three robots of four episodes, of which one scatters most: few degrees of freedom, and a wide interval."""
     hits = normal = 0
