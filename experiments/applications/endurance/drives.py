@@ -71,7 +71,8 @@ def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
 
 
 def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -> Drive:
-    """The true rollout of `frames` actions of a kind. Deterministic; `start` must have the seed of its episode."""
+    """The true rollout of `frames` actions of a kind. Deterministic; `start` must have the seed of its episode. Robots
+    draw apart: intervals take them as independent."""
     spec = SPECS[robot.name]
     world = World(spec, [start.seed])
     for action in start.actions:
@@ -81,7 +82,7 @@ def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -
     for t in range(frames):
         if kind == "behaviour":
             if t % restart == 0:
-                behaviour = Behaviour(world, np.random.default_rng([seed, t]))
+                behaviour = Behaviour(world, np.random.default_rng([seed, t, *map(ord, spec.name)]))
             command = behaviour.act()[0]
         else:
             command = _extreme_action(robot, kind, t)

@@ -1,9 +1,12 @@
 """What a drive says happened is what the true simulator shows under its actions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
+from experiments.applications.endurance import drives
 from experiments.applications.endurance.drives import HOLD_SECONDS, make_drive
 from experiments.applications.scenes import point_names, points_of
 
@@ -25,6 +28,18 @@ def test_the_true_simulator_shows_the_same_frames(start, kind):
         assert not true.clipped[0]
     np.testing.assert_array_equal(drive.frames(0, 21), np.stack(seen))
     np.testing.assert_array_equal(drive.frames(7, 9), np.stack(seen[7:9]))
+
+
+def test_robots_of_one_rate_draw_apart(start, monkeypatch):
+    """Five robots of 4 Hz worked on their tasks, or did not, in the same twelve seconds."""
+    drawn, behaviour = {}, drives.Behaviour
+    monkeypatch.setattr(
+        drives, "Behaviour", lambda world, rng: drawn.setdefault(world.spec.name, behaviour(world, rng))
+    )
+    for robot in (ROBOT, suite_robot("pusher_sand", (-8.0, -8.0), (8.0, 8.0), (0.0, 0.0), 1)):
+        make_drive(robot, replace(start, robot=robot.name, actions=np.zeros((0, robot.action_dim))), 1, "behaviour", 0)
+    first, second = (one.task_probability[0] for one in drawn.values())
+    assert first != second
 
 
 def test_actions_unlike_the_data(start):
