@@ -61,8 +61,9 @@ MISSING_PROBABILITY = 0.2
 MAX_NOISE = 16.0
 """Standard deviation, in grey levels, of the strongest noise added to training frames."""
 
-MIN_CONFIDENCE = 0.15
-"""Confidence above which a point counts as detected."""
+MIN_CONFIDENCE, SURE_CONFIDENCE = 0.15, 0.5
+"""Confidence above which a point counts as detected, and above which tables of films also count it, since how much is
+found depends on this threshold."""
 
 WITHIN_PX = (2.0, 4.0)
 """Distances, in pixels of a 64-pixel frame, within which the share of detections is reported."""
@@ -172,7 +173,8 @@ def _resume(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]
 
 
 def detection_errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
-    """Position errors for each kind of point of a robot, detection rates, and false detections (`ghosts`)."""
+    """Position errors for each kind of point of a robot, detection rates, and how many points that are not visible are
+    detected nevertheless (`ghosts`), by why they are not: see `unseen`."""
     position, confidence = detector.detect(robot, scenes.images)
     error = np.linalg.norm(position - scenes.position, axis=-1)
     names, rows = point_names(SPECS[robot]), []
@@ -186,9 +188,29 @@ def detection_errors(detector: Detector, robot: str, scenes: Scenes) -> list[dic
         rows.append({
             "robot": robot, "what": kind, "frames": int(visible.sum()), "median_px": float(np.median(distances)),
             "p90_px": float(np.quantile(distances, 0.9)), **within, "found": float(np.mean(confident[visible])),
-            "ghosts": float(np.mean(confident[~visible])) if (~visible).any() else float("nan"),
+            **{
+                name: value
+                for why, which in unseen(scenes).items()
+                for name, value in _ghosts(why, confident[which[:, kind_points]])
+            },
         })  # fmt: skip
     return rows
+
+
+def unseen(scenes: Scenes) -> dict[str, np.ndarray]:
+    """Points that are not visible, bool [n, P] for each reason: `absent`, no object has this colour; `hidden`, none of
+    it is in view; `partly`, too little is."""
+    there = ~scenes.absent
+    return {
+        "absent": scenes.absent,
+        "hidden": there & (scenes.share == 0),
+        "partly": there & (scenes.share > 0) & ~scenes.visible,
+    }
+
+
+def _ghosts(why: str, detected: np.ndarray) -> list[tuple[str, float | int]]:
+    """The columns of points that are not visible: the share that is detected, and how many there are."""
+    return [(f"ghosts_{why}", float(np.mean(detected)) if detected.size else float("nan")), (why, detected.size)]
 
 
 def enlarged(images: np.ndarray) -> np.ndarray:

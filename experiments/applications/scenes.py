@@ -38,7 +38,16 @@ class Scenes(NamedTuple):
 
     images: np.ndarray  # uint8 [n, H, W, 3]
     position: np.ndarray  # float32 [n, P, 2]
-    visible: np.ndarray  # bool [n, P]
+    share: np.ndarray  # float32 [n, P], of it in view
+
+    @property
+    def visible(self) -> np.ndarray:
+        return self.share >= VISIBLE_SHARE
+
+    @property
+    def absent(self) -> np.ndarray:
+        """Which colours no object has, bool [n, P]: they have no position."""
+        return ~self.position.any(-1)
 
 
 def point_names(spec: EmbodimentSpec) -> tuple[str, ...]:
@@ -77,4 +86,4 @@ def draw_scenes(
     )
     points = points_of(spec, seeds[episode], q, objects)
     images = render_frames(spec, draw_appearance(spec, seeds), rollout.goals, q, objects, episode)
-    return Scenes(images, points.position, points.visible)
+    return Scenes(images, points.position, points.share)

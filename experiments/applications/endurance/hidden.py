@@ -8,7 +8,7 @@ Expected: within the model's window what was hidden comes back as often as what 
 Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
 after the start. Beside each stands a control: an object that is seen all the time, judged as long after a start of as
 many frames.
-Writes DIR/NAME_hidden.csv, a row per event.
+Writes DIR/NAME_hidden.csv, a row per event; `moved_px` is how far the object truly is from where it was last seen.
 """
 
 from __future__ import annotations
@@ -126,7 +126,8 @@ def judge(
         films.append(simulator.step([a[min(t, len(a) - 1)] for a in actions]).copy())
     film, rows = np.stack(films), []
     for b, (e, (image, points)) in enumerate(zip(events, true, strict=True)):
-        row: Row = {"robot": spec.name, "kind": e.kind, "gone": e.gone, "lag": e.lag}
+        moved = float(np.linalg.norm(points.position[-1, e.point] - points.position[e.start, e.point]))
+        row: Row = {"robot": spec.name, "kind": e.kind, "gone": e.gone, "lag": e.lag, "moved_px": moved}
         for name, seen in (("", film[e.lag, b]), ("true_", image)):
             found = detector.detect(spec.name, enlarged(seen[None]))
             off = float(np.linalg.norm(found.position[0, e.point] - points.position[-1, e.point]))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.analysis.intervals import critical
-from experiments.applications.detector import CLOSE_PX, MIN_CONFIDENCE
+from experiments.applications.detector import CLOSE_PX, MIN_CONFIDENCE, SURE_CONFIDENCE
 from experiments.applications.endurance.films import Film
 from experiments.applications.scenes import VISIBLE_SHARE
 
@@ -24,7 +24,7 @@ Row = dict[str, object]
 MEASURES = (
     "psnr", "psnr_still", "tool_found", "tool_close", "tool_px", "object_found", "object_close", "object_px", "follows",
     "moves", "steers", "true_tool_close", "true_object_close", "true_follows", "true_moves", "true_steers", "level",
-    "variance", "histogram",
+    "variance", "histogram", "tool_sure", "object_sure",
 )  # fmt: skip
 
 
@@ -44,6 +44,9 @@ def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
                 f"{name}{kind}_found": detected.mean(), f"{name}{kind}_close": (detected & (distances <= CLOSE_PX)).mean(),
                 f"{name}{kind}_px": np.median(distances),
             }  # fmt: skip
+    sure = film.confidence[part] >= SURE_CONFIDENCE
+    for kind, which in (("tool", slice(None, tools)), ("object", slice(tools, None))):
+        measures[f"{kind}_sure"] = sure[:, which][visible[:, which]].mean()
     for name, position in (("", film.position), ("true_", film.seen_position)):
         measures |= motion(film.true_position[part, :tools], position[part, :tools], visible[:, :tools], name)
     measures |= {name: getattr(film, name)[part].mean() for name in ("level", "variance", "histogram")}

@@ -16,6 +16,7 @@ from experiments.applications import in_place as in_place_module
 from experiments.applications import simulators
 from experiments.applications.detector import (
     Detector,
+    detection_errors,
     enlarged,
     make_detector,
     reconstruct,
@@ -26,7 +27,7 @@ from experiments.applications.detector import (
 )  # fmt: skip
 from experiments.applications.detector_network import Detections, init_detector
 from experiments.applications.in_place import CLOSE_PX, EPISODES, VIEWS, in_place, measure_ends
-from experiments.applications.scenes import draw_scenes, point_names
+from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from tests.experiments.applications.runs import make_run
@@ -90,6 +91,21 @@ def test_the_share_is_of_what_moved_and_a_mean_over_robots():
     share, half, robots = in_place(rows, "model")
     assert (round(share, 4), robots) == (0.6667, 3) and half > 0.5
     assert in_place([], "true")[2] == 0
+
+
+def test_false_detections_are_told_apart_by_why_nothing_is_seen():
+    """A detector that reports the one object whenever it is out of sight, and no colour that is not there."""
+    share = np.float32([[1, 1, 0, 0]] * 6 + [[1, 0, 0, 0]] * 3 + [[1, 0.1, 0, 0]])
+    position = np.zeros((10, 4, 2), np.float32)
+    position[:, :2] = 20
+    scenes = Scenes(np.zeros((10, 64, 64, 3), np.uint8), position, share)
+    confidence = np.where((share < 1) & (scenes.position[..., 0] > 0), 0.9, 0.0)
+    detector = SimpleNamespace(detect=lambda *_: Detections(position, confidence))
+    _, objects = detection_errors(detector, "gripper_wood", scenes)
+    kinds = {name: objects[name] for why in ("absent", "hidden", "partly") for name in (f"ghosts_{why}", why)}
+    assert kinds == {
+        "ghosts_absent": 0.0, "absent": 20, "ghosts_hidden": 1.0, "hidden": 3, "ghosts_partly": 1.0, "partly": 1,
+    }  # fmt: skip
 
 
 def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monkeypatch):

@@ -6,8 +6,8 @@ import csv
 
 import numpy as np
 
+from experiments.applications.detector import CLOSE_PX, MIN_CONFIDENCE, SURE_CONFIDENCE, WEIGHTS, Detector
 from experiments.applications.detector import COMMITTED as DETECTOR
-from experiments.applications.detector import WEIGHTS, Detector
 from experiments.applications.endurance.tables import over_robots, read_rows
 from tests.experiments.applications.endurance.committed import (
     PAGE,
@@ -23,6 +23,8 @@ from tests.experiments.applications.endurance.committed import (
     words_of,
 )
 from tests.pages import table
+
+THRESHOLDS = MIN_CONFIDENCE, SURE_CONFIDENCE
 
 
 def test_the_page_shows_what_was_measured():
@@ -264,6 +266,72 @@ def test_half_of_what_was_hidden_comes_back():
     assert said + f"{stay[0]} ± {stay[1]} and {stay_close[0]} ± {stay_close[1]} %." in page
     short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
     assert f"it is {sum(short):.0f} of {len(short)}, after four or more {sum(long):.0f} of {len(long)}" in page
+    gone = [row["gone"] for row in hidden]
+    assert f"an object is out of view for {min(gone):.0f} to {max(gone):.0f} frames" in page
+    moved, stayed, control_moved, control_stayed = (
+        (len(those), *(int(sum(row[name] for row in those)) for name in ("found", "close")))
+        for mine in (hidden, control)
+        for far in (True, False)
+        for those in [[row for row in mine if (row["moved_px"] > CLOSE_PX) == far]]
+    )
+    said = (
+        f"of the {{}} objects that end more than {CLOSE_PX:.0f} pixels from where they were last seen, the model shows {{}}, "
+        "and {} in place; of the {} others {}, and {} in place. Controls: of {} that moved as far {} and {}, of {} others "
+        "{} and {}."
+    )
+    assert said.format(*moved, *stayed, *control_moved, *control_stayed) in page
+
+
+def test_how_much_is_found_depends_on_the_threshold_as_the_page_says():
+    page, places = words_of(PAGE), ROOT / "experiments" / "results" / "in_place"
+
+    def found(rows: list[dict], column: str = "confidence") -> list[str]:
+        return [f"{100 * np.mean([row[column] >= least for row in rows]):.0f}" for least in THRESHOLDS]
+
+    grown, small = (
+        [found([row for row in read_rows(RESULTS / name) if row["kind"] == kind]) for kind in ("hidden", "control")]
+        for name in ("grown_hidden.csv", "hidden.csv")
+    )
+    least, sure = THRESHOLDS
+    assert f"the detector's confidence is at least {least:g}." in page
+    said = f"At {sure:g} [hidden objects](#ten-minutes) are shown again in {{1}} % of the cases instead of {{0}} %, controls in "
+    said += "{3} instead of {2} %; in the small model in {5} instead of {4} %, and {7} instead of {6} %."
+    assert said.format(*grown[0], *grown[1], *small[0], *small[1]) in page
+    with (places / "grown.csv").open(newline="") as file, (places / "weighed.csv").open(newline="") as other:
+        moved = [
+            [
+                {name: float(row[name]) for name in ("model_confidence", "true_confidence")}
+                for row in csv.DictReader(text)
+                if row["what"].startswith("colour") and float(row["moved_px"]) > CLOSE_PX
+            ]
+            for text in (file, other)
+        ]
+    said = "in a window, {1} % are found instead of {0} %, in the small model {3} instead of {2} %"
+    assert said.format(*(x for rows in moved for x in found(rows, "model_confidence"))) in page
+    hidden = [row for row in read_rows(RESULTS / "grown_hidden.csv") if row["kind"] == "hidden"]
+    true = found(moved[0], "true_confidence"), found(hidden, "true_confidence")
+    assert {all_of for all_of, _ in true} == {"100"}
+    missed = sorted(100 - int(some) for _, some in true)
+    assert f"{least:g} misses none of these objects, {sure:g} misses {missed[0]} to {missed[1]} %." in page
+
+
+def test_false_detections_are_as_the_page_says():
+    with (DETECTOR / "errors.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["frames_of"] == "true"]
+
+    def counts(why: str) -> tuple[int, int]:
+        """Detected, and of how many objects."""
+        of = [(float(row[f"ghosts_{why}"]), int(row[why])) for row in rows if row["what"] == "object" and int(row[why])]
+        return round(sum(share * n for share, n in of)), sum(n for _, n in of)
+
+    absent, hidden, partly = map(counts, ("absent", "hidden", "partly"))
+    tools = [100 * float(row["ghosts_hidden"]) for row in rows if row["what"] == "tool" and int(row["hidden"])]
+    said = (
+        f"{100 * absent[0] / absent[1]:.1f} % of the colours that no object of the episode has, {hidden[0]} of {hidden[1]} "
+        f"objects of which nothing is in view, {100 * partly[0] / partly[1]:.0f} % of the {partly[1]} of which less than a "
+        f"quarter is, and {min(tools):.0f} to {max(tools):.0f} % of tools out of view (arms and picker)."
+    )
+    assert said in words_of(PAGE)
 
 
 def test_the_detector_finds_what_is_there():

@@ -45,7 +45,10 @@ def test_found_is_not_close_and_what_is_not_there_does_not_count():
     unsure = right.confidence.copy()
     unsure[: N // 4, 1] = 0.1
     lost = measure(film(confidence=unsure), whole, tools=1)
-    assert lost["object_found"] == lost["object_close"] == 0.75
+    assert lost["object_found"] == lost["object_close"] == lost["object_sure"] == 0.75
+    unsure[: N // 2, 1] = 0.4
+    found = measure(film(confidence=unsure), whole, tools=1)
+    assert (found["object_found"], found["object_sure"], found["tool_sure"]) == (1, 0.5, 1)
 
 
 def test_motion_follows_or_does_not():
