@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from hma_jax.config import require
+
 Cost = Callable[[np.ndarray], np.ndarray]
 """The cost of each of B rollouts, float [B], by its frames uint8 [B, F, H, W, C]: less is better. The probabilities of
 a success head make another such function."""
@@ -26,11 +28,21 @@ def block_means(images: np.ndarray) -> np.ndarray:
 
 
 def distance(images: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """float [...]: mean squared difference of `block_means` of images uint8 [..., H, W, C] from those of the goal."""
+    """float [...]: mean squared difference of `block_means` of images uint8 [..., H, W, C] from those of the goal.
+
+    Raises ConfigError for images of another size than the goal.
+    """
+    shown, wanted = (" x ".join(map(str, x.shape[-3:])) for x in (images, goal))
+    require(shown == wanted, f"the image of the goal is {wanted}, but the frames are {shown}; scale it to their size")
     return ((block_means(images) - block_means(goal)) ** 2).mean((-3, -2, -1))
 
 
 def goal_image_cost(goal: np.ndarray) -> Cost:
     """The mean distance from an image uint8 [H, W, C] over the second half of the horizon, which rewards to arrive
-    early and to stay."""
+    early and to stay. Raises ConfigError for another array; the cost does where frames have another size."""
+    goal = np.asarray(goal)
+    require(
+        goal.dtype == np.uint8 and goal.ndim == 3,
+        f"the image of a goal must be uint8 [H, W, C], got {goal.dtype} {list(goal.shape)}",
+    )
     return lambda frames: distance(frames[:, frames.shape[1] // 2 :], goal).mean(1)

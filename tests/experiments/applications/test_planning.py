@@ -138,6 +138,19 @@ def test_a_goal_counts_in_the_second_half_of_the_horizon():
     assert cost.tolist() == [0, 0.5]
 
 
+@pytest.mark.parametrize("goal", [np.zeros((9, 9), np.uint8), np.zeros((8, 8, 3), np.float32)])
+def test_what_is_no_image_of_a_goal_is_refused(goal):
+    with pytest.raises(ConfigError, match=r"the image of a goal must be uint8 \[H, W, C\], got "):
+        goal_image_cost(goal)
+
+
+def test_a_goal_of_another_size_than_the_frames_is_refused():
+    """The sizes 225 and 256 have no common cells: each frame was compared with the mean colour of the goal."""
+    cost = goal_image_cost(np.zeros((9, 9, 3), np.uint8))
+    with pytest.raises(ConfigError, match="the image of the goal is 9 x 9 x 3, but the frames are 8 x 8 x 3"):
+        cost(np.zeros((1, 2, 8, 8, 3), np.uint8))
+
+
 @pytest.mark.parametrize("stride", [1, 2])
 def test_the_true_model_sees_what_the_robot_would(stride):
     task = find_task("pusher_sand", "reach")
