@@ -26,7 +26,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
-from hma_jax.simulator.folder import find_decode
+from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
@@ -90,7 +90,7 @@ class Settings:
     skip: int = 0  # starts of the task before the first that is taken: others than an earlier run's
     execute: int = 2  # frames from one plan to the next
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
-    temperature: float = 0.0  # at which tokens are sampled, whatever the run's decode.json says; 0: greedy decoding
+    temperature: float = 0.0  # of sampling, whatever the run's decode.json says; 0: greedy decoding
     search: SearchConfig = field(default_factory=SearchConfig)
     steps: int = 2000  # of training of the cloned policies
     batch: int = 32
@@ -277,7 +277,10 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=SearchConfig.iterations)
     parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
     parser.add_argument(
-        "--temperature", type=float, default=Settings.temperature, help="at which tokens are sampled; 0: greedy"
+        "--temperature",
+        type=float,
+        default=Settings.temperature,
+        help="at which tokens or latents are sampled; 0: greedy",
     )
     args = vars(parser.parse_args())
     run, out, wanted = args.pop("run"), args.pop("out"), args.pop("ways")
@@ -285,7 +288,7 @@ def main() -> None:
     require(args["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {args['candidates']}")
     search = SearchConfig(candidates=args.pop("candidates"), iterations=args.pop("iterations"))
     settings = Settings(search=search, **args)
-    decode = replace(find_decode(run), unmask_steps=settings.unmask_steps, temperature=settings.temperature)
+    decode = change_decode(find_decode(run), settings.temperature, unmask_steps=settings.unmask_steps)
     simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = settings.start_seeds()

@@ -21,6 +21,9 @@ FILE = "settings.json"
 SIMULATOR = "simulator"
 """The field of what a simulator's results depend on besides its weights."""
 
+SAMPLER = f"{SIMULATOR}.decode.sampler"
+"""The field of how latents are sampled, on which no result of a model of token ids depends."""
+
 
 def pin_settings(
     out: Path,
@@ -43,6 +46,7 @@ def pin_settings(
     if path.exists():
         known = json.loads(path.read_text())
         comparable = wanted if SIMULATOR in known else {name: x for name, x in wanted.items() if name != SIMULATOR}
+        unused = unused if simulator.tokenizer.channels else (*unused, SAMPLER)
         free = tuple(f"{name}{end}" for name in (*may_differ, *unused) for end in ":.")
         differences = [line for line in diff(known, comparable) if not line.startswith(free)]
         require(

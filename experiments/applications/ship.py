@@ -21,7 +21,6 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +38,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params
 from hma_jax.runtime.files import write_file
-from hma_jax.simulator.folder import DEFAULT_DECODE
+from hma_jax.simulator.folder import DEFAULT_DECODE, change_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -205,7 +204,7 @@ def main() -> None:
     parser.add_argument("--unmask-steps", type=int, default=DEFAULT_DECODE.unmask_steps, help="passes over a frame")
     parser.add_argument("--temperature", type=float, default=DEFAULT_DECODE.temperature, help="of drawing tokens")
     args = parser.parse_args()
-    decode = replace(DEFAULT_DECODE, unmask_steps=args.unmask_steps, temperature=args.temperature)
+    decode = change_decode(DEFAULT_DECODE, args.temperature, unmask_steps=args.unmask_steps)
     ship(args.run, args.out, decode, describe)
 
 

@@ -85,7 +85,7 @@ from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.files import write_file
-from hma_jax.simulator.folder import find_decode
+from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
@@ -276,14 +276,17 @@ def main() -> None:
     parser.add_argument("--given", type=int, default=Training.given, help="recorded frames that others begin with")
     parser.add_argument("--with-given", action="store_true", help="train on these, too")
     parser.add_argument(
-        "--temperature", type=float, default=Training.temperature, help="at which tokens are sampled; 0: greedy"
+        "--temperature",
+        type=float,
+        default=Training.temperature,
+        help="at which tokens or latents are sampled; 0: greedy",
     )
     parser.add_argument(
         "--without-actions", type=Path, metavar="RUN", help="second control: of the same video, trained without actions"
     )
     args = parser.parse_args()
     run, out = args.run, args.out
-    decode = replace(find_decode(run), temperature=args.temperature)
+    decode = change_decode(find_decode(run), args.temperature)
     simulator = load_simulator(run, own_starts=True, episodes=BATCH, decode=decode, history=1)
     source = make_source(args, simulator)  # a mistyped name claims nothing
     second = out / SECOND

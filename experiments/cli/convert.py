@@ -178,7 +178,7 @@ def to_stablehlo(
         frames: Total number of frames; those after the prompt are generated. Past the model's window it slides as
             RUN/decode.json's `slide` says, by default exact.
         unmask_steps: Unmasking steps per generated frame.
-        temperature: 0 takes the most likely tokens, 1 samples from the model's distribution.
+        temperature: 0 takes the most likely tokens or latents, 1 samples from the model's distribution.
         sampler_steps: Steps of the diffusion sampler; no effect on discrete models.
         sampler: The diffusion sampler; dpm++ needs 8 to 12 steps.
         platforms: Platforms that the program can run on.
@@ -189,8 +189,7 @@ def to_stablehlo(
     from hma_jax.training.runs import load_run
 
     require_free(out)
-    frame = {"unmask_steps": unmask_steps, "temperature": temperature}
-    decode = _decode(run, frame, {"kind": sampler, "steps": sampler_steps, "temperature": temperature})
+    decode = _decode(run, temperature, unmask_steps, {"kind": sampler, "steps": sampler_steps})
     loaded = load_run(run, weights)
     frames = loaded.model.frames if frames is None else frames
     prompt = min(ProgramConfig.prompt, frames - 1) if prompt is None else prompt
@@ -200,14 +199,14 @@ def to_stablehlo(
     wrote(out, about=f"{out / 'model.json'} lists the program's inputs and outputs")
 
 
-def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> DecodeConfig:
+def _decode(run: Path, temperature: float | None, unmask_steps: int | None, latents: dict[str, Any]) -> DecodeConfig:
     """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, but for what is asked for (not
-    None)."""
-    from hma_jax.simulator.folder import DECODE, find_decode
+    None), of the sampler as well: `latents`."""
+    from hma_jax.simulator.folder import DECODE, change_decode, find_decode
 
     found = find_decode(run) if (run / DECODE).exists() else PLAIN
-    frame, latents = ({name: x for name, x in options.items() if x is not None} for options in (frame, latents))
-    return replace(found, **frame, sampler=replace(found.sampler, **latents))
+    sampler = replace(found.sampler, **{name: x for name, x in latents.items() if x is not None})
+    return change_decode(found, temperature, unmask_steps=unmask_steps, sampler=sampler)
 
 
 def _rates(run: Run) -> tuple[str, list[str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -53,7 +52,7 @@ def play(
             every frame; streaming is faster, but may stop following commands (docs/endurance_small.md). Default: as
             in RUN/decode.json, or exact.
         unmask_steps: Unmasking steps per frame; more are slower. Default: as in RUN/decode.json, or 2.
-        temperature: Temperature at which tokens are sampled; 0 takes the most likely ones. Default: as in
+        temperature: Temperature at which tokens or latents are sampled; 0 takes the most likely ones. Default: as in
             RUN/decode.json, or 0.
         tokenizer: Directory of the tokenizer that the model was trained with, if it is not beside RUN.
     """
@@ -70,7 +69,7 @@ def play(
         mark_absolute_actions,
         true_simulator,
     )
-    from hma_jax.simulator.folder import find_decode
+    from hma_jax.simulator.folder import change_decode, find_decode
     from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
     require(
@@ -82,8 +81,7 @@ def play(
     for name in public_name:
         require(not set(name) & set(":/"), f"--public-name takes a name without scheme and port, got {name!r}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
-    given_decode = {"slide": window, "unmask_steps": unmask_steps, "temperature": temperature}
-    decode = replace(find_decode(run), **{name: x for name, x in given_decode.items() if x is not None})
+    decode = change_decode(find_decode(run), temperature, slide=window, unmask_steps=unmask_steps)
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,16 @@ def find_decode(directory: Path) -> DecodeConfig:
     """From decode.json, otherwise DEFAULT_DECODE. Raises ConfigError for a file that is damaged."""
     path = directory / DECODE
     return from_dict(DecodeConfig, _read(path), str(path)) if path.exists() else DEFAULT_DECODE
+
+
+def change_decode(decode: DecodeConfig, temperature: float | None = None, **fields: Any) -> DecodeConfig:
+    """`decode` with other fields; None leaves one as it is. `temperature` is that of whatever a model samples, token
+    ids or latents."""
+    given = {name: value for name, value in fields.items() if value is not None}
+    if temperature is not None:
+        sampler = replace(given.get("sampler", decode.sampler), temperature=temperature)
+        given |= {"temperature": temperature, "sampler": sampler}
+    return replace(decode, **given)
 
 
 def load_robots(path: Path) -> tuple[Robot, ...]:

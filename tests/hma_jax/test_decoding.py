@@ -11,6 +11,7 @@ import pytest
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.generation import decoding
 from hma_jax.generation.decoding import Frame, masked_counts, sample_tokens, unmask
+from hma_jax.simulator.folder import DEFAULT_DECODE, change_decode
 from tests.tiny import DIFFUSION, model_config
 
 
@@ -141,3 +142,11 @@ def test_frames_are_not_filled_in_ways_that_their_tokens_do_not_have(diffusion, 
         decoding.decode_frame(
             model, jnp.zeros((1, 9, 3)), lambda _: None, jax.random.split(jax.random.key(0), 1), decode
         )
+
+
+def test_a_temperature_is_that_of_token_ids_and_of_latents():
+    """Asked for greedy frames, models on latents sampled theirs."""
+    greedy = change_decode(DEFAULT_DECODE, 0.0, unmask_steps=5, slide=None)
+    latents = replace(DEFAULT_DECODE.sampler, temperature=0.0)
+    assert greedy == replace(DEFAULT_DECODE, unmask_steps=5, temperature=0.0, sampler=latents)
+    assert change_decode(DEFAULT_DECODE) == DEFAULT_DECODE

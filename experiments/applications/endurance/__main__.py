@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from experiments.applications.tables import write_rows
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Update, console, step, wrote
 from hma_jax.config import ExecutionConfig, require
-from hma_jax.simulator.folder import find_decode
+from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -79,7 +78,7 @@ def run_variant(
     robots: Mapping[str, Robot], starts: Mapping[str, Sequence[Start]], unfinished: Path, update: Update,
 ) -> dict[str, Film]:  # fmt: skip
     """`robots` of a run, each from its start number `which` on, in one batch. See `make_films` for `unfinished`."""
-    decode = replace(find_decode(run), **VARIANTS[variant])
+    decode = change_decode(find_decode(run), **VARIANTS[variant])
     options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
     simulator, drives = load_simulator(run, **options), []
     for name, robot in robots.items():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.applications.settings_file import hash_of, pin_settings
-from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.config.json import to_dict
 from hma_jax.simulator.robots import Robot
 
@@ -20,8 +20,9 @@ SETTINGS = {"robot": "arm", "seeds": (0, 1), "search": {"candidates": 4}}
 ARM = Robot("arm", 2, (-1.0,), (1.0,), (0.0,))
 
 
-def simulator(params=PARAMS, decode: DecodeConfig = DecodeConfig(8, temperature=0.7), robot: Robot = ARM):
-    return SimpleNamespace(model=SimpleNamespace(params=params), decode=decode, robots={robot.name: robot})
+def simulator(params=PARAMS, decode=DecodeConfig(8, temperature=0.7), robot: Robot = ARM, channels: int = 0):
+    model, tokenizer = SimpleNamespace(params=params), SimpleNamespace(channels=channels)
+    return SimpleNamespace(model=model, tokenizer=tokenizer, decode=decode, robots={robot.name: robot})
 
 
 def test_what_was_made_otherwise_is_refused_by_name(tmp_path):
@@ -54,6 +55,15 @@ def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(
         pin_settings(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS, unused=("simulator.dec",))
     with pytest.raises(ConfigError, match="simulator.robots.arm: "):
         pin_settings(out, run, simulator(robot=replace(ARM, high=(2.0,))), SETTINGS)
+
+
+def test_how_latents_are_sampled_counts_in_models_on_latents_alone(tmp_path):
+    run, sampled = Path("runs/model"), DecodeConfig(8, temperature=0.7, sampler=SamplerConfig(temperature=0.7))
+    for channels in (0, 4):
+        pin_settings(tmp_path / str(channels), run, simulator(channels=channels), SETTINGS)
+    pin_settings(tmp_path / "0", run, simulator(decode=sampled), SETTINGS)
+    with pytest.raises(ConfigError, match="simulator.decode.sampler.temperature: 1.0 -> 0.7"):
+        pin_settings(tmp_path / "4", run, simulator(decode=sampled, channels=4), SETTINGS)
 
 
 def test_results_that_do_not_say_how_frames_were_filled_are_not_gone_on_with(tmp_path):

@@ -43,7 +43,7 @@ from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.config.json import from_dict
-from hma_jax.simulator.folder import DECODE, save_decode
+from hma_jax.simulator.folder import DECODE, change_decode, save_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_model
 from tests.experiments.applications.runs import TABLE, make_run
@@ -223,7 +223,7 @@ def test_the_second_control_is_decoded_as_the_model_that_it_controls(tmp_path, m
         monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--without-actions", str(passive), *place, *asked])
         with pytest.raises(ZeroDivisionError):
             synthetic.main()
-    assert made == [(DecodeConfig(8, t, sampler=made[0][0].sampler),) * 2 for t in (0.0, 0.5)]
+    assert made == [(change_decode(DecodeConfig(8), t),) * 2 for t in (0.0, 0.5)]
     assert json.loads((out / "1/settings.json").read_text())["temperature"] == 0.5
 
 
