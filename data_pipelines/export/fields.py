@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from data_pipelines.sources.rlds.schema import field_slice, step_key
+from data_pipelines.sources.source import vector_sizes
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.source import EpisodeSource
 
 ACTION, STATE = "action", "observation.state"
-
-USED = re.compile(r"steps/(?:observation/|action)")
-"""Vectors that are written; besides them sources have flags, rewards and embeddings of texts."""
 
 STATES = ("observation/state", "observation/proprio")
 """What sources call the robot's state; the first that there is becomes `observation.state`."""
@@ -44,7 +41,7 @@ def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequ
     """
     images = [key for key, feature in source.features.items() if feature.camera]
     numbers = {key: f.size for key, f in source.features.items() if f.size and not f.image and not f.encoding}
-    vectors = [key for key in numbers if USED.match(key) and "embedding" not in key]
+    vectors = list(vector_sizes(source.features))
     require(bool(images), f"{source.location}: it has no camera, so it cannot be written as a LeRobot dataset")
     actions = [step_key(key) for key in action] or default_actions(vectors)
     states = [step_key(key) for key in state] or [step_key(key) for key in STATES if step_key(key) in vectors][:1]

@@ -33,6 +33,7 @@ from data_pipelines.sources.source import (
     EpisodeSource,
     SourceFrame,
     decode_frame,
+    find_instructions,
     join_actions,
 )
 from hma_jax.config import require
@@ -205,7 +206,7 @@ class _Writer:
         # Every frame is decoded here, before anything of the episode is written.
         shapes = {name: self._shape(name, of, unusable) for name, of in frames.items()}
         self._dtypes, self._shapes = dtypes, shapes
-        return _Episode(i, columns, frames, _texts(record, steps))
+        return _Episode(i, columns, frames, find_instructions(record, steps))
 
     def _shape(
         self, camera: str, frames: Sequence[SourceFrame], unusable: Callable[[str], EpisodeError]
@@ -377,12 +378,3 @@ def _place(number: int) -> dict[str, int]:
 
 def _named(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
     return {f"{prefix}/{key}": value for key, value in values.items()}
-
-
-def _texts(record: Mapping[str, Any], steps: int) -> list[str]:
-    """The task of every step; "" where the source has none."""
-    for key in INSTRUCTION_KEYS:
-        texts = record.get(key, ())
-        if len(texts) == steps and isinstance(texts[0], bytes):
-            return [text.decode(errors="replace") for text in texts]
-    return [""] * steps

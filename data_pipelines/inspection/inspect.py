@@ -30,7 +30,7 @@ from data_pipelines.sources.source import (
     EpisodeSource,
     SourceFrame,
     decode_frame,
-    find_instruction,
+    find_instructions,
 )
 from hma_jax.config import require
 
@@ -389,7 +389,7 @@ def _example(i: int, steps: int, record: dict, times: tuple[int, ...], looked: d
     success = record.get(SUCCESS_KEY)
     known = isinstance(success, np.ndarray) and len(success) == 1
     flag = bool(success[0]) if known else None
-    return ExampleEpisode(i, steps, flag, find_instruction(record), times, shrink(looked), actions)
+    return ExampleEpisode(i, steps, flag, find_instructions(record, steps)[0], times, shrink(looked), actions)
 
 
 def _size(values: np.ndarray | list[bytes]) -> int:

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 INSTRUCTION_KEY = "steps/language_instruction"
 
-INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
+CODE_POINTS_KEY = "steps/observation/instruction"
+"""Where Language Table keeps the text of a task, as code points with zeros behind them."""
+
+INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction", CODE_POINTS_KEY)
 """Where RLDS datasets keep the text of a task."""
 
 SUCCESS_KEY = "episode_metadata/success"
@@ -238,11 +241,30 @@ def same_rate(hz: float, other: float) -> bool:
     return math.isclose(hz, other, rel_tol=1e-5)
 
 
-def find_instruction(record: Mapping[str, Any]) -> str:
-    """The first step's text in a record that was read with INSTRUCTION_KEYS; "" where it has none."""
-    found = (record.get(key, ()) for key in INSTRUCTION_KEYS)
-    text = next((values[0] for values in found if len(values) and isinstance(values[0], bytes)), b"")
-    return text.decode(errors="replace")
+def vector_sizes(features: Mapping[str, FlatFeature]) -> dict[str, int]:
+    """How many values a step has in each vector that is an action or was observed, by flat key. Besides them sources
+    have flags, rewards, and texts as code points or embeddings."""
+    return {
+        key: f.size
+        for key, f in features.items()
+        if f.size and not f.image and not f.encoding and key.startswith(("steps/observation/", "steps/action"))
+        and "embedding" not in key and key not in INSTRUCTION_KEYS
+    }  # fmt: skip
+
+
+def find_instructions(record: Mapping[str, Any], steps: int) -> list[str]:
+    """The text of every step in a record that was read with INSTRUCTION_KEYS; "" where it has none. One text alone is
+    that of all steps."""
+    for key in INSTRUCTION_KEYS:
+        values = record.get(key, ())
+        if len(values) and isinstance(values[0], bytes):
+            texts = [text.decode(errors="replace") for text in values]
+            return texts if len(texts) == steps else texts[:1] * steps
+    points = record.get(CODE_POINTS_KEY, ())
+    if isinstance(points, np.ndarray) and points.dtype.kind in "iu" and steps and points.size % steps == 0:
+        if ((points == 0) | ((points >= ord(" ")) & (points <= ord("~")))).all():  # other numbers are ids of words
+            return ["".join(map(chr, row[row > 0])) for row in points.reshape(steps, -1)]
+    return [""] * steps
 
 
 def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception]) -> np.ndarray:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments.study_setup import UNSET, command, require_local, use_entries
 from experiments.terminal.progress import Eta, console, say, step, wrote
+from experiments.terminal.words import counted
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.config.base import require_seed
 
@@ -31,6 +31,9 @@ def generate(
     clips: int = 4,
     unmask_steps: Annotated[int | None, arg(name="unmask-steps", metavar="M"), UNSET] = None,
     temperature: Annotated[float | None, UNSET] = None,
+    recorded: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
+    allow_clipping: Annotated[FlagCreatePairsOff[bool], arg(name="allow-clipping"), UNSET] = False,
+    skip_damaged: Annotated[FlagCreatePairsOff[bool], arg(name="skip-damaged"), UNSET] = False,
     tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
     registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
@@ -53,23 +56,30 @@ def generate(
         batch: Episodes generated at the same time. By rounding, it has an effect on the frames.
         clips: Number of episodes that are also written as MP4, the recording on the left. With 0, PyAV is not needed.
         unmask_steps: Unmasking steps per frame. Default: as in RUN/decode.json.
-        temperature: Temperature at which tokens are sampled. Default: as in RUN/decode.json.
+        temperature: Temperature at which tokens or latents are sampled. Default: as in RUN/decode.json.
+        recorded: Also write the recordings of the same episodes in the same layout, as ROBOT_recorded or NAME_recorded,
+            so that policies can be trained on both.
+        allow_clipping: Replay actions even if most values of one of them lie outside the robot's range.
+        skip_damaged: Leave out damaged episodes and count them, instead of stopping.
         tokenizer: Directory of the tokenizer that the model was trained with, if it is not beside RUN.
         registry: TOML file with your own registry entries.
     """
     from data_pipelines.convert.write import convert
+    from data_pipelines.errors import DataError, EpisodeError, without_advice
     from data_pipelines.names import made_name
     from data_pipelines.sources.convertible import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
+    from experiments.applications.generating.survey import survey
     from experiments.applications.generating.trajectories import (
+        describe_lacking,
         describe_reconstruction,
         describe_training,
         open_trajectories,
     )
     from experiments.applications.simulators import DEAF, load_simulator
     from experiments.running.workspace import Workspace
-    from hma_jax.simulator.folder import find_decode
+    from hma_jax.simulator.folder import change_decode, find_decode
 
     require_local("--out", out)
     require(given >= 1, f"--given must be at least 1, got {given}")
@@ -80,8 +90,7 @@ def generate(
     if clips:
         require_module("av", f"--clips {clips}")
     use_entries(registry)
-    given_decode = {"unmask_steps": unmask_steps, "temperature": temperature}
-    decode = replace(find_decode(run), **{key: x for key, x in given_decode.items() if x is not None})
+    decode = change_decode(find_decode(run), temperature, unmask_steps=unmask_steps)
     simulator = load_simulator(
         run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,
         decode=decode, history=1,
@@ -90,40 +99,59 @@ def generate(
         say(f"note: {DEAF}")
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
-    recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)
-    if note := describe_reconstruction(recorded):
-        say(note)
-    count = len(recorded) if episodes is None else min(episodes, len(recorded))
-    if note := describe_training(recorded, count, stores):
-        say(note)
+    found, driven = open_trajectories(
+        actions, split, named, robots, simulator.tokenizer, stores, skip_damaged=skip_damaged
+    )
+    count = len(found) if episodes is None else min(episodes, len(found))
+    for note in (describe_reconstruction(found), describe_lacking(found), describe_training(found, count, stores)):
+        if note:
+            say(note)
     mark = checkpoint_hash(run, simulator.model.step)
-    source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)
     called, eta = name or made_name(f"{driven.name}_generated"), Eta()
-    with step(f"generate {count} episodes of {driven.name}") as update:
-        done = convert(
-            source, out, called, shard_bytes=SHARD_BYTES, origin=source.origin() | {"run": str(run)},
-            progress=lambda n, total, unit: update(n, total, unit + eta(n, total)),
+    twin = f"{name}_recorded" if name else made_name(f"{driven.name}_recorded")
+    try:
+        with step(f"read the actions of {counted(count, 'episode')}") as update:
+            known = survey(found, count, driven, update)
+        if not allow_clipping:
+            known.require_raw_units()
+        if said := known.describe():
+            say(f"note: {said}. Are these its raw units?")
+        source = GeneratedSource(
+            simulator, driven, found, given=given, count=count, seed=seed, checkpoint=mark,
+            knows_success=known.knows_success,
         )  # fmt: skip
+        origin = {"clipped": known.shares(), "run": str(run)}
+        with step(f"generate {counted(count, 'episode')} of {driven.name}") as update:
+            done = convert(
+                source, out, called, shard_bytes=SHARD_BYTES, origin=source.origin() | origin,
+                progress=lambda n, total, unit: update(n, total, unit + eta(n, total)),
+            )  # fmt: skip
+        if recorded:
+            with step(f"write the recordings as {twin}") as update:
+                same = source.twin()
+                beside = convert(same, out, twin, origin=same.origin() | origin, progress=update)
+    except EpisodeError as error:
+        raise DataError(f"{without_advice(str(error))} Add --skip-damaged to leave it out.") from error
     for reason, left in done.skipped.items():
         say(f"left out {left:,} x: {reason}")
     with step("compare with the recordings") as update:
-        comparison = compare(done.directory, recorded, given, clips, source.hz, update)
+        comparison = compare(done.directory, found, given, clips, source.hz, update)
     _print_comparison(comparison, done.episodes)
     written = [done.directory, done.directory.parent / "psnr.csv"]
     written += [done.directory.parent / "clips"] if clips else []
+    written += [beside.directory] if recorded else []
     wrote(*written, then=command("data inspect", done.directory, "--entry", f"{called}.toml"))
 
 
 def _print_comparison(comparison: Comparison, episodes: int) -> None:
     """PSNR of the generated frames and of a still picture, with intervals over episodes if there are several."""
     generated, still = comparison
-    counted, of_generated, of_still = "1 episode", " (one alone has no interval)", ""
+    of_generated, of_still = " (one alone has no interval)", ""
     if episodes > 1:
-        counted = f"{episodes:,} episodes"
         of_generated = f" ({generated.low:.2f} to {generated.high:.2f}, 95 % over episodes)"
         of_still = f" ({still.low:.2f} to {still.high:.2f})"
     console.print(
-        f"{counted}. PSNR against the recording {generated.mean:.2f} dB{of_generated}; a still picture "
+        f"{counted(episodes, 'episode')}. PSNR against the recording {generated.mean:.2f} dB{of_generated}; a still picture "
         f"{still.mean:.2f}{of_still}",
         soft_wrap=True,
     )

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from data_pipelines.errors import EpisodeError
 from experiments.applications.generating.source import confined
 from experiments.applications.generating.trajectories import Trajectories, Trajectory, describe
 from experiments.applications.policies.closed_loop import MOST_TRIED, run_policy, start_distances, start_seeds
@@ -30,7 +31,7 @@ class Training:
     learning_rate: float = 2e-3
     given: int = 1  # recorded frames that a generated trajectory begins with
     with_given: bool = False  # policies are trained on these, too
-    temperature: float = 0.0  # at which tokens are sampled, whatever a run's decode.json says; 0: greedy decoding
+    temperature: float = 0.0  # of sampling, whatever a run's decode.json says; 0: greedy decoding
 
     def __post_init__(self) -> None:
         """Raises ConfigError."""
@@ -162,7 +163,11 @@ class RecordedSource:
         for i in range(len(trajectories)):
             if len(longer) == count:
                 break
-            one = trajectories[i]
+            try:
+                one = trajectories[i]
+            except EpisodeError as error:
+                trajectories.skip(i, error)
+                continue
             if len(one) > self.settings.given:
                 longer.append(one)
         return longer

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from data_pipelines.errors import EpisodeError, without_advice
 from data_pipelines.registry import DatasetSpec, find_reader, get_spec
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.sources.open import open_source, source_name
 from data_pipelines.sources.rlds.images import fit_images
-from data_pipelines.sources.source import INSTRUCTION_KEYS, REWARD_KEY, find_instruction
+from data_pipelines.sources.rlds.schema import step_key
+from data_pipelines.sources.source import (
+    INSTRUCTION_KEYS,
+    MAX_SKIPPED,
+    REWARD_KEY,
+    find_instructions,
+    join_actions,
+    vector_sizes,
+)
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import FILE as MANIFEST
 from data_pipelines.tokens.manifest_file import load_manifest
@@ -34,7 +44,7 @@ class Trajectory:
     origin: str  # dataset/split/number
     images: np.ndarray  # uint8 [M, H, W, 3]
     chunks: np.ndarray  # float32 [M, stride, A], raw; the last one's effect is not seen
-    instruction: str = ""
+    instructions: Sequence[str] = ()  # the text at each frame, "" for none
 
     def __len__(self) -> int:
         """M."""
@@ -49,6 +59,14 @@ class Outline:
     success: bool | None  # whether it reached its goal, where the recording says so
 
 
+@dataclass(frozen=True)
+class Readings:
+    """What was recorded at the M frames of a trajectory besides them and the actions."""
+
+    observations: Mapping[str, np.ndarray] = field(default_factory=dict)  # float32 [M, size], as `observed` says
+    rewards: np.ndarray | None = None  # float32 [M]: the sum over each frame's chunk
+
+
 class Trajectories(ABC):
     """The recorded trajectories of one split, made when they are asked for."""
 
@@ -58,6 +76,7 @@ class Trajectories(ABC):
     fingerprint: str  # of its contents
     spec: DatasetSpec  # which camera and actions of it, at which rate
     reconstructed: bool = False  # whether images are what the tokenizer makes of tokens, for want of recorded ones
+    observed: Mapping[str, int] = {}  # sizes of the vectors that `readings` has, by their keys in a step
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -69,6 +88,19 @@ class Trajectories(ABC):
     @abstractmethod
     def outline(self, i: int) -> Outline:
         """Raises EpisodeError for an episode that cannot be read."""
+
+    @abstractmethod
+    def actions(self, i: int) -> np.ndarray:
+        """float32 [N, A]: all native actions, raw, without the frames. Raises EpisodeError as `outline`."""
+
+    def readings(self, i: int) -> Readings:
+        """Raises EpisodeError for an episode whose readings cannot be used."""
+        return Readings()
+
+    def skip(self, i: int, error: EpisodeError) -> str:
+        """Leaves out the damaged episode `i`; returns why, for people. Raises `error` where none may be damaged, and
+        DataError for too many."""
+        raise error
 
     @abstractmethod
     def rewards(self, i: int) -> np.ndarray | None:
@@ -85,9 +117,9 @@ class Trajectories(ABC):
 class RldsTrajectories(Trajectories):
     """Trajectories of a dataset in any format that is read in place."""
 
-    def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int, max_lost: int = 0):
-        """`max_lost`: how many episodes may be missing. Raises ConfigError for a dataset whose actions are not this
-        robot's, DataError for more damage."""
+    def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int, max_lost: float = 0):
+        """`max_lost`: how many episodes may be missing or damaged. Raises ConfigError for a dataset whose actions are
+        not this robot's, DataError for more damage."""
         self._source = open_source(directory, split, corrupt="skip" if max_lost else "raise", max_skipped=max_lost)
         self.spec, self._robot, self._size = spec, robot, size
         # The former one counts task texts, which are copied into what is generated.
@@ -95,6 +127,9 @@ class RldsTrajectories(Trajectories):
         self.drawn_as = self._source.name if spec.joins else spec.name
         _require_fit(spec, robot)
         self._source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+        sizes, start = vector_sizes(self._source.features), step_key("observation/")
+        observed = {key: size for key, size in sizes.items() if key.startswith(start)}
+        self.observed = {key.removeprefix(step_key("")): size for key, size in observed.items()}
 
     def __len__(self) -> int:
         return len(self._source)
@@ -103,12 +138,35 @@ class RldsTrajectories(Trajectories):
         spec = self.spec
         episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
         images = spec.correct(fit_images(episode.images, self._size))
-        instruction = find_instruction(self._source.record(i, INSTRUCTION_KEYS))
-        return _trajectory(self.origin(i), images, spec.convert(episode.actions), self._robot, instruction)
+        texts = find_instructions(self._source.record(i, INSTRUCTION_KEYS), episode.steps)
+        return _trajectory(self.origin(i), images, spec.convert(episode.actions), self._robot, texts)
 
     def outline(self, i: int) -> Outline:
         with self._source.open_episode(i, self.spec.image_key, self.spec.action_keys) as episode:
             return Outline(-(-episode.steps // self._robot.stride), episode.success)
+
+    def actions(self, i: int) -> np.ndarray:
+        with self._source.open_episode(i, self.spec.image_key, self.spec.action_keys) as episode:
+            return self.spec.convert(episode.actions)
+
+    def readings(self, i: int) -> Readings:
+        stride, keys = self._robot.stride, [step_key(key) for key in self.observed]
+        record, steps = self._source.record(i, [*keys, REWARD_KEY]), len(self.actions(i))
+
+        def unusable(what: str) -> EpisodeError:
+            return EpisodeError(f"{self.name}, episode {i}: {what}")
+
+        vectors = (join_actions(record, [key], self._source.features, steps, unusable)[::stride] for key in keys)
+        rewards = record.get(REWARD_KEY)
+        if isinstance(rewards, np.ndarray):
+            if rewards.shape != (steps,) or not np.isfinite(rewards).all():
+                raise unusable(f"it has no reward for each of its {steps} steps")
+            rewards = np.add.reduceat(rewards, np.arange(0, steps, stride)).astype(np.float32)
+        return Readings(dict(zip(self.observed, vectors, strict=True)), rewards)
+
+    def skip(self, i: int, error: EpisodeError) -> str:
+        self._source.skip(i, error)
+        return self._source.without_location(without_advice(str(error)))
 
     def rewards(self, i: int) -> np.ndarray | None:
         native = self._source.record(i, [REWARD_KEY]).get(REWARD_KEY)
@@ -155,7 +213,7 @@ class StoredTrajectories(Trajectories):
             images = np.array(episode.frames[:: self._every])
         else:
             images = np.asarray(self._tokenizer.decode(np.array(episode.tokens[:: self._every])))
-        return _trajectory(self.origin(i), images, episode.actions, self._robot, "")
+        return _trajectory(self.origin(i), images, episode.actions, self._robot, [""] * len(episode.actions))
 
     def _keeps(self, episode: StoredEpisode) -> bool:
         """Whether there are the recorded frames of an episode, of the size that the model's have."""
@@ -164,6 +222,9 @@ class StoredTrajectories(Trajectories):
     def outline(self, i: int) -> Outline:
         episode = self._store.episode(self.name, self.split, i)
         return Outline(len(episode.tokens[:: self._every]), episode.success)
+
+    def actions(self, i: int) -> np.ndarray:
+        return self._store.episode(self.name, self.split, i).actions
 
     def rewards(self, i: int) -> np.ndarray | None:
         return None  # a token store does not keep them
@@ -175,7 +236,14 @@ class StoredTrajectories(Trajectories):
 
 
 def open_trajectories(
-    place: str, split: str, robot: Robot | None, robots: dict[str, Robot], tokenizer: BaseTokenizer, stores: Path
+    place: str,
+    split: str,
+    robot: Robot | None,
+    robots: dict[str, Robot],
+    tokenizer: BaseTokenizer,
+    stores: Path,
+    *,
+    skip_damaged: bool = False,
 ) -> tuple[Trajectories, Robot]:
     """The trajectories at `place`, and who replays them: `robot`, or the one that the dataset, or the one that it is
     joined to, is called after.
@@ -183,7 +251,7 @@ def open_trajectories(
     `place` is a dataset's directory, one of a token store (`STORE/NAME`), or the name of a dataset in the token store
     `stores`. Raises ConfigError for what is none of them, or of no known robot, and for an entry that corrects images
     otherwise than that store was made; DataError for damage, but for as many episodes as were left out of the tokens of
-    the same dataset in `stores`.
+    the same dataset in `stores`, or with `skip_damaged` as many as that leaves out by default.
     """
     path = Path(place)
     if not path.exists() and stores.is_dir() and "/" not in place:
@@ -209,6 +277,7 @@ def open_trajectories(
         _require_corrections(get_spec(name), stores / name)
     learnt_from = stores / name / MANIFEST
     max_lost = load_manifest(learnt_from).skipped_count if learnt_from.is_file() else 0
+    max_lost = max(max_lost, MAX_SKIPPED if skip_damaged else 0)
     return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size, max_lost), chosen
 
 
@@ -221,6 +290,16 @@ def describe_reconstruction(recorded: Trajectories) -> str:
         f"note: the token store has no frames of {recorded.name}, split {recorded.split}. PSNR is computed against "
         "frames decoded from tokens, so it does not contain the error of the tokenizer; to avoid this, give the "
         "directory of the recordings"
+    )
+
+
+def describe_lacking(recorded: Trajectories) -> str:
+    """A note for the user on what a token store does not keep; '' where there are the recordings themselves."""
+    if not isinstance(recorded, StoredTrajectories):
+        return ""
+    return (
+        "note: a token store keeps neither texts nor observed vectors and rewards: language_instruction will be empty and "
+        "reward 0. If policies need them, give the directory of the recordings"
     )
 
 
@@ -276,13 +355,13 @@ def require_layout(recorded: Trajectories, robot: Robot, table: EmbodimentTable)
         recorded.spec.check_layout(table.entries[table.index(robot.name)])
 
 
-def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Robot, instruction: str) -> Trajectory:
+def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Robot, texts: Sequence[str]) -> Trajectory:
     """Frames every `stride` native steps, and all actions between them; of a last chunk that is not whole, the last
-    action is held."""
+    action is held. `texts`: of all native steps."""
     missing = len(images) * robot.stride - len(actions)
     held = np.concatenate([actions, np.repeat(actions[-1:], max(missing, 0), 0)])[: len(images) * robot.stride]
     chunks = held.reshape(len(images), robot.stride, robot.action_dim).astype(np.float32)
-    return Trajectory(origin, images, chunks, instruction)
+    return Trajectory(origin, images, chunks, tuple(texts[:: robot.stride]))
 
 
 def rewards_of_frames(native_N: np.ndarray, stride: int) -> np.ndarray:

@@ -100,7 +100,7 @@ class RecordedTruth:
         self.held_out = sorted((i for kind in kinds for i in kind[: len(kind) // HELD_OUT]), key=usable.index)
         self.learnt = [i for i in usable if i not in set(self.held_out)]
         frames = task.frames or int(np.ceil(np.quantile(length[kinds[0]], MOST))) - 1  # one is the start's
-        instruction = recorded[self.held_out[0]].instruction
+        instruction = recorded[self.held_out[0]].instructions[0]
         # As starts in true worlds do, those begin before their goal is reached, of which that is known.
         self._begun_from = [i for i in self.held_out if self._reached is None or not self._reached[i][0]]
         require(

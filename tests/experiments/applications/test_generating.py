@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 
 from data_pipelines.convert import write as convert_module
-from data_pipelines.errors import DataError
+from data_pipelines.convert.episode import encode
+from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.lerobot_dataset import LeRobotDataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.source import SUCCESS_KEY, find_instructions
 from data_pipelines.suite.generate import generate_suite
 from data_pipelines.tokens.store import TokenStore
 from experiments.applications.generating import source as source_module
 from experiments.applications.generating import trajectories as trajectories_module
+from experiments.applications.generating.survey import survey
 from experiments.applications.generating.trajectories import describe, describe_training, open_trajectories
 from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
@@ -43,6 +47,20 @@ def recorded(tmp_path_factory):
     root = tmp_path_factory.mktemp("suite")
     (directory,) = generate_suite(root, scale=0.01, validation=5, names=["pusher_sand"])
     return directory
+
+
+@pytest.fixture
+def gnm(tmp_path):
+    """(simulator, spec) of a model that knows a robot of two actions at stride 2, in `tmp_path / "study"`."""
+    spec = get_spec("berkeley_gnm_cory_hall")
+    entry = Embodiment(spec.name, 2, 2, (0.0,) * 2, (1.0,) * 2, layout=spec.action_layout())
+    return load_simulator(make_run(tmp_path / "study", table=EmbodimentTable((*TABLE.entries, entry)))), spec
+
+
+def opened(simulator, spec, place, **options):
+    """The recordings at `place`, as the robot that `spec` is called after sees them."""
+    robot, none = simulator.robot(spec.name), place.parent / "no store"
+    return open_trajectories(str(place), "train", robot, {}, simulator.tokenizer, none, **options)[0]
 
 
 def generate(run, recorded, out, *more: str) -> int:
@@ -96,12 +114,12 @@ def test_recorded_actions_are_replayed_and_a_killed_command_goes_on(run, recorde
 
 
 def test_what_was_made_under_other_ranges_of_actions_is_not_taken_for_the_same(run, recorded, tmp_path, capsys):
-    assert generate(run, recorded, tmp_path, "--episodes", "1") == 0
+    assert generate(run, recorded, tmp_path, "--episodes", "1", "--allow-clipping") == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "1 episode. PSNR" in said and "(one alone has no interval); a still" in said and "nan" not in said
     save_robots([replace(ROBOT, low=tuple(x / 2 for x in ROBOT.low))], run / "robots.json")
     try:
-        assert generate(run, recorded, tmp_path, "--episodes", "1") == 2
+        assert generate(run, recorded, tmp_path, "--episodes", "1", "--allow-clipping") == 2
     finally:
         (run / "robots.json").unlink()
     assert "was made from another source, with other settings or by an earlier version" in " ".join(
@@ -173,7 +191,7 @@ def test_frames_that_are_corrected_otherwise_than_those_a_model_learnt_from_are_
 
 
 def test_recordings_may_lack_as_many_episodes_as_were_left_out_of_their_tokens(tmp_path):
-    """The model was trained without them; `hma generate` and `hma judge` have no option of their own for it."""
+    """The model was trained without them; `hma judge` has no option of its own for it."""
     spec = get_spec("berkeley_gnm_cory_hall")
     entry = Embodiment(spec.name, 2, 2, (0.0,) * 2, (1.0,) * 2, layout=spec.action_layout())
     simulator = load_simulator(make_run(tmp_path / "study", table=EmbodimentTable((*TABLE.entries, entry))))
@@ -188,6 +206,104 @@ def test_recordings_may_lack_as_many_episodes_as_were_left_out_of_their_tokens(t
     tokenize_dataset(spec, rlds, simulator.tokenizer, tokens, min_val=1, corrupt="skip")
     recorded = opened()
     assert len(recorded) == len(set(recorded.ids().tolist())) == 4
+
+
+def with_texts(e: int, features: dict) -> None:
+    """Two texts in an episode of 9 steps, whose later frames and actions are those of a damaged one if e is 1."""
+    features["steps/language_instruction"] = [b"open"] * 4 + [b"close"] * 5
+    if e == 1:
+        features["steps/observation/image"][4] = b"no image"
+
+
+def source_of(simulator, spec, recorded, **options):
+    given = {"given": 1, "count": len(recorded), "seed": 0, "checkpoint": ""}
+    return source_module.GeneratedSource(simulator, simulator.robot(spec.name), recorded, **given | options)
+
+
+def test_texts_rewards_and_success_are_those_of_the_recording(gnm, tmp_path):
+    """An episode had its first text, the reward 0 and no success."""
+    simulator, spec = gnm
+    place = write_rlds(tmp_path, spec, [9, 9], change=with_texts, rewards=lambda e: np.arange(9))
+    twin = source_of(simulator, spec, opened(simulator, spec, place), count=1, knows_success=True).twin()
+    (episode,) = twin.read(0)
+    assert list(episode.instructions) == ["open"] * 2 + ["close"] * 3
+    assert episode.rewards.tolist() == [1, 5, 9, 13, 8] and episode.success is False
+    encode(episode, twin.layout)
+
+
+def test_texts_as_code_points_are_read():
+    """As Language Table has them."""
+    points = np.array([[*b"push", 0, 0], [*b"pull", 0, 0]])
+    assert find_instructions({"steps/observation/instruction": points.ravel()}, 2) == ["push", "pull"]
+    assert find_instructions({"steps/observation/instruction": np.array([3, 3])}, 2) == ["", ""]
+
+
+def test_a_damaged_episode_stops_the_command_or_is_left_out(gnm, tmp_path):
+    simulator, spec = gnm
+    place = write_rlds(tmp_path, spec, [9] * 3, change=with_texts)
+
+    def read(**options):
+        source = source_of(simulator, spec, opened(simulator, spec, place, **options)).twin()
+        return [item for unit in range(len(source.units)) for item in source.read(unit)]
+
+    with pytest.raises(EpisodeError, match="episode 1 .*step 4 of .* cannot be decoded"):
+        read()
+    found = read(skip_damaged=True)
+    assert [getattr(item, "origin", "left out") for item in found] == [
+        f"recorded/{spec.name}/train/0", "left out", f"recorded/{spec.name}/train/2"
+    ]  # fmt: skip
+    assert "corrupt=" not in found[1].reason and str(tmp_path) not in found[1].reason
+
+
+def test_actions_in_other_units_are_told_and_refused(gnm, tmp_path):
+    """They were clipped, and nothing said so."""
+    simulator, spec = gnm
+    robot, recorded = simulator.robot(spec.name), opened(simulator, spec, write_rlds(tmp_path, spec, [4, 9]))
+    known = survey(recorded, 2, robot)  # its second value is the number of the step; the range ends at 3
+    assert known.shares() == {"action 1": round(5 / 13, 6)} and known.knows_success
+    assert "(38 % of action 1): action 1 of 0 to 8 is outside the range" in known.describe()
+    known.require_raw_units()
+    assert survey(recorded, 1, robot).describe() == ""
+    other = replace(robot, low=(-3.0, -3.0), high=(3.0, 1.0))
+    with pytest.raises(ConfigError, match="hardly its raw units.*--allow-clipping"):
+        survey(recorded, 2, other).require_raw_units()
+
+
+def test_another_rate_of_the_recordings_is_another_dataset(gnm, tmp_path):
+    simulator, spec = gnm
+    recorded = opened(simulator, spec, write_rlds(tmp_path, spec, [9]))
+    known = source_of(simulator, spec, recorded).identity()
+    recorded.spec = replace(spec, hz=2 * spec.hz)
+    assert source_of(simulator, spec, recorded).identity() != known
+
+
+def test_the_recorded_twin_has_the_layout_and_actions_of_what_was_generated(run, recorded, tmp_path):
+    assert generate(run, recorded, tmp_path, "--episodes", "2", "--recorded") == 0
+    places = [tmp_path / f"pusher_sand_{kind}" / "1.0.0" for kind in ("generated", "recorded")]
+    assert len({(place / "features.json").read_bytes() for place in places}) == 1
+    made, twin = map(RldsDataset, places)
+    source, keys = RldsDataset(recorded, "val"), ["steps/observation/state", "steps/observation/position"]
+    for i in range(2):
+        mine, truth = (one.episode(i, "observation/image", ("action",)) for one in (made, twin))
+        np.testing.assert_array_equal(mine.actions, truth.actions)
+        np.testing.assert_array_equal(mine.images[:3], truth.images[:3])
+        for key in keys:
+            rows = source.record(i, [key])[key].reshape(len(source.episode(i, "observation/image", ()).images), -1)
+            np.testing.assert_array_equal(made.record(i, [key])[key].reshape(len(mine.images), -1), rows[::2])
+        assert mine.success is truth.success is source.episode(i, "observation/image", ()).success
+    about = [json.loads((place / "metadata.json").read_text()) for place in places]
+    assert about[0]["action"] == about[1]["action"] == {
+        "shape": [2, 2], "values": ["xy x", "xy y"], "fields": ["action"], "rows_per_second": 4.0
+    }  # fmt: skip
+    assert about[0]["clipped"] == about[1]["clipped"] and about[0]["clipped"].keys() <= {"xy x", "xy y"}
+
+    assert main(["data", "export", str(places[0]), "--out", str(tmp_path / "lerobot")]) == 0
+    exported = LeRobotDataset(tmp_path / "lerobot")
+    assert exported.hz == 2
+    for i in range(2):
+        for key in (*keys, "steps/action", "steps/reward", "steps/language_instruction", SUCCESS_KEY):
+            theirs, ours = (one.record(i, [key])[key] for one in (exported, made))
+            np.testing.assert_array_equal(np.asarray(theirs).ravel(), np.asarray(ours).ravel())
 
 
 def episode_seed(i: int) -> int:

@@ -251,7 +251,7 @@ def test_every_format_says_how_long_a_recording_is_whether_it_succeeded_and_what
         zeros = (0.0,) * spec.action_dim
         recorded = RldsTrajectories(str(place), "train", spec, Robot(spec.name, 2, zeros, zeros, zeros), 8)
         assert [recorded.outline(i) for i in range(2)] == [Outline(*one) for one in outlines]
-        assert len(recorded[0]) == outlines[0][0] and recorded[0].instruction == task
+        assert len(recorded[0]) == outlines[0][0] and recorded[0].instructions[0] == task
         assert len(set(recorded.ids().tolist())) == len(recorded)
 
 
