@@ -3,10 +3,14 @@
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from data_pipelines.suite.simulator import suite_robot
+from data_pipelines.suite.rollout import episode_seeds, simulate
+from data_pipelines.suite.simulator import SPECS, suite_robot
+from experiments.applications.detector_network import Detections
 from experiments.applications.endurance import hidden
+from experiments.applications.scenes import point_names, points_of
 from hma_jax.config import ConfigError, DecodeConfig
 
 ROBOT = suite_robot("pusher_sand", (-8.0, -8.0), (8.0, 8.0), (0.0, 0.0), 1)
@@ -51,3 +55,24 @@ def test_models_of_one_directory_have_their_own_tables(watch, tmp_path):
 def test_where_nothing_is_hidden_that_is_said(watch):
     with pytest.raises(ConfigError, match="no object is hidden and comes back in held-out episodes of pusher_sand"):
         watch("first", some=False)
+
+
+def test_a_row_says_how_far_its_object_moved_since_it_was_last_seen():
+    spec, lag = SPECS[ROBOT.name], 20
+    rollout = simulate(spec, episode_seeds(spec, 4, 0, "val"))
+    positions = [
+        points_of(spec, np.repeat(seed, len(q)), q, objects).position
+        for seed, q, objects in zip(rollout.seeds, rollout.q, rollout.objects, strict=True)
+    ]
+    far = [np.linalg.norm(at[3 + lag] - at[3], axis=-1)[1:] for at in positions]  # without the tool
+    episode = int(np.argmax([x.max() for x in far]))
+    point = 1 + int(far[episode].argmax())
+    images, points = np.zeros((1, 64, 64, 3), np.uint8), len(point_names(spec))
+    simulator = SimpleNamespace(
+        robots={ROBOT.name: ROBOT}, tokenizer=SimpleNamespace(image_size=64), reset=lambda *_, **__: images,
+        step=lambda _: images,
+    )  # fmt: skip
+    detector = SimpleNamespace(detect=lambda *_: Detections(np.zeros((1, points, 2)), np.zeros((1, points))))
+    event = hidden.Event("control", episode, 3, point, 0, lag)
+    (row,) = hidden.judge(simulator, detector, spec, rollout, [event])
+    assert row["moved_px"] == pytest.approx(far[episode].max()) and row["moved_px"] > 4
