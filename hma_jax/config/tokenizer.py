@@ -9,6 +9,9 @@ from hma_jax.config.base import check_fields, require, require_seed
 ImageSize = int | tuple[int, int]
 """Pixels along the sides of an image: one number for a square, else (height, width)."""
 
+ENTROPY_BITS = 12
+"""Bits of a factor, at most, whose entropies are computed: they take an array of all its codes for every token."""
+
 
 class TokenGrid:
     """What follows from `image_size` and `token_size`: tokens on a grid, row by row."""
@@ -110,10 +113,15 @@ class TokenizerConfig(TokenGrid):
         )
         require(self.bits <= 24, f"tokenizer.bits must be at most 24, got {self.bits}")
         require(
-            self.bits // self.factors <= 12,
-            f"tokenizer.factors {self.factors}: a factor of {self.bits // self.factors} bits is too wide "
-            "for the entropy loss (at most 12); use more factors",
+            self.has_entropies or not self.entropy_weight,
+            f"tokenizer.factors {self.factors}: a factor of {self.bits // self.factors} bits is too wide for the entropy "
+            f"loss (at most {ENTROPY_BITS}); use more factors, or entropy_weight=0",
         )
+
+    @property
+    def has_entropies(self) -> bool:
+        """Whether training computes the entropies of the codes, if only to record them."""
+        return self.bits // self.factors <= ENTROPY_BITS
 
     @property
     def token_size(self) -> int:

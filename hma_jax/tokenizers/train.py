@@ -127,8 +127,10 @@ def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dic
     """(weighted sum, terms): losses that keep latents [B, S, bits] close to their codes, and all codes in use."""
     if not (config.entropy_weight or config.commitment_weight):
         z = jax.lax.stop_gradient(z)  # they are measured only: their gradient, all zeros, is not computed
-    uncertainty, diversity = entropies(z, config.factors, config.entropy_temperature)
     commit = commitment(z)
+    if not config.has_entropies:
+        return config.commitment_weight * commit, {"commitment": commit}
+    uncertainty, diversity = entropies(z, config.factors, config.entropy_temperature)
     total = config.entropy_weight * (uncertainty - diversity) + config.commitment_weight * commit
     return total, {"uncertainty": uncertainty, "diversity": diversity, "commitment": commit}
 

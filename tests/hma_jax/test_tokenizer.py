@@ -274,6 +274,18 @@ def test_regularisers_reach_loss_and_encoder():
         assert not np.allclose(moved, at_rest)
 
 
+def test_a_wide_factor_is_trained_but_has_no_entropies():
+    """They take an array of all codes for each token."""
+    wide = {"bits": 13, "factors": 1}
+    with pytest.raises(ConfigError, match="a factor of 13 bits is too wide for the entropy loss"):
+        replace(CONFIG, **wide, entropy_weight=0.1)
+    config = replace(CONFIG, **wide, encoder_blocks=0, decoder_blocks=0, commitment_weight=0.5)
+    declared, key = declare_tokenizer(config), jax.random.key(0)
+    shapes = declared.shapes(), jax.ShapeDtypeStruct((4, 16, 16, 3), jnp.uint8)
+    _, terms = jax.eval_shape(lambda params, images: tokenizer_loss(declared, params, images, config, key), *shapes)
+    assert set(terms) == {"loss", "psnr", "commitment"}
+
+
 def train(run_dir: Path, *, config=CONFIG, settings=TRAIN, last_step: int | None = None, **options):
     """Trains on random scenes; the source breaks after `last_step` batches."""
 
