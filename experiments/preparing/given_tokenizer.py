@@ -1,4 +1,5 @@
-"""A tokenizer that is given to a study: copied from where it was trained, or refused, and what it may know is told."""
+"""A tokenizer that is given to a study: copied from where it was trained, or refused; what it may know is told, and how
+well it reconstructs the study's frames."""
 
 from __future__ import annotations
 
@@ -10,12 +11,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_pipelines.publishing.files import publish
-from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, read_stamp, require_same
+from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, differences, read_stamp, require_same
 from experiments.preparing.sources import Source, open_source
-from experiments.preparing.tokenizer import OF_FRAMES, TRAINED, require_same_trained
+from experiments.preparing.tokenizer import (
+    OF_FRAMES,
+    QUALITY,
+    TRAINED,
+    frames_made_from,
+    make_frames,
+    reconstruction_psnr,
+    require_same_trained,
+    save_quality,
+    seen,
+)
 from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.terminal.progress import say
+from experiments.terminal.progress import say, step
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
@@ -30,6 +41,9 @@ GIVEN = "given with --tokenizer, identity"
 TRAINED_FROM = "trained_from"
 """In the stamp of a copy: the inputs of the training, where they are known. Its identity alone tells it from other
 tokenizers."""
+
+JUDGED = "judged_on.json"
+"""Beside a tokenizer that was given: by which frames it was judged, as the inputs of a stamp."""
 
 
 def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
@@ -66,6 +80,27 @@ def adopt_tokenizer(
     known = {TRAINED_FROM: training.inputs} if training.inputs else {}
     dataclasses.replace(training, inputs={ORIGIN: _given(tokenizer)} | known).save(aside)
     publish(aside, workspace.tokenizer)
+
+
+def judge_tokenizer(
+    study: Study, workspace: Workspace, sources: Sequence[Source], *, threads: int | None = None
+) -> None:
+    """How well the workspace's tokenizer, which was given, reconstructs frames that the study holds out: said, and
+    written beside it; nothing is done if it was judged by the same frames. `threads` as in `make_frame_loader`."""
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    place, sources = workspace.tokenizer, seen(study, sources)
+    before = read_stamp(place, JUDGED) or read_stamp(place)  # one that was trained here was judged then
+    frames = frames_made_from(study, sources, before)
+    known = {name: before.inputs[name] for name in frames if name in before.inputs} if before else {}
+    if (place / QUALITY).exists() and not differences(known, frames):
+        return
+    tokenizer = load_tokenizer(place)
+    held_out = make_frames(study, sources, tokenizer.image_size, split="val", threads=threads)
+    with step("judge the tokenizer") as update:
+        quality = reconstruction_psnr(tokenizer, held_out, lambda done, total: update(done, total, "frames"))
+    save_quality(quality, place)
+    MadeFrom(frames).save(place, JUDGED)
 
 
 def _training(stamp: MadeFrom | None) -> MadeFrom:

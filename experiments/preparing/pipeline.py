@@ -13,7 +13,7 @@ from pathlib import Path
 
 from experiments.preparing.asked import write_asked
 from experiments.preparing.counterfactual import make_counterfactual
-from experiments.preparing.given_tokenizer import adopt_tokenizer
+from experiments.preparing.given_tokenizer import adopt_tokenizer, judge_tokenizer
 from experiments.preparing.made_from import Step
 from experiments.preparing.sources import find_sources, say_short_episodes
 from experiments.preparing.store import make_store
@@ -41,7 +41,8 @@ def prepare(
 
     `data` are directories of the user's datasets; () simulates the suite. Instead of training one, a trained
     `tokenizer` is taken from its directory. What follows from `replace` on may be made again in its place. `batch` and
-    `threads` as in `make_store`; a tokenizer is trained with as many threads. Raises ConfigError or DataError.
+    `threads` as in `make_store`; a tokenizer is trained and judged with as many threads. Raises ConfigError or
+    DataError.
     """
     require_plain(workspace.root)
     if study.eval.lpips:
@@ -55,6 +56,7 @@ def prepare(
         make_tokenizer(study, workspace, sources, replace, threads=threads)
     else:
         adopt_tokenizer(tokenizer, study, workspace, sources, replace)
+        judge_tokenizer(study, workspace, sources, threads=threads)
     make_store(study, workspace, sources, replace=replace, batch=batch, threads=threads)
     provenance = freeze_windows(study, workspace, replace)
     if not data and study.eval.other_actions and study.eval.context == "generated":

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -65,9 +66,22 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
     Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
     of where a dataset's frames are.
     """
+    inputs = {
+        ORIGIN: TRAINED,
+        "tokenizer": to_dict(study.tokenizer),
+        "tokenizer_train": to_dict(study.tokenizer_train),
+        **frames_made_from(study, sources, read_stamp(workspace.tokenizer)),
+    }
+    recorded = {"code": closure_hash(trace(SOURCES)), FRAMES: ENCODED}
+    return MadeFrom(inputs, recorded, describe_machine())
+
+
+def frames_made_from(study: Study, sources: Sequence[Source], existing: MadeFrom | None) -> dict[str, Any]:
+    """Which frames there are to train a tokenizer on and to judge it by; as inputs of a stamp, of which an `existing`
+    one may name recordings as earlier versions did."""
     from data_pipelines.sampling.order import ORDER_VERSION
 
-    settings, existing = study.store, read_stamp(workspace.tokenizer)
+    settings = study.store
     known = existing.inputs.get("data", {}) if existing else {}
     data = {
         spec.name: {
@@ -77,18 +91,13 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
         }
         for spec, path in sources
     }
-    inputs = {
-        ORIGIN: TRAINED,
-        "tokenizer": to_dict(study.tokenizer),
-        "tokenizer_train": to_dict(study.tokenizer_train),
+    return {
         "store": to_dict(settings.held_out),
         "tau": study.tau,
         "order": ORDER_VERSION,
         "datasets": list(data),
         "data": data,
     }
-    recorded = {"code": closure_hash(trace(SOURCES)), FRAMES: ENCODED}
-    return MadeFrom(inputs, recorded, describe_machine())
 
 
 def make_tokenizer(
@@ -104,48 +113,66 @@ def make_tokenizer(
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. `threads` as in `make_frame_loader`. Raises
     ConfigError if one is there that was made from other inputs, unless `replace` allows it.
     """
-    from data_pipelines.loading.frames import make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
-    config, train, settings = study.tokenizer, study.tokenizer_train, study.store
+    config, train = study.tokenizer, study.tokenizer_train
     require(
         isinstance(config, TokenizerConfig),
         "the study's tokenizer cannot be trained here; give the directory of an imported one with --tokenizer",
     )
-    sources = _seen(study, sources)
+    sources = seen(study, sources)
     made_from = tokenizer_made_from(study, workspace, sources)
     if _in_place(workspace.tokenizer, made_from, replace):
         return
-
-    def frames(start: int, split: str = "train") -> FrameLoader:
-        return make_frame_loader(
-            sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
-            held_out=settings.held_out, corrupt=settings.corrupt, max_skipped=settings.max_skipped, threads=threads,
-        )  # fmt: skip
-
-    held_out = frames(0, "val")  # raises before hours of training if there are none
+    frames = partial(make_frames, study, sources, config.image_size, threads=threads)
+    held_out = frames(split="val")  # raises before hours of training if there are none
     aside = workspace.root / f"tokenizer.{made_from.id}"  # never resumed with other inputs
     with step("train the tokenizer") as update:
         tokenizer = train_tokenizer(
             config, train, frames, aside, provenance=made_from.identity(),
             options=LoopOptions(checkpoint_every=train.steps // CHECKPOINTS),
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
-            records=lambda index: frames(0).describe(index),
+            records=lambda index: frames().describe(index),
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, held_out)
-    console.print(f"its reconstruction of held-out frames: {plus_minus(quality.mean, quality.sem)} dB PSNR")
-    write_file(aside / QUALITY, json.dumps(dataclasses.asdict(quality)))
+    save_quality(quality, aside)
     made_from.save(aside)
     publish(aside, workspace.tokenizer)
 
 
+def make_frames(
+    study: Study,
+    sources: Sequence[Source],
+    size: int,
+    start: int = 0,
+    *,
+    split: Literal["train", "val"] = "train",
+    threads: int | None = None,
+) -> FrameLoader:
+    """Batches of frames of `size` x `size` pixels for the tokenizer of a study, from batch `start` on."""
+    from data_pipelines.loading.frames import make_frame_loader
+
+    train, settings = study.tokenizer_train, study.store
+    return make_frame_loader(
+        sources, size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
+        held_out=settings.held_out, corrupt=settings.corrupt, max_skipped=settings.max_skipped, threads=threads,
+    )  # fmt: skip
+
+
+def save_quality(quality: Stat, directory: Path) -> None:
+    """Tells the PSNR of a tokenizer's reconstruction, and writes it beside the tokenizer."""
+    console.print(f"its reconstruction of held-out frames: {plus_minus(quality.mean, quality.sem)} dB PSNR")
+    write_file(directory / QUALITY, json.dumps(dataclasses.asdict(quality)))
+
+
 def require_same_trained(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
     """Raises ConfigError if the workspace has another tokenizer than the study would train."""
-    _in_place(workspace.tokenizer, tokenizer_made_from(study, workspace, _seen(study, sources)), None)
+    _in_place(workspace.tokenizer, tokenizer_made_from(study, workspace, seen(study, sources)), None)
 
 
-def _seen(study: Study, sources: Sequence[Source]) -> list[Source]:
+def seen(study: Study, sources: Sequence[Source]) -> list[Source]:
+    """The sources that a tokenizer is trained on and judged by: all but those of unseen robots."""
     return [(spec, path) for spec, path in sources if spec.name not in study.unseen]
 
 
@@ -166,10 +193,13 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     return True
 
 
-def reconstruction_psnr(tokenizer: Tokenizer, frames: FrameLoader) -> Stat:
+def reconstruction_psnr(
+    tokenizer: Tokenizer, frames: FrameLoader, progress: Callable[[int, int], None] | None = None
+) -> Stat:
     """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames from the first batch of `frames` on.
 
-    Every frame counts equally; the error counts episodes, within each dataset.
+    Every frame counts equally; the error counts episodes, within each dataset. `progress` is called with the number of
+    frames that are done, and that of all.
     """
     from hma_jax.evaluation.metrics import psnr
     from hma_jax.evaluation.statistics import mean_and_sem, stratified
@@ -180,7 +210,10 @@ def reconstruction_psnr(tokenizer: Tokenizer, frames: FrameLoader) -> Stat:
         values.append(np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)))
         for column, own in zip((datasets, episodes), frames.episodes(number), strict=True):
             column.append(own)
-        if sum(map(len, values)) >= QUALITY_FRAMES:
+        done = sum(map(len, values))
+        if progress is not None:
+            progress(done, QUALITY_FRAMES)
+        if done >= QUALITY_FRAMES:
             break
     value, dataset, episode = (np.concatenate(parts) for parts in (values, datasets, episodes))
     stats = [mean_and_sem(value[dataset == d], episode[dataset == d]) for d in np.unique(dataset)]

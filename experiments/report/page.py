@@ -161,7 +161,7 @@ def _headline(
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
                  f"dB; a control: should be zero within {EACH:g} standard errors"),
         ]  # fmt: skip
-    if quality := _tokenizer_quality(workspace):  # not known of one that was given
+    if quality := _tokenizer_quality(workspace):  # earlier versions did not judge one that was given
         cards.append(card("tokenizer PSNR", quality, "dB, reconstruction of held-out frames"))
     unfinished = sum(state.event != FINISHED for state in states.values())
     lacking = f"{counted(unfinished, 'trial')} {'has' if unfinished == 1 else 'have'} no result"

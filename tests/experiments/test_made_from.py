@@ -27,6 +27,7 @@ from experiments.preparing.sources import find_sources
 from experiments.preparing.windows import _differences
 from experiments.running.closure import trace
 from experiments.study_setup import StudyArguments, make_setup
+from hma_jax.evaluation.statistics import Stat
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
@@ -242,6 +243,26 @@ def test_a_copy_that_an_earlier_version_made_stays_in_use(made, tmp_path):
     before = contents(tmp_path)
     assert main(["tokenize", *SMOKE, "--out", str(tmp_path), *data, *given]) == 0
     assert contents(tmp_path) == before
+
+
+def test_a_given_tokenizer_is_judged_once_by_frames_that_the_study_holds_out(made, tmp_path, monkeypatch, capsys):
+    """Those by which it was judged where it was trained: a study of the same data and settings finds the same."""
+    there, data = made
+    command = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, "--tokenizer", str(there / "tokenizer")]
+    assert main(command) == 0 and "reconstruction of held-out frames: " in capsys.readouterr().out
+    quality = tmp_path / "tokenizer" / tokenizer_step.QUALITY
+    first = quality.read_text()
+    assert first == (there / "tokenizer" / tokenizer_step.QUALITY).read_text()
+
+    judged = []
+    monkeypatch.setattr(given_tokenizer, "reconstruction_psnr", lambda *_: judged.append(1) or Stat(20.0, 0.1, 8, 2))
+    setup = make_setup(StudyArguments("smoke", tmp_path, tuple(data[1:])))
+    found = find_sources(setup.study, setup.data)
+    given_tokenizer.judge_tokenizer(setup.study, setup.workspace, found)
+    assert not judged
+    for sources in (found[:1], found[:1], found):
+        given_tokenizer.judge_tokenizer(setup.study, setup.workspace, sources)
+    assert len(judged) == 2 and json.loads(quality.read_text())["mean"] == 20.0
 
 
 def test_no_dataset_is_opened_for_a_given_tokenizer_that_knows_none_of_them(made, tmp_path, monkeypatch):
