@@ -9,7 +9,7 @@ Expected: well above random actions; no better than policies made for nothing el
 The world model gets action heads and is post-trained, all of it, to predict what an expert does next
 (`masking.setting` is policy). The others are trained on the same episodes. All begin at the same starts, which no
 recording has. `--policies` takes some of them; with `--predicts chunk` the Diffusion Policy predicts the clean chunk of
-actions instead of the noise in it.
+actions instead of the noise in it, with `--limits spread` it gives no action beyond three standard deviations.
 
 Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts;
 run, the post-trained model, and its tokenizer: a policy, and no simulator any more.
@@ -40,7 +40,13 @@ from experiments.applications.policies.demonstrations import (
     record,
     save_demonstrations,
 )
-from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, Predicts, train_diffusion
+from experiments.applications.policies.diffusion import (
+    DiffusionConfig,
+    DiffusionPolicy,
+    Limits,
+    Predicts,
+    train_diffusion,
+)
 from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.own_head import OwnHeadPolicy
@@ -82,7 +88,8 @@ class Settings:
     steps: int = 3000  # of training, of every policy
     batch: int = 12  # windows of the model
     learning_rate: float = 1e-3
-    predicts: Predicts = "noise"  # of the Diffusion Policy
+    predicts: Predicts = "noise"  # of the Diffusion Policy, as the next
+    limits: Limits = "range"
     seed: int = 0
 
     def __post_init__(self):
@@ -162,7 +169,7 @@ def make_policy(
     if name == CLONED:
         return clone(demos, BcConfig(frames=1, fit=fit), settings.seed, report)
     if name == DIFFUSION:
-        config = DiffusionConfig(frames=1, predicts=settings.predicts, fit=fit)
+        config = DiffusionConfig(frames=1, predicts=settings.predicts, limits=settings.limits, fit=fit)
         made = train_diffusion(demos, config, settings.seed, report)
         return DiffusionPolicy(config, made[settings.steps], scale_of(demos))
     return RandomPolicy(robot)
@@ -248,6 +255,9 @@ def main() -> None:
     parser.add_argument("--demonstrations", type=int, default=Settings.demonstrations, help="episodes of the expert")
     parser.add_argument(
         "--predicts", choices=get_args(Predicts), default=Settings.predicts, help="what the Diffusion Policy predicts"
+    )
+    parser.add_argument(
+        "--limits", choices=get_args(Limits), default=Settings.limits, help="of the Diffusion Policy's actions"
     )
     parser.add_argument(
         "--policies", nargs="+", default=POLICIES, choices=POLICIES, metavar="POLICY", help=f"of: {', '.join(POLICIES)}"

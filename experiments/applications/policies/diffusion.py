@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.applications.policies.acting import ChunkPolicy, Scale, frames_of, make_examples
+from experiments.applications.policies.acting import ChunkPolicy, Scale, frames_of, make_examples, scale_of
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.learning import FitConfig, Report, fit
 from experiments.applications.policies.network import (
@@ -37,11 +37,18 @@ from hma_jax.kernels.random import key_of
 EMBEDDED = 32
 """Values that a noise level is given as: sines and cosines."""
 
-CLIP = 3.0
-"""Standard deviations beyond which no action is denoised to."""
+SPREAD = 3.0
+"""Standard deviations of the demonstrated actions, for the limits of this name."""
+
+FORMER = {"limits": "spread"}
+"""Fields of policies that were saved before there were these fields, where they differ from the defaults."""
 
 Predicts = Literal["noise", "chunk"]
 """What the denoiser is trained to predict."""
+
+Limits = Literal["range", "spread"]
+"""Beyond what no action is denoised to: the range of the demonstrated ones, or SPREAD, beyond which lies, for example,
+the action of a gripper that is closed in few frames."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,7 @@ class DiffusionConfig:
     levels: int = 100
     samples: int = 10
     predicts: Predicts = "noise"  # policies that were saved without this field predict noise
+    limits: Limits = "range"
     width: int = 256
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=FitConfig)
@@ -69,6 +77,7 @@ class DiffusionConfig:
             f"the number of denoising steps must lie in 1..{self.levels}, the noise levels, got {self.samples}",
         )
         require_choice(self.predicts, get_args(Predicts), "predicts")
+        require_choice(self.limits, get_args(Limits), "limits")
 
 
 def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:
@@ -88,6 +97,14 @@ def signal(levels: int) -> np.ndarray:
     return np.clip(kept[1:] / kept[0], 1e-4, 0.9999).astype(np.float32)
 
 
+def bounds(config: DiffusionConfig, scale: Scale) -> np.ndarray:
+    """float32 [2, chunk * A]: the least and the greatest normalised actions of a chunk."""
+    ends = scale.normalise(np.array([scale.low, scale.high]))
+    if config.limits == "spread":
+        ends = np.broadcast_to(np.array([[-SPREAD], [SPREAD]], np.float32), ends.shape)
+    return np.tile(ends, config.chunk)
+
+
 def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array) -> jax.Array:
     """The noise in chunks [B, chunk * A] at levels [B], or the clean chunks, as the network was trained, given features
     of what is seen [B, 3 K]."""
@@ -96,8 +113,11 @@ def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array
     return mlp(params["denoiser"], jnp.concatenate([seen, jnp.sin(angle), jnp.cos(angle), noised], -1))
 
 
-def draw(params: Params, config: DiffusionConfig, frames: jax.Array, start: jax.Array) -> jax.Array:
-    """Normalised chunks [B, chunk * A] from Gaussian `start` of that shape, by DDIM without new noise."""
+def draw(
+    params: Params, config: DiffusionConfig, frames: jax.Array, start: jax.Array, limits: np.ndarray | jax.Array
+) -> jax.Array:
+    """Normalised chunks [B, chunk * A] from Gaussian `start` of that shape, by DDIM without new noise; `limits` are
+    the `bounds`."""
     kept = jnp.asarray(signal(config.levels))
     seen = encode(params["encoder"], config.encoder, stack_frames(frames))
     visited = np.linspace(config.levels - 1, 0, config.samples).round().astype(int)
@@ -108,7 +128,7 @@ def draw(params: Params, config: DiffusionConfig, frames: jax.Array, start: jax.
         found = denoise(params, seen, x, jnp.full(len(x), now, jnp.float32))
         if config.predicts == "noise":
             found = (x - jnp.sqrt(1 - kept[now]) * found) / jnp.sqrt(kept[now])
-        clean = jnp.clip(found, -CLIP, CLIP)
+        clean = jnp.clip(found, limits[0], limits[1])
         noise = (x - jnp.sqrt(kept[now]) * clean) / jnp.sqrt(1 - kept[now])
         left = jnp.where(then < 0, 1.0, kept[then])
         return jnp.sqrt(left) * clean + jnp.sqrt(1 - left) * noise, None
@@ -122,12 +142,13 @@ def train_diffusion(
     """{step: parameters} for `config.fit.keep` and the last step; a function of its arguments."""
     kept = jnp.asarray(signal(config.levels))
     data = make_examples(demos, config.frames, config.chunk, config.encoder.size)
+    least, greatest = bounds(config, scale_of(demos))
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
         light, level_key, noise_key = jax.random.split(key, 3)
         frames = jitter_colour(frames_of(data, index), light, config.light)
         seen = encode(params["encoder"], config.encoder, stack_frames(frames))
-        chunk = jnp.clip(data["chunk"][index], -CLIP, CLIP)
+        chunk = jnp.clip(data["chunk"][index], least, greatest)
         level = jax.random.randint(level_key, (len(index),), 0, config.levels, jnp.int32)
         noise = jax.random.normal(noise_key, chunk.shape, jnp.float32)
         share = kept[level][:, None]
@@ -140,9 +161,9 @@ def train_diffusion(
 
 
 @partial(jax.jit, static_argnums=1)
-def _act(params: Params, config: DiffusionConfig, images: jax.Array, start: jax.Array) -> jax.Array:
+def _act(params: Params, config: DiffusionConfig, images: jax.Array, start: jax.Array, limits: jax.Array) -> jax.Array:
     """Compiled once for all checkpoints of a policy."""
-    return draw(params, config, as_floats(images), start)
+    return draw(params, config, as_floats(images), start, limits)
 
 
 class DiffusionPolicy(ChunkPolicy):
@@ -157,5 +178,6 @@ class DiffusionPolicy(ChunkPolicy):
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
         size = self.config.chunk * len(self.scale.mean)
         start = [np.random.default_rng([s, n, 14]).standard_normal(size) for s, n in zip(seeds, steps, strict=True)]
-        out = np.asarray(_act(self.params, self.config, frames, np.asarray(start, np.float32)))
+        limits = bounds(self.config, self.scale)
+        out = np.asarray(_act(self.params, self.config, frames, np.asarray(start, np.float32), limits))
         return out.reshape(len(frames), self.config.chunk, -1)

@@ -14,7 +14,7 @@ from data_pipelines.suite.simulator import SuiteSimulator, suite_robot
 from data_pipelines.suite.world import World
 from experiments.applications.judging.rollouts import run
 from experiments.applications.policies import RandomPolicy, diffusion, find_task, load_policy, record, save_policy
-from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.acting import Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
 from experiments.applications.policies.closed_loop import goal_distance, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import load_demonstrations, save_demonstrations
@@ -215,7 +215,8 @@ def test_denoising_with_the_true_noise_or_chunk_gives_the_chunk(monkeypatch, dem
 
     monkeypatch.setattr(diffusion, "denoise", exact)
     frames = jnp.zeros((2, 2, 8, 8, 3))
-    drawn = diffusion.draw(params, config, frames, jnp.ones((2, 16)))
+    limits = np.array([[-3.0], [3.0]]) * np.ones(16)
+    drawn = diffusion.draw(params, config, frames, jnp.ones((2, 16)), limits)
     np.testing.assert_allclose(drawn, np.broadcast_to(wanted, (2, 16)), atol=1e-4)
 
 
@@ -231,14 +232,26 @@ def test_a_denoiser_learns_the_noise_or_the_chunk_as_its_config_says(monkeypatch
         DiffusionConfig(predicts="velocity")
 
 
-def test_saved_diffusion_policies_that_do_not_say_what_they_predict_predict_noise(demos, tmp_path):
+def test_an_action_that_is_demonstrated_seldom_can_be_given(monkeypatch, demos):
+    """A gripper closed in one frame of twenty is 4.4 standard deviations away: the policy could close it to 0.7."""
+    monkeypatch.setattr(diffusion, "denoise", lambda params, seen, noised, level: 0 * noised + 9)
+    scale = Scale((0.05,), (0.05**0.5 * 0.95**0.5,), (0.0,), (1.0,))
+    closed = {}
+    for limits in get_args(diffusion.Limits):
+        config = DiffusionConfig(encoder=SMALL, samples=2, predicts="chunk", limits=limits)
+        policy = DiffusionPolicy(config, init_diffusion(config, 1, 0), scale)
+        closed[limits] = float(policy.act(demos.images[:1, 0])[0, 0])
+    assert closed["range"] == 1 and closed["spread"] == pytest.approx(0.704, abs=0.001)
+
+
+def test_saved_diffusion_policies_without_later_fields_are_as_they_were(demos, tmp_path):
     config, path = DiffusionConfig(encoder=SMALL, samples=2, predicts="chunk"), tmp_path / "one/policy.json"
     save_policy(DiffusionPolicy(config, init_diffusion(config, 4, 0), scale_of(demos)), tmp_path / "one")
     assert load_policy(tmp_path / "one").config == config
     description = json.loads(path.read_text())
-    del description["config"]["predicts"]
+    del description["config"]["predicts"], description["config"]["limits"]
     path.write_text(json.dumps(description))
-    assert load_policy(tmp_path / "one").config == replace(config, predicts="noise")
+    assert load_policy(tmp_path / "one").config == replace(config, predicts="noise", limits="spread")
 
 
 def test_a_ladder_has_its_first_and_last_rung():
