@@ -92,8 +92,9 @@ def _plan(
     changes = diff(facts[0], facts[1]) + diff(train.actions.shape[1], val.actions.shape[1], "action_dim")
     require(not changes, f"{train.path} and {val.path} do not belong together: {'; '.join(changes)}")
     if tokenizer is not None:
-        decoder = replace(facts[0], identity=tokenizer.identity, image_size=tokenizer.image_size)
-        for field in ("grid", "tokens", "vocab_size", "factors", "factor_vocab", "channels"):
+        own = ("identity", "image_size", "factors", "factor_vocab")
+        decoder = replace(facts[0], **{field: getattr(tokenizer, field) for field in own})
+        for field in ("grid", "tokens", "vocab_size", "channels"):
             have, want = getattr(tokenizer, field), getattr(decoder, field)
             require(
                 have == want,
@@ -135,7 +136,8 @@ def _plan(
 
 
 def _facts(folder: ReleaseFolder, patch: int) -> TokenizerFacts:
-    """Raises ConfigError for a grid that the patch does not divide or a vocabulary of another base."""
+    """Ids of a vocabulary that is no power of 512 have one factor. ConfigError for a grid that the patch does not
+    divide."""
     side, vocab = folder.video.shape[-1], folder.vocab_size
     pixels = PIXELS.get(str(folder.metadata.get("encoder_type")))
     image_size = side * pixels if pixels else IMAGE_SIZE
@@ -144,12 +146,8 @@ def _facts(folder: ReleaseFolder, patch: int) -> TokenizerFacts:
         grid = side // patch
         return TokenizerFacts(folder.encoder, image_size, grid, grid**2, 0, 0, 0, patch**2 * folder.channels)
     factors = round(np.log(vocab) / np.log(FACTOR_VOCAB))
-    require(
-        factors >= 1 and FACTOR_VOCAB**factors == vocab,
-        f"{folder.path}: the vocabulary size {vocab} is not a power of {FACTOR_VOCAB}, so ids cannot be split into "
-        "factors",
-    )
-    return TokenizerFacts(folder.encoder, image_size, side, side**2, vocab, factors, FACTOR_VOCAB)
+    factors, entries = (factors, FACTOR_VOCAB) if FACTOR_VOCAB**factors == vocab else (1, vocab)
+    return TokenizerFacts(folder.encoder, image_size, side, side**2, vocab, factors, entries)
 
 
 def _episode(

@@ -1,4 +1,4 @@
-"""`hma tokenizer`: the image tokenizer is trained here, made of published weights, or none."""
+"""`hma tokenizer`: the image tokenizer is trained here, made of published weights or of your own code, or none."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 tokenizer_app = Commands()
 
-HELP = "Train an image tokenizer, import published weights, or make one of pixel patches."
+HELP = "Train an image tokenizer, import published weights, or make one of your own code or of pixel patches."
 
 
 @tokenizer_app.command(name="train")
@@ -86,6 +86,29 @@ def pixels(
 
     require_free(out)
     _write(PixelTokenizer(PixelsConfig(image_size=image_size, patch=patch)), out)
+
+
+@tokenizer_app.command(name="python")
+def python(
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")], out: Annotated[Path, arg(metavar="DIR")]
+) -> None:
+    """Make a tokenizer of your own Python code: a folder with tokenizer.py, beside it its weights.
+
+    All files of the folder are copied. Every command that uses the tokenizer runs this code, so take such a tokenizer,
+    and a run or study that holds one, only from people whom you trust.
+
+    Args:
+        folder: Folder with tokenizer.py; docs/own_data.md, "Your own tokenizer", says what is in it.
+        out: Directory to write.
+    """
+    from hma_jax.convert import require_free
+    from hma_jax.tokenizers.python import PythonTokenizer, try_out
+
+    require_free(out)
+    tokenizer = PythonTokenizer(None, folder)
+    with step(f"try {short(folder)}"):
+        try_out(tokenizer)
+    _write(tokenizer, out)
 
 
 def train_tokenizer(setup: StudySetup, replace: Step | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import traceback
 import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.errors import DataError
-from hma_jax.config import ConfigError, require
+from hma_jax.config import require
+from hma_jax.runtime import user_code
 
 
 def find_function(path: Path, signature: str, what: str, page: str) -> Callable[..., Any]:
@@ -42,20 +42,6 @@ def run_file(path: Path, signature: str, what: str, page: str) -> types.ModuleTy
 
 @contextmanager
 def naming_line(path: Path, page: str) -> Iterator[None]:
-    """What the file at `path`, or what it calls, raises becomes a ConfigError in the exception's own words that names
-    the line of the file. Errors of data and of the system have a message of their own."""
-    try:
+    """As `user_code.naming_line`; errors of data have a message of their own, too."""
+    with user_code.naming_line(path, page, DataError):
         yield
-    except (DataError, OSError):
-        raise
-    except Exception as error:  # the boundary of somebody else's code
-        syntax = isinstance(error, SyntaxError) and error.filename == str(path)
-        lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == str(path)]
-        line = error.lineno if syntax else lines[-1] if lines else None
-        where = f"{path}, line {line}" if line else str(path)
-        if isinstance(error, ConfigError):  # it says what to do
-            raise ConfigError(f"{where}: {error}" if line else str(error)) from error
-        words = ": ".join(filter(None, (type(error).__name__, error.msg if syntax else str(error))))
-        raise ConfigError(
-            f"{where}: {words}; correct the file ({page}), or add --debug to see the traceback"
-        ) from error

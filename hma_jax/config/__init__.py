@@ -14,6 +14,7 @@ from hma_jax.config.pretrained_tokenizers import (
     Latents,
     Magvit2Config,
     PixelsConfig,
+    PythonConfig,
     SvdVaeConfig,
 )
 from hma_jax.config.tokenizer import ImageSize, TokenGrid, TokenizerConfig, TokenizerTrainConfig
@@ -46,6 +47,7 @@ __all__ = [
     "MupConfig",
     "OptimizerConfig",
     "PixelsConfig",
+    "PythonConfig",
     "SamplerConfig",
     "Setting",
     "SvdVaeConfig",

@@ -1,4 +1,4 @@
-"""Configurations of the tokenizers that are not trained here: two pretrained ones, and pixels.
+"""Configurations of the tokenizers that are not trained here: two pretrained ones, pixels, and the user's own.
 
 The trainable one is `hma_jax.config.TokenizerConfig`. All say how large an image is and what its
 tokens are; `kind` tells them apart where a configuration may be any of them. Nothing here imports
@@ -152,7 +152,55 @@ class PixelsConfig(Latents):
         return self.patch
 
 
-AnyTokenizerConfig = TokenizerConfig | Magvit2Config | SvdVaeConfig | PixelsConfig
+@dataclass(frozen=True)
+class PythonConfig:
+    """What the user's own Python code (`tokenizers.python`) says of its tokens: ids below `vocab_size`, or latents."""
+
+    kind: Literal["python"] = "python"
+    image_size: int = 256
+    grid: int = 16  # tokens along one side of the image
+    vocab_size: int = 0  # V^Q; 0: tokens are latents
+    factors: int = 1  # Q: an id is split into as many digits; without meaning for latents
+    channels: int = 0  # C: values per token; 0: tokens are ids
+
+    def __post_init__(self):
+        check_fields(self)
+        for name in ("image_size", "grid", "factors"):
+            require(getattr(self, name) >= 1, f"python.{name} must be at least 1, got {getattr(self, name)}")
+        require(
+            (self.vocab_size >= 2 and self.channels == 0) or (self.vocab_size == 0 and self.channels >= 1),
+            "a tokenizer makes ids of a vocab_size of at least 2, or latents of at least one of channels; got "
+            f"vocab_size {self.vocab_size} and channels {self.channels}",
+        )
+        require(
+            self.factor_vocab**self.factors == self.vocab_size or self.channels > 0,
+            f"python.vocab_size {self.vocab_size} is no whole number to the power of factors {self.factors}, so ids "
+            "cannot be split evenly; take one factor, or a larger vocab_size of which some ids stay unused",
+        )
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        return self.image_size, self.image_size
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        return self.grid, self.grid
+
+    @property
+    def tokens(self) -> int:
+        return self.grid**2
+
+    @property
+    def token_channels(self) -> int:
+        return self.channels
+
+    @property
+    def factor_vocab(self) -> int:
+        """V: entries per factor; 0 where tokens are latents."""
+        return round(self.vocab_size ** (1 / self.factors)) if self.vocab_size else 0
+
+
+AnyTokenizerConfig = TokenizerConfig | Magvit2Config | SvdVaeConfig | PixelsConfig | PythonConfig
 
 
 def _check_levels(name: str, widths: list[int] | tuple[int, ...], groups: int) -> None:

@@ -6,6 +6,7 @@ latent vectors and back can stand behind it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -17,6 +18,9 @@ from hma_jax.model.params import Params
 
 PIECE = 64
 """Images per call of a jitted encoder or decoder; smaller batches are padded to it."""
+
+PIXELS = 2**18
+"""Pixels that go through a large network at once: four images of 256 x 256."""
 
 
 class Tokenizer(Protocol):
@@ -115,6 +119,11 @@ def token_mismatch(model: ModelConfig, tokenizer: Tokenizer) -> str:
     if takes == makes:
         return ""
     return f"the model needs {words.format(*takes)}, but the tokenizer makes {words.format(*makes)}"
+
+
+def fitting_piece(image_shape: tuple[int, int]) -> int:
+    """Images that a large network takes at a time: at most PIECE of them, and PIXELS."""
+    return max(1, min(PIECE, PIXELS // math.prod(image_shape)))
 
 
 def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int = PIECE) -> np.ndarray:

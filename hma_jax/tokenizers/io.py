@@ -1,4 +1,4 @@
-"""Tokenizers on disk, of every kind: `tokenizer.json` and `weights.npz`.
+"""Tokenizers on disk, of every kind: `tokenizer.json` and `weights.npz`, or `files/` with the user's own code.
 
 The JSON holds kind, configuration, identity and what was measured beside the weights, such as the
 scale of latents. It is written last, so a directory holds a whole tokenizer or none.
@@ -24,14 +24,25 @@ from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
+from hma_jax.tokenizers.python import PythonTokenizer, copy_folder, folder_identity
 from hma_jax.tokenizers.shared import BaseTokenizer
 
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
+FILES = "files"
+"""The folder of a tokenizer of the user's own code."""
 KINDS: dict[str, type[BaseTokenizer]] = {
-    cls.kind: cls for cls in (LfqTokenizer, ContinuousTokenizer, Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)
+    cls.kind: cls
+    for cls in (
+        LfqTokenizer,
+        ContinuousTokenizer,
+        Magvit2Tokenizer,
+        SvdVaeTokenizer,
+        PixelTokenizer,
+        PythonTokenizer,
+    )
 }
-ADVICE = "train, import or copy the tokenizer again"
+ADVICE = "train, make, import or copy the tokenizer again"
 
 
 def save_tokenizer(tokenizer: BaseTokenizer, directory: str | Path) -> None:
@@ -47,7 +58,10 @@ def save_tokenizer(tokenizer: BaseTokenizer, directory: str | Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         (directory / DESCRIPTION).unlink(missing_ok=True)
-        write_arrays(directory / WEIGHTS, arrays, compressed=False)
+        if isinstance(tokenizer, PythonTokenizer):
+            copy_folder(tokenizer.folder, directory / FILES)
+        else:
+            write_arrays(directory / WEIGHTS, arrays, compressed=False)
         write_file(directory / DESCRIPTION, json.dumps(description, indent=2, sort_keys=True) + "\n")
     except OSError as error:
         raise ConfigError(
@@ -61,7 +75,7 @@ def load_tokenizer(
     *,
     piece: int | None = None,
 ) -> BaseTokenizer:
-    """The tokenizer in `directory`. `piece` is explained at `BaseTokenizer`.
+    """The tokenizer in `directory`. `piece` is explained at `BaseTokenizer`. Of the kind "python", its code is run.
 
     Raises ConfigError if none is there, if a file is damaged, or if its configuration is not
     `expect` (when given), naming every field that differs.
@@ -75,22 +89,31 @@ def load_tokenizer(
             f"the tokenizer at {directory} has another configuration; give another directory or "
             "change these fields:\n  " + "\n  ".join(diff(config, expect))
         )
+    if kind is PythonTokenizer:
+        files = directory / FILES
+        _require_described(files, "folder", folder_identity(config, files), description)  # before its code is run
+        return PythonTokenizer(config, files, piece=piece)
     weights = _read_weights(directory)
     measured = {name: description[name] for name in kind.measured}
     try:
         tokenizer = kind(config, weights, **measured, piece=piece)
     except ConfigError as error:
         raise ConfigError(f"{directory}: {error}; {ADVICE}") from error
-    require(
-        tokenizer.identity == description["identity"],
-        f"{directory / WEIGHTS} is not the file that {DESCRIPTION} describes (identity {tokenizer.identity}, expected "
-        f"{description['identity']}); {ADVICE}",
-    )
+    _require_described(directory / WEIGHTS, "file", tokenizer.identity, description)
     return tokenizer
 
 
+def _require_described(path: Path, what: str, identity: str, description: dict[str, Any]) -> None:
+    require(
+        identity == description["identity"],
+        f"{path} is not the {what} that {DESCRIPTION} describes (identity {identity}, expected {description['identity']}); "
+        f"{ADVICE}",
+    )
+
+
 def load_config(directory: Path) -> AnyTokenizerConfig:
-    """The configuration of the tokenizer in `directory`; its weights are not read.
+    """The configuration of the tokenizer in `directory`; neither are its weights read nor its
+    code run.
 
     Raises ConfigError if none is there or its description is damaged.
     """

@@ -6,31 +6,22 @@ on. Reading their weights from the files they are published in is `convert.pretr
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 from einops import rearrange
 
-from hma_jax.config import Magvit2Config, SvdVaeConfig, TokenGrid
+from hma_jax.config import Magvit2Config, SvdVaeConfig
 from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
-from hma_jax.tokenizers.base import PIECE
+from hma_jax.tokenizers.base import fitting_piece
 from hma_jax.tokenizers.magvit2 import Magvit2
 from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
 from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.tokenizers.svd_vae import SvdVae
 
-PIXELS = 2**18
-"""Pixels that go through a large network at once: four images of 256 x 256."""
-
 LATENT_LIMIT = 25.0
 """What unscaled latents are clipped to before they are decoded, as in the release."""
-
-
-def _piece(config: TokenGrid) -> int:
-    return max(1, min(PIECE, PIXELS // math.prod(config.image_shape)))
 
 
 class Magvit2Tokenizer(BaseTokenizer):
@@ -45,7 +36,7 @@ class Magvit2Tokenizer(BaseTokenizer):
 
     @classmethod
     def default_piece(cls, config: Magvit2Config) -> int:
-        return _piece(config)
+        return fitting_piece(config.image_shape)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
         z = self._declared.merge(params).encoder(from_pixels(images))
@@ -68,7 +59,7 @@ class SvdVaeTokenizer(BaseTokenizer):
 
     @classmethod
     def default_piece(cls, config: SvdVaeConfig) -> int:
-        return _piece(config)
+        return fitting_piece(config.image_shape)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
         mean, _ = self._declared.merge(params).moments(from_pixels(images))

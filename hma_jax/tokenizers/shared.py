@@ -60,13 +60,13 @@ class BaseTokenizer(abc.ABC):
 
         Raises ConfigError if `params` are not those that `config` declares, or for a `piece` without an image.
         """
-        require(piece is None or piece >= 1, f"a tokenizer must encode at least 1 image at a time, got {piece}")
-        declared = self.declare(config)
-        require_params(declared, params, "tokenizer weights do not fit their configuration")
-        self.config = config
-        self.params = params
-        self.piece = self.default_piece(config) if piece is None else piece
-        self._declared = declared
+        self._declared = self.declare(config)
+        self._set_up(config, params, devices, self.default_piece(config) if piece is None else piece)
+        require_params(self._declared, params, "tokenizer weights do not fit their configuration")
+
+    def _set_up(self, config: Any, params: Params, devices: Sequence[jax.Device] | None, piece: int) -> None:
+        require(piece >= 1, f"a tokenizer must encode at least 1 image at a time, got {piece}")
+        self.config, self.params, self.piece = config, params, piece
         self._mesh = make_mesh(MeshConfig(), list(devices or jax.local_devices()))
         self._encode = self._jit_over_devices(self.encode_fn)
         self._decode = self._jit_over_devices(self.decode_uint8_fn)

@@ -247,13 +247,20 @@ def test_damage_is_named_with_file_and_sizes(tmp_path, pair, damage, message):
     assert not (tmp_path / "store" / "toy_arm").exists()
 
 
-def test_raw_images_and_odd_vocabularies_are_refused(tmp_path, pair):
+def test_raw_images_are_refused(tmp_path, pair):
     meta(token_dtype="uint8")(pair[0])
     with pytest.raises(ConfigError, match="raw images .* not tokens"):
         import_tokens(*pair, tmp_path / "store", hz=4)
-    meta(token_dtype="uint32", vocab_size=1000)(pair[0])
-    with pytest.raises(ConfigError, match="the vocabulary size 1000 is not a power of 512"):
-        import_tokens(*pair, tmp_path / "store", hz=4)
+
+
+def test_ids_of_a_vocabulary_that_is_no_power_of_512_stay_whole(tmp_path, pair):
+    for folder in pair:
+        meta(vocab_size=200_000)(folder)
+    facts = import_tokens(*pair, tmp_path / "store", hz=4).tokenizer
+    assert (facts.vocab_size, facts.factors, facts.factor_vocab) == (200_000, 1, 200_000)
+    decoder = Decoder()
+    decoder.vocab_size, decoder.factors, decoder.factor_vocab = 200_000, 1, 200_000
+    import_tokens(*pair, tmp_path / "decoded", hz=4, tokenizer=decoder)
 
 
 @pytest.mark.parametrize(

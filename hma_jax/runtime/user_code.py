@@ -1,0 +1,31 @@
+"""Where Python code of the user is run, its errors name the line."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hma_jax.config import ConfigError
+
+
+@contextmanager
+def naming_line(path: Path, page: str, *others: type[Exception]) -> Iterator[None]:
+    """What the file at `path`, or what it calls, raises becomes a ConfigError in the exception's own words that names
+    the line of the file. Errors of the system, and `others`, have a message of their own."""
+    try:
+        yield
+    except (OSError, *others):
+        raise
+    except Exception as error:  # the boundary of somebody else's code
+        syntax = isinstance(error, SyntaxError) and error.filename == str(path)
+        lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == str(path)]
+        line = error.lineno if syntax else lines[-1] if lines else None
+        where = f"{path}, line {line}" if line else str(path)
+        if isinstance(error, ConfigError):  # it says what to do
+            raise ConfigError(f"{where}: {error}" if line else str(error)) from error
+        words = ": ".join(filter(None, (type(error).__name__, error.msg if syntax else str(error))))
+        raise ConfigError(
+            f"{where}: {words}; correct the file ({page}), or add --debug to see the traceback"
+        ) from error

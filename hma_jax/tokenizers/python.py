@@ -1,0 +1,261 @@
+"""Tokenizers of the user's own Python code: a folder with `tokenizer.py`, whose `make_tokenizer(folder)` makes one.
+
+What it makes says what its tokens are, encodes and decodes (docs/own_data.md). With `params` it computes in JAX and
+becomes a part of compiled programs. Otherwise it computes on the host, with NumPy or PyTorch say, and compiled programs
+call it there. A change in any file of the folder makes it another tokenizer.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import json
+import logging
+import shutil
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from hma_jax.config import PythonConfig, require
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.model.params import Declared, Params, declare
+from hma_jax.runtime.user_code import naming_line
+from hma_jax.tokenizers.base import fitting_piece, in_pieces
+from hma_jax.tokenizers.shared import BaseTokenizer
+
+FILE, FUNCTION = "tokenizer.py", "make_tokenizer"
+PAGE = 'docs/own_data.md, "Your own tokenizer"'
+FACTS = ("image_size", "grid", "vocab_size", "factors", "channels")
+"""What an object may say of its tokens: the fields of `PythonConfig`, by its attributes."""
+
+NEIGHBOURS = 0.01
+"""Tokens, of all, that may depend on the other images of a batch: rounding turns an id that is all but another one."""
+
+log = logging.getLogger(__name__)
+
+
+class PythonTokenizer(BaseTokenizer):
+    """Tokens are what the code makes of an image: ids, int32 [B, S], or latents, float32 [B, S, C]."""
+
+    kind = "python"
+    config_class = PythonConfig
+
+    def __init__(
+        self,
+        config: PythonConfig | None,
+        folder: Path,
+        *,
+        devices: Sequence[jax.Device] | None = None,
+        piece: int | None = None,
+    ):
+        """Runs the code of `folder`. `config` is what it must say of its tokens; None: whatever it says.
+
+        Raises ConfigError if there is no such code, if it fails, and for facts that are missing or wrong.
+        """
+        self.folder, self._file, self._lock = Path(folder), Path(folder) / FILE, threading.Lock()
+        self._hash = hash_folder(self.folder)
+        with naming_line(self._file, PAGE):
+            self._own = own = _run(self.folder, self._hash)(self.folder)
+            facts = {name: getattr(own, name) for name in FACTS if hasattr(own, name)}
+            missing = [name for name in ("encode", "decode") if not callable(getattr(own, name, None))]
+            piece = getattr(own, "piece", None) if piece is None else piece
+        missing += [name for name in ("image_size", "grid") if name not in facts]
+        require(not missing, f"{self._file}: what {FUNCTION} returns has no {', no '.join(missing)}; add it ({PAGE})")
+        says = from_dict(PythonConfig, facts, f"{self._file}: what {FUNCTION} returns")
+        require(
+            config in (None, says),
+            f"{self._file}: what {FUNCTION} returns says {says} here, but it said {config} when it was made a "
+            "tokenizer; its facts must follow from the files of its folder alone",
+        )
+        piece = fitting_piece(says.image_shape) if piece is None else piece
+        self._on_host = not hasattr(own, "params")
+        if self._on_host:
+            self._set_up(says, {}, jax.local_devices()[:1], piece)
+            self._encode = lambda _, images: self._host_encode(images)
+            self._decode = lambda _, tokens: self._host_decode(tokens)
+        else:
+            self._set_up(says, jax.tree.map(jnp.asarray, own.params), devices, piece)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(type(self), piece=self.piece), (self.config, self.folder)
+
+    @classmethod
+    def declare(cls, config: PythonConfig) -> Declared:
+        del config
+        return declare(nnx.Module)  # its parameters are its own affair
+
+    @cached_property
+    def identity(self) -> str:
+        return _identity(self.config, self._hash)
+
+    def encode(self, images: np.ndarray) -> np.ndarray:
+        """As `BaseTokenizer.encode`. Raises ConfigError for what are no tokens."""
+        tokens = super().encode(images)
+        low, high = tokens.min(), tokens.max()
+        good = np.isfinite([low, high]).all() if self.channels else 0 <= low <= high < self.vocab_size
+        wanted = "finite numbers" if self.channels else f"in [0, {self.vocab_size})"
+        require(bool(good), f"{self._file}: encode gives values from {low} to {high}; tokens must be {wanted}")
+        return tokens
+
+    def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
+        if self._on_host:
+            shape, dtype = self._tokens_of(len(images))
+            call = partial(in_pieces, self._host_encode, size=self.piece)
+            return jax.pure_callback(call, jax.ShapeDtypeStruct(shape, dtype), images)
+        with naming_line(self._file, PAGE):
+            tokens = self._own.encode(params, images)
+        return self._checked_encoding(tokens, len(images))
+
+    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        if self._on_host:
+            described = jax.ShapeDtypeStruct((len(tokens), *self.image_shape, 3), jnp.uint8)
+            call = partial(in_pieces, self._host_decode, size=self.piece)
+            return jax.pure_callback(call, described, tokens).astype(jnp.float32)
+        with naming_line(self._file, PAGE):
+            images = self._own.decode(params, tokens)
+        return jnp.clip(self._checked_images(images, len(tokens)).astype(jnp.float32), 0, 255)
+
+    # --- On the host -------------------------------------------------------------------------
+
+    def _host_encode(self, images: np.ndarray) -> np.ndarray:
+        with self._lock, naming_line(self._file, PAGE):  # several devices may call at once
+            tokens = np.asarray(self._own.encode(np.array(images)))
+        return self._checked_encoding(tokens, len(images))
+
+    def _host_decode(self, tokens: np.ndarray) -> np.ndarray:
+        with self._lock, naming_line(self._file, PAGE):
+            images = np.asarray(self._own.decode(np.array(tokens)))
+        images = self._checked_images(images, len(tokens))
+        return images if images.dtype == np.uint8 else np.clip(np.rint(images), 0, 255).astype(np.uint8)
+
+    # --- What the code gives back ------------------------------------------------------------
+
+    def _tokens_of(self, count: int) -> tuple[tuple[int, ...], type]:
+        """(shape, type) of the tokens of `count` images."""
+        if self.channels:
+            return (count, self.tokens, self.channels), np.float32
+        return (count, self.tokens), np.int32
+
+    def _checked_encoding(self, tokens: Any, count: int) -> Any:
+        shape, dtype = self._tokens_of(count)
+        kinds, words = ("f", "float") if self.channels else ("iu", "integers")
+        self._require_shape("encode", tokens, kinds, words, shape)
+        return tokens.astype(dtype)
+
+    def _checked_images(self, images: Any, count: int) -> Any:
+        self._require_shape("decode", images, "uf", "uint8, or float in 0..255,", (count, *self.image_shape, 3))
+        return images
+
+    def _require_shape(self, what: str, got: Any, kinds: str, words: str, shape: tuple[int, ...]) -> None:
+        dtype = jnp.dtype(got.dtype)
+        fits = dtype.kind in kinds or ("f" in kinds and jnp.issubdtype(dtype, jnp.floating))  # bfloat16, say
+        require(
+            fits and tuple(got.shape) == shape,
+            f"{self._file}: {what} must give {words} {list(shape)}, not {dtype} {list(got.shape)} ({PAGE})",
+        )
+
+
+def try_out(tokenizer: PythonTokenizer) -> None:
+    """Encodes and decodes a few images of noise. Raises ConfigError for results of another shape, type or range than
+    the code says, and if an image's tokens depend on the images beside it."""
+    images = np.random.default_rng(0).integers(0, 256, (3, *tokenizer.image_shape, 3), np.uint8)
+    together, alone = tokenizer.encode(images), tokenizer.encode(images[1:2])
+    other = (np.abs(together[1:2] - alone.astype(np.float64)) > 1e-2 * np.abs(alone)).mean()
+    require(
+        other <= NEIGHBOURS,
+        f"{tokenizer.folder / FILE}: an image beside others has other tokens ({other:.0%} of them) than alone; encode "
+        "must be deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
+    )
+    tokenizer.decode(together)
+
+
+def folder_identity(config: PythonConfig, folder: Path) -> str:
+    """The identity of a tokenizer of these files that says `config` of itself; none of its code is run."""
+    return _identity(config, hash_folder(folder))
+
+
+def _identity(config: PythonConfig, files: str) -> str:
+    named = [PythonTokenizer.kind, to_dict(config), files]
+    return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def hash_folder(folder: Path) -> str:
+    """Over the names and bytes of all files of a tokenizer's folder. Raises ConfigError if it has no tokenizer.py."""
+    digest = hashlib.sha256()
+    for name in _files(folder):
+        with (folder / name).open("rb") as file:
+            digest.update(f"{name}\n{hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+    return digest.hexdigest()
+
+
+def copy_folder(folder: Path, to: Path) -> None:
+    """Copies all files of a tokenizer's folder, in place of what is there."""
+    if to.resolve() == folder.resolve():
+        return
+    shutil.rmtree(to, ignore_errors=True)
+    for name in _files(folder):
+        (to / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(folder / name, to / name)
+
+
+def _files(folder: Path) -> list[str]:
+    """The files of a folder, by their paths in it; without hidden ones and Python's bytecode."""
+    require(
+        (folder / FILE).is_file(),
+        f"{folder / FILE}: no such file; a tokenizer of your own is a folder with {FILE}, which has a function "
+        f"{FUNCTION}(folder) ({PAGE})",
+    )
+    found = []
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder)
+        if any(part.startswith(".") or part == "__pycache__" for part in name.parts):
+            continue
+        require(
+            not (path.is_symlink() and path.is_dir()),
+            f"{path} is a link to a folder, whose files would not be copied; put the files themselves there",
+        )
+        if path.is_file():
+            found.append(name.as_posix())
+    return sorted(found)
+
+
+def _run(folder: Path, files: str) -> Any:
+    """`make_tokenizer` of tokenizer.py, which is run as a package of its own: other files of the folder are
+    `from .network import Network` there, and are not confused with those of another tokenizer."""
+    path, name = folder / FILE, f"own_tokenizer_{files[:16]}"
+    _say(path)
+    for known in [known for known in sys.modules if known == name or known.startswith(name + ".")]:
+        del sys.modules[known]
+    spec = importlib.util.spec_from_file_location(name, path, submodule_search_locations=[str(folder)])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    with _no_bytecode():
+        exec(compile(path.read_bytes(), path, "exec"), vars(module))
+    found = vars(module).get(FUNCTION)
+    require(callable(found), f"{path}: has no function {FUNCTION}(folder) ({PAGE})")
+    return found
+
+
+@functools.cache
+def _say(path: Path) -> None:
+    log.warning("the tokenizer runs the Python code of %s", path)
+
+
+@contextmanager
+def _no_bytecode() -> Iterator[None]:
+    """Python writes no bytecode into the folder."""
+    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+    try:
+        yield
+    finally:
+        sys.dont_write_bytecode = before

@@ -1,0 +1,168 @@
+"""Tokenizers of a user's own Python code: the one that docs/own_data.md shows, and others of JAX and with latents."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, PythonConfig
+from hma_jax.evaluation.images import decode_in_pieces
+from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
+from hma_jax.tokenizers.python import PythonTokenizer, try_out
+
+PAGE = Path(__file__).parents[2] / "docs" / "own_data.md"
+(COLOURS,) = (x for x in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S) if "make_tokenizer" in x)
+
+JAX = """
+import numpy as np
+
+from .network import halves
+
+
+class Bright:
+    image_size, grid, channels, piece = 8, 2, 3, 2
+
+    def __init__(self, folder):
+        self.params = {"gain": np.load(folder / "gain.npy")}
+
+    def encode(self, params, images):
+        return halves(images).reshape(-1, 4, 3) * params["gain"]
+
+    def decode(self, params, tokens):
+        return (tokens / params["gain"]).reshape(-1, 2, 2, 3).repeat(4, 1).repeat(4, 2)
+
+
+make_tokenizer = Bright
+"""
+NETWORK = """
+def halves(images):
+    return images.reshape(-1, 2, 4, 2, 4, 3).astype("float32").mean((2, 4))
+"""
+
+
+def write(folder: Path, code: str, **changes: str) -> Path:
+    for old, new in changes.values():
+        assert old in code
+        code = code.replace(old, new)
+    folder.mkdir(exist_ok=True)
+    (folder / "tokenizer.py").write_text(code)
+    return folder
+
+
+@pytest.fixture
+def colours(tmp_path) -> Path:
+    return write(tmp_path / "colours", COLOURS)
+
+
+@pytest.fixture
+def bright(tmp_path) -> Path:
+    folder = write(tmp_path / "bright", JAX)
+    (folder / "network.py").write_text(NETWORK)
+    np.save(folder / "gain.npy", np.float32(2**-7))
+    return folder
+
+
+def noise(count: int, size: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (count, size, size, 3), np.uint8)
+
+
+def test_ids_of_the_code_on_the_page(colours):
+    tokenizer = PythonTokenizer(None, colours, piece=2)
+    try_out(tokenizer)
+    assert tokenizer.config == PythonConfig(image_size=64, grid=8, vocab_size=1000)
+    assert (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels) == (64, 1, 1000, 0)
+    images = np.full((3, 64, 64, 3), (0, 128, 255), np.uint8)
+    ids = tokenizer.encode(images)
+    assert ids.dtype == np.int32 and ids.tolist() == [[950] * 64] * 3
+    assert tokenizer.decode(ids)[2, 0, 0].tolist() == [12, 140, 243]
+
+
+@pytest.mark.parametrize("kind", ["colours", "bright"])
+def test_compiled_programs_encode_and_decode_as_the_host_does(kind, request):
+    tokenizer = PythonTokenizer(None, request.getfixturevalue(kind))
+    images = noise(5, tokenizer.image_size)
+    tokens = tokenizer.encode(images)
+    within = jax.jit(tokenizer.encode_fn)(tokenizer.params, images)
+    assert within.dtype == tokens.dtype and np.allclose(within, tokens, rtol=1e-6)
+    program = jax.jit(lambda params, tokens: decode_in_pieces(tokenizer.decode_uint8_fn, 2, params, tokens))
+    assert np.array_equal(program(tokenizer.params, tokens), tokenizer.decode(tokens))
+
+
+def test_a_copy_is_the_same_tokenizer(bright, tmp_path):
+    tokenizer = PythonTokenizer(None, bright)
+    save_tokenizer(tokenizer, tmp_path / "one")
+    shutil.rmtree(bright)
+    one = load_tokenizer(tmp_path / "one")
+    save_tokenizer(one, tmp_path / "two")
+    save_tokenizer(one, tmp_path / "one")  # over itself
+    two = pickle.loads(pickle.dumps(load_tokenizer(tmp_path / "two", expect=tokenizer.config, piece=3)))
+    assert tokenizer.identity == one.identity == two.identity and (one.piece, two.piece) == (2, 3)
+    assert load_config(tmp_path / "two") == tokenizer.config
+    images = noise(3, 8)
+    assert np.array_equal(tokenizer.encode(images), two.encode(images))
+    assert not list(tmp_path.rglob("__pycache__"))
+
+
+@pytest.mark.parametrize("name", ["network.py", "gain.npy", "more.txt"])
+def test_a_changed_file_is_another_tokenizer_and_is_not_run(bright, tmp_path, name):
+    before = PythonTokenizer(None, bright)
+    save_tokenizer(before, tmp_path / "saved")
+    for folder in (bright, tmp_path / "saved" / "files"):
+        with (folder / name).open("ab") as file:
+            file.write(b"\n")
+    assert PythonTokenizer(None, bright).identity != before.identity
+    (tmp_path / "saved" / "files" / "tokenizer.py").write_text("raise SystemExit")
+    with pytest.raises(ConfigError, match=r"saved/files is not the folder that tokenizer.json describes"):
+        load_tokenizer(tmp_path / "saved")
+
+
+def test_two_folders_have_files_of_the_same_name(bright, tmp_path):
+    other = shutil.copytree(bright, tmp_path / "other")
+    (other / "network.py").write_text(NETWORK.replace(".mean((2, 4))", ".max((2, 4))"))
+    first, second = PythonTokenizer(None, bright), PythonTokenizer(None, other)
+    images = noise(2, 8)
+    assert (second.encode(images) > first.encode(images)).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("def make_tokenizer", "def make", r"tokenizer.py: has no function make_tokenizer\(folder\)"),
+        ("import numpy as np", "import nunpy as np", r"tokenizer.py, line 1: ModuleNotFoundError: No module named"),
+        ("image_size, grid = 64, 8", "grid = 8", "returns has no image_size; add it"),
+        ("def decode", "def decoded", "returns has no decode; add it"),
+        ("vocab_size = LEVELS**3", "width = 3", "ids of a vocab_size of at least 2, or latents"),
+        ("vocab_size = LEVELS**3", "vocab_size, factors = 1000, 2", "is no whole number to the power of factors 2"),
+        ("vocab_size = LEVELS**3", "vocab_size = 100", r"encode gives values from 333 to 444; tokens must be in \[0, 100"),
+        (".reshape(len(images), 64)", "", r"encode must give integers \[64, 64\], not int64 \[64, 8, 8\]"),
+        ("return colours.repeat(8, 1)", "return colours", r"decode must give uint8, .*\[64, 64, 64, 3\], not uint8 \[64, 8"),
+        ("images.reshape", "(images - images.mean(0)).reshape", "an image beside others has other tokens .* than alone"),
+        ("LEVELS / 256", "LEVELS / none", "line 14: NameError: name 'none' is not defined; correct the file"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named(tmp_path, old, new, message):
+    code = COLOURS.replace("images.reshape", "np.clip(images, 30, 150).reshape") if "333" in message else COLOURS
+    with pytest.raises(ConfigError, match=message):
+        try_out(PythonTokenizer(None, write(tmp_path / "mine", code, it=(old, new))))
+
+
+def test_a_folder_without_code_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"mine/tokenizer.py: no such file; a tokenizer of your own is a folder with"):
+        PythonTokenizer(None, tmp_path / "mine")
+
+
+def test_shapes_of_jax_code_are_checked(bright):
+    write(bright, JAX, it=("reshape(-1, 4, 3)", "reshape(-1, 12)"))
+    with pytest.raises(ConfigError, match=r"encode must give float \[2, 4, 3\], not float32 \[2, 12\]"):
+        PythonTokenizer(None, bright).encode(noise(2, 8))
+
+
+def test_factors_of_a_large_vocabulary():
+    config = PythonConfig(vocab_size=2**18, factors=2)
+    assert (config.factor_vocab, config.tokens) == (512, 256)
