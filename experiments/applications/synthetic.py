@@ -63,6 +63,7 @@ from experiments.applications.generating.demonstration_sources import (
 )
 from experiments.applications.generating.figures import draw_conditions, draw_strips
 from experiments.applications.generating.source import replay
+from experiments.applications.generating.survey import survey
 from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories, require_layout
 from experiments.applications.policies.acting import STILL, Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
@@ -243,9 +244,11 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
     trained_on, driven = open_trajectories(args.actions, args.split or "train", *place)
     held_out, _ = open_trajectories(args.actions, args.held_out or "val", *place)
     require_layout(trained_on, driven, simulator.model.table)
-    for note in filter(None, map(describe_reconstruction, (trained_on, held_out))):
+    source = RecordedSource(training, driven, trained_on, held_out)
+    clipped = survey(trained_on, training.trajectories, driven)
+    for note in filter(None, (*map(describe_reconstruction, (trained_on, held_out)), clipped.note())):
         say(note)
-    return RecordedSource(training, driven, trained_on, held_out)
+    return source
 
 
 def load_passive(run: Path, robot: Robot, decode: DecodeConfig) -> Simulator:

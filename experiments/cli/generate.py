@@ -114,8 +114,8 @@ def generate(
             known = survey(found, count, driven, update)
         if not allow_clipping:
             known.require_raw_units()
-        if said := known.describe():
-            say(f"note: {said}. Are these its raw units?")
+        if note := known.note():
+            say(note)
         source = GeneratedSource(
             simulator, driven, found, given=given, count=count, seed=seed, checkpoint=mark,
             knows_success=known.knows_success,

@@ -40,6 +40,11 @@ class Survey:
         outside = self.robot.describe(self.clipped > 0, np.stack([self.least, self.greatest]))
         return f"recorded actions of {self.robot.name} will be clipped ({shares}): {outside}"
 
+    def note(self) -> str:
+        """The same as a question to the user; "" where nothing is."""
+        said = self.describe()
+        return said and f"note: {said}. Are these its raw units?"
+
     def require_raw_units(self) -> None:
         """Raises ConfigError where most of a value would be clipped."""
         require(

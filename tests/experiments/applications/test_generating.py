@@ -263,7 +263,7 @@ def test_actions_in_other_units_are_told_and_refused(gnm, tmp_path):
     assert known.shares() == {"action 1": round(5 / 13, 6)} and known.knows_success
     assert "(38 % of action 1): action 1 of 0 to 8 is outside the range" in known.describe()
     known.require_raw_units()
-    assert survey(recorded, 1, robot).describe() == ""
+    assert known.note().startswith("note: recorded actions") and survey(recorded, 1, robot).note() == ""
     other = replace(robot, low=(-3.0, -3.0), high=(3.0, 1.0))
     with pytest.raises(ConfigError, match="hardly its raw units.*--allow-clipping"):
         survey(recorded, 2, other).require_raw_units()
