@@ -154,3 +154,43 @@ def test_a_stick_that_drifts_does_not_keep_an_abandoned_page_going(browsing, mon
         assert await page.evaluate("state.running") and not page.faults, "it is held, as a key may be"
 
     browsing(test)
+
+
+def test_only_the_first_button_of_a_pointer_presses_and_takes_the_focus(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        made = executed(client)
+        await page.click("#back", button="right")
+        await page.click("[data-key=ArrowRight]", button="middle")
+        await frames(page, 3)
+        assert not any(map(any, made))
+        assert await page.evaluate("document.activeElement") == await page.evaluate("document.body")
+        await page.keyboard.press("Space")
+        assert await page.inner_text("#run") == "Resume", "it pauses"
+        await page.keyboard.press("Space")
+        await frames(page, 2)
+        assert not page.faults
+
+    browsing(test)
+
+
+def test_a_slider_that_a_pointer_holds_keeps_the_page_going(browsing, monkeypatch):
+    """As a key or a stick that is held does."""
+    edit_page(monkeypatch, "IDLE = 60e3", "IDLE = 1e3")
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        box = await page.locator("#dimension0").bounding_box()
+        await page.mouse.move(box["x"] + box["width"] * 0.9, box["y"] + box["height"] / 2)
+        await page.mouse.down()
+        await page.wait_for_timeout(2500)
+        assert await page.evaluate("state.running")
+        await page.mouse.up()
+        await page.wait_for_function("!state.running")
+        await page.focus("#dimension0")
+        await page.keyboard.press("ArrowRight")
+        await page.wait_for_function("state.running")
+        await page.wait_for_function("!state.running")  # by the keyboard it may stay set on an abandoned page
+        assert not page.faults
+
+    browsing(test)

@@ -9,6 +9,7 @@ pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
 
 from experiments.applications.play import recording  # noqa: E402
 from tests.experiments.applications.browser import edit_page, frames, opened  # noqa: E402
+from tests.experiments.applications.test_play_server import FakeTruth  # noqa: E402
 
 
 def test_a_page_without_input_says_why_time_stands_still(browsing):
@@ -99,3 +100,27 @@ def test_a_recording_that_is_full_says_so_until_another_begins(browsing, monkeyp
         assert "full" not in await page.inner_text("#saved") and not page.faults
 
     browsing(test)
+
+
+def test_a_recording_that_ends_with_its_episode_says_so(browsing):
+    """Who pressed R for another try drove on, and the try was not recorded."""
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.click("#robots button[data-name=arm]")
+        ended = "the recording ended with its episode; download it before you record again"
+        for end, said in (
+            ("$('record').click()", ""),  # who ended it knows
+            ("begin(state.robot, 1)", ended),
+            ("tell({type: 'truth', on: true})", ended),
+        ):
+            await page.evaluate("say('', 1)")
+            await page.click("#record")
+            await page.wait_for_function("state.recording")
+            await frames(page, 2)
+            await page.evaluate(end)
+            await page.wait_for_function("!state.recording")
+            assert await page.inner_text("#said") == said
+        assert not page.faults
+
+    browsing(test, truth=FakeTruth)
