@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
 from aiohttp import WSMsgType, web
+from yarl import URL
 
 from data_pipelines.names import made_name
 from experiments.applications.play.requests import Truth, command, picture
@@ -90,6 +91,11 @@ def make_app(
     return app
 
 
+async def require_free(host: str, port: int) -> None:
+    """Raises OSError where `serve` could not listen now."""
+    (await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port, start_serving=False)).close()
+
+
 async def serve(app: web.Application, host: str, port: int, ready: Callable[[int], None]) -> None:
     """Serves until cancelled; `ready` is told the port, which port 0 leaves open. Raises OSError for a taken one."""
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0, keepalive_timeout=REQUEST_SECONDS)
@@ -157,7 +163,7 @@ def _refuse_other_names(public_names: Collection[str]) -> Callable[..., Awaitabl
     Such a name may be that of a hostile page, made to resolve to this server's address: to the browser both are then of
     one origin, and the page could drive and read what only this computer can reach (DNS rebinding).
     """
-    names = {"localhost", *(name.lower() for name in public_names)}
+    names = {"localhost", *map(name_as_sent, public_names)} - {""}
 
     @web.middleware
     async def refuse(request: web.Request, handler: Callable[..., Awaitable[web.StreamResponse]]) -> web.StreamResponse:
@@ -173,6 +179,15 @@ def _refuse_other_names(public_names: Collection[str]) -> Callable[..., Awaitabl
         return await handler(request)
 
     return refuse
+
+
+def name_as_sent(name: str) -> str:
+    """As browsers write a name in the Host header: in lower case, an international one in ASCII ("xn--..."); without
+    the final dot, which counts for nothing. Empty for what is no name."""
+    try:
+        return URL.build(scheme="http", host=name.strip().removesuffix(".")).raw_host or ""
+    except ValueError:
+        return ""
 
 
 def _name_of(host: str) -> str:
@@ -215,13 +230,17 @@ async def _drive(request: web.Request) -> web.StreamResponse:
     if len(sockets) >= len(sessions.simulator) + EXTRA_CONNECTIONS:
         raise web.HTTPServiceUnavailable(text="too many connections")
     socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=HEARTBEAT)
-    await socket.prepare(request)
+    try:
+        await socket.prepare(request)
+    except ConnectionError:  # whoever knocked is gone; aiohttp would log a fault of the server
+        return socket
     sockets[socket] = request.transport
     try:
         visitor = sessions.connect(request.query.get("token"))
         await _serve_connection(sessions, visitor, socket, request.transport)
     except NoFreeSession:
-        await socket.send_str(json.dumps({"type": "full", "message": "all places are taken"}))
+        with contextlib.suppress(ConnectionError):
+            await socket.send_str(json.dumps({"type": "full", "message": "all places are taken"}))
         await socket.close(code=1013)
     finally:
         del sockets[socket]

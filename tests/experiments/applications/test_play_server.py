@@ -5,6 +5,7 @@ import contextlib
 import json
 import resource
 import socket
+import struct
 import threading
 import time
 from copy import copy
@@ -16,7 +17,7 @@ import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
-from aiohttp import ClientSession
+from aiohttp import ClientError, ClientSession
 
 from experiments.applications.play import server
 from experiments.applications.play import sessions as sessions_module
@@ -409,6 +410,52 @@ def test_answers_that_nobody_reads_keep_no_newcomer_out(monkeypatch):
     listening(test, monkeypatch)
 
 
+def test_whoever_vanishes_while_connecting_leaves_nothing_in_the_log(caplog):
+    """A page that is loaded again, say, or a scanner of ports."""
+
+    def knock_and_vanish(port):
+        with socket.create_connection(("127.0.0.1", port)) as connection:
+            connection.sendall(
+                b"GET /drive HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            )
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # no farewell
+
+    async def test(client):
+        app, asked = client.server.app, []
+        sessions, sockets = app[server.SESSIONS], app[server.SOCKETS]
+        connect = sessions.connect
+
+        def vanishing(token):
+            asked.append(token)
+            list(sockets.values())[-1].abort()
+            return connect(token)
+
+        async def vanish():
+            before = len(client.server.handler.connections)
+            for _ in range(3):
+                knock_and_vanish(client.port)
+            await asyncio.sleep(0.05)
+            await until(lambda: len(client.server.handler.connections) <= before)
+            before = len(sockets)
+            sessions.connect = vanishing
+            with contextlib.suppress(ClientError):
+                await hear(await client.ws_connect("/drive"))
+            sessions.connect = connect
+            await until(lambda: len(sockets) <= before)
+
+        first, second = Player(client), Player(client)
+        await first.enter()
+        await vanish()
+        await second.enter()
+        await vanish()  # all places are taken
+        assert len(asked) == 2
+        assert len(await first.drive(0.5, 1)) == len(await second.drive(0.5, 1)) == 1
+
+    serving(test)
+    assert not [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+
+
 def test_one_who_never_reads_is_let_go_and_others_play_on(monkeypatch):
     monkeypatch.setattr(sessions_module, "SEND_SECONDS", 0.2)
 
@@ -482,7 +529,7 @@ def test_a_page_whose_name_was_rebound_to_this_server_reaches_nothing(caplog):
         [said] = [record.getMessage() for record in caplog.records if "refused" in record.message]
         assert "'rebound.example:8765'" in said and "--public-name" in said
 
-    serving(test)
+    serving(test, public_names=("", "a b"))
 
 
 def test_addresses_this_computer_and_names_that_were_given_are_answered():
@@ -494,10 +541,12 @@ def test_addresses_this_computer_and_names_that_were_given_are_answered():
         "10.0.0.7",
         "Robots.example",
         "robots.example.:1",
+        "xn--mller-kva.example:80",
+        "box.example",
     ]
 
     async def test(client):
         answers = [await client.get("/robots", headers={"Host": host}) for host in hosts]
         assert [a.status for a in answers] == [200] * len(hosts)
 
-    serving(test, public_names=("robots.EXAMPLE",))
+    serving(test, public_names=("robots.EXAMPLE", "Müller.example", " box.example."))
