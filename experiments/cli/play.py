@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +13,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.applications import DRIVEN
 from experiments.study_setup import UNSET
-from experiments.terminal.progress import console, say
+from experiments.terminal.progress import console, say, step
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError, ExecutionConfig, require
 from hma_jax.runtime.exits import raise_pending_stop
@@ -57,7 +59,7 @@ def play(
         tokenizer: Directory of the tokenizer that the model was trained with, if it is not beside RUN.
     """
     try:
-        from experiments.applications.play.server import SESSIONS, make_app, serve
+        from experiments.applications.play.server import SESSIONS, make_app, name_as_sent, require_free, serve
     except ModuleNotFoundError as error:
         if error.name != "aiohttp":
             raise
@@ -79,9 +81,11 @@ def play(
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     for name in public_name:
-        require(not set(name) & set(":/"), f"--public-name takes a name without scheme and port, got {name!r}")
+        require(bool(name_as_sent(name)), f"--public-name takes a name without scheme and port, got {name!r}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
     decode = change_decode(find_decode(run), temperature, slide=window, unmask_steps=unmask_steps)
+    with _listening_at(host, port):
+        asyncio.run(require_free(host, port))
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )
@@ -94,8 +98,9 @@ def play(
         )
     if simulator.ignores_actions:
         say(f"note: {DEAF}")
-    say(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling")
-    warm_up(simulator, together=1)
+    say(f"{run}: {few([name for name in simulator.robots if name in begins])}")
+    with step("compile the simulator") as progress:
+        warm_up(simulator, together=1, progress=progress)
     raise_pending_stop()
 
     def truth(robot: Robot) -> TrueSimulator | None:
@@ -120,17 +125,25 @@ def play(
             compiling.start()
 
     try:
-        asyncio.run(serve(app, host, port, ready))
+        with _listening_at(host, port):
+            asyncio.run(serve(app, host, port, ready))
     except KeyboardInterrupt:
         if compiling.is_alive():
             console.print("stopping, as soon as the running compilation is finished")
         raise
+    finally:
+        ended.set()
+
+
+@contextmanager
+def _listening_at(host: str, port: int) -> Iterator[None]:
+    """Says where it was when the system does not let the block listen."""
+    try:
+        yield
     except OSError as error:
         raise ConfigError(
             f"cannot listen on {_place(host, port)}: {error.strerror}; choose another --host or --port"
         ) from error
-    finally:
-        ended.set()
 
 
 def _place(host: str, port: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import count
 
 import numpy as np
 
@@ -11,19 +12,27 @@ from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 
-def warm_up(simulator: Simulator, together: int | None = None) -> None:
+def warm_up(
+    simulator: Simulator, together: int | None = None, progress: Callable[[int, int, str], None] = lambda *_: None
+) -> None:
     """Compiles resetting, rewinding and advancing up to `together` episodes at once (default: any number), and restores
-    the simulator's state. For more that advance at once: `warm_up_more`."""
+    the simulator's state. For more that advance at once: `warm_up_more`.
+
+    Calls `progress(done, total, what)`: so many of the programs are compiled, and `what` the next one is for."""
+    each = [n for n in sizes(len(simulator)) if n <= (together or len(simulator))]
+    done, total = count(), 3 * len(each)
     kept = simulator.snapshot()
     robot = next(iter(simulator.robots.values()))
     black = np.zeros((1, *simulator.images.shape[1:]), np.uint8)
-    for size in sizes(len(simulator)):
-        if size <= (together or len(simulator)):
-            which = range(size)
-            simulator.reset(Start(robot.name, black, np.zeros((0, robot.action_dim), np.float32)), episodes=which)
-            simulator.rewind(0, which)
+    for n in each:
+        progress(next(done), total, "beginning episodes")
+        simulator.reset(Start(robot.name, black, np.zeros((0, robot.action_dim), np.float32)), episodes=range(n))
+        progress(next(done), total, "rewinding")
+        simulator.rewind(0, range(n))
     simulator.restore(kept)
-    warm_up_more(simulator, 0, together)
+    for n in each:
+        progress(next(done), total, "making frames")
+        simulator.compile(n)
 
 
 def warm_up_more(

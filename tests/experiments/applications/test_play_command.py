@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import socket
 from dataclasses import replace
 
 import pytest
@@ -19,6 +20,16 @@ from hma_jax.simulator import Simulator
 from hma_jax.simulator.folder import DECODE, DEFAULT_DECODE, save_decode
 from tests.experiments.applications.serving import no_truth, until
 from tests.hma_jax.simulator.small import parts, simulator, start
+
+
+@pytest.fixture(autouse=True)
+def every_address_is_free(monkeypatch):
+    """Also those of other computers, and those that somebody listens on."""
+
+    async def free(host, port):
+        pass
+
+    monkeypatch.setattr(server, "require_free", free)
 
 
 def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
@@ -70,8 +81,9 @@ def test_the_command_answers_at_its_host_and_at_the_public_names_that_it_is_give
     command = ["play", str(tmp_path), "--visitors", "1", "--host", "robots.lan", "--public-name"]
     assert main([*command, "robots.example", "--public-name", "third.example"]) == 0
     assert answers == {"robots.lan:80": 200, "robots.example": 200, "others.example": 403}
-    assert main([*command, "robots.example:80"]) == 2
-    assert "a name without scheme and port, got 'robots.example:80'" in " ".join(capsys.readouterr().err.split())
+    for unusable in ("robots.example:80", "robots.example/", "two names", " ", "."):
+        assert main([*command, unusable]) == 2
+        assert f"a name without scheme and port, got {unusable!r}" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, capsys):
@@ -87,7 +99,7 @@ def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, c
     assert main(["play", str(tmp_path)]) == 2
     said = " ".join(capsys.readouterr().out.split())
     assert f"not on the page: {', '.join(others)}; this directory has no held-out frames" in said
-    assert said.endswith(f"{tmp_path}: {first}; compiling")
+    assert said.endswith(f"{tmp_path}: {first} compile the simulator ...")
 
 
 def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(monkeypatch, tmp_path, capsys):
@@ -140,6 +152,19 @@ def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monke
     assert main(["play", str(tmp_path), "--visitors", "1", "--host", "nosuchhost"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "nosuchhost:" in said and "Name or service not known; choose another --host or --port" in said
+
+
+def test_a_taken_port_is_said_before_anything_is_loaded(monkeypatch, tmp_path, capsys):
+    """It was said after minutes of compiling."""
+    from experiments.applications import simulators
+
+    monkeypatch.undo()  # addresses are asked for
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: pytest.fail("it loads"))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["play", str(tmp_path), "--port", str(port)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"cannot listen on 127.0.0.1:{port}: " in said and "choose another --host or --port" in said
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])

@@ -84,7 +84,9 @@ def test_nothing_is_compiled_once_an_episode_is_under_way():
         sim.branch([1, 1])
         sim.restore(kept)
 
-    warm_up(sim)
+    told = []
+    warm_up(sim, progress=lambda *step: told.append(step))
+    assert [(done, total) for done, total, _ in told] == [(i, len(told)) for i in range(len(told))]
     assert sim.counts == (0, 0) and not sim.images.any(), "warming up leaves nothing behind"
     everything(1)
     assert compiled, "the listener hears nothing"
