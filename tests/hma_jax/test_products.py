@@ -69,7 +69,7 @@ def test_a_training_step_has_the_products_that_the_formula_counts(masking):
 
 
 def test_muon_multiplies_what_the_page_says():
-    """docs/own_data.md: of each layer, of each robot in it, and of each robot's stem."""
+    """docs/models.md: of each layer, of each robot in it, and of each robot's stem."""
     model = model_config(width=32, layers=3)
     declared = declare_model(model, TABLE)
     hidden = {name: spec for name, spec in declared.leaves().items() if spec.role == "hidden"}
