@@ -234,7 +234,8 @@ def test_two_conversions_do_not_write_the_same_place(tmp_path):
 
 
 def test_the_documented_script_writes_a_dataset_that_is_read(tmp_path, monkeypatch, capsys):
-    (text,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    _, section = PAGE.read_text().split("\n## Writing RLDS\n")
+    (text,) = re.findall(r"^```python\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
     (tmp_path / "my_robot.py").write_text(text)
     monkeypatch.setattr(sys, "argv", ["my_robot.py", str(tmp_path)])
     for _ in range(2):  # the second finds it done
