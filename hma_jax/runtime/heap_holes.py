@@ -4,7 +4,8 @@ Small matrix products take a temporary block each, thousands of times a step. In
 seconds, the lists in which glibc keeps free chunks of such sizes (its large bins) have hundreds of members, and it
 walks through them under the heap's lock: a training step takes up to a third longer, for as long as the process
 lives. After compiling, blocks that nobody uses are therefore allocated in these holes, until the next program is
-compiled. docs/performance.md has the figures.
+compiled. On two cores a step of `hma train --preset play-gpu` at batch 8 took 573 to 623 ms before and 487 to 571 ms
+since, one of the base model 3.70 to 3.89 s and 3.55 to 3.79 s.
 """
 
 from __future__ import annotations
