@@ -94,8 +94,8 @@ def python(
 ) -> None:
     """Make a tokenizer of your own Python code: a folder with tokenizer.py, beside it its weights.
 
-    All files of the folder are copied. Every command that uses the tokenizer runs this code, so take such a tokenizer,
-    and a run or study that holds one, only from people whom you trust.
+    All files of the folder are copied. Every command that uses the tokenizer runs this code. Others who get the
+    tokenizer, or a run or study that holds it, have to say that they trust it: `hma tokenizer trust`.
 
     Args:
         folder: Folder with tokenizer.py; docs/own_data.md, "Your own tokenizer", says what is in it.
@@ -109,6 +109,23 @@ def python(
     with step(f"try {short(folder)}"):
         try_out(tokenizer)
     _write(tokenizer, out)
+
+
+@tokenizer_app.command(name="trust")
+def trust(directory: Annotated[Positional[Path], arg(metavar="DIR")]) -> None:
+    """Let a tokenizer of somebody else's Python code run here, in this and all later commands.
+
+    One that `hma tokenizer python` made here needs this only for other users, or on machines with another home
+    directory (HMA_CACHE_DIR). Read the code first: DIR/files.
+
+    Args:
+        directory: Directory of the tokenizer; that of a run is in its study's folder `tokenizer`.
+    """
+    from hma_jax.tokenizers.io import trust_tokenizer
+
+    say(
+        f"trusted: {trust_tokenizer(directory)}; the code of {short(directory)} runs from now on, as long as it is unchanged"
+    )
 
 
 def train_tokenizer(setup: StudySetup, replace: Step | None) -> None:

@@ -20,6 +20,14 @@ IO_ERRNOS = frozenset(
 """errno values that report a failing disk, network or operating system, and never damaged contents."""
 
 
+CACHE_VARIABLE = "HMA_CACHE_DIR"
+
+
+def cache_directory() -> Path:
+    """What is kept for later processes of this user: `$HMA_CACHE_DIR`, by default `~/.cache/hma-jax`."""
+    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "hma-jax")
+
+
 def sync(path: Path) -> None:
     """Flushes a file, or the renames within a directory, to disk (fsync)."""
     fd = os.open(path, os.O_RDONLY)

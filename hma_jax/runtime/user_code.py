@@ -1,4 +1,4 @@
-"""Where Python code of the user is run, its errors name the line."""
+"""Python code of the user: which is run at all, and errors that name its line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import cache_directory
 
 
 @contextmanager
@@ -29,3 +30,21 @@ def naming_line(path: Path, page: str, *others: type[Exception]) -> Iterator[Non
         raise ConfigError(
             f"{where}: {words}; correct the file ({page}), or add --debug to see the traceback"
         ) from error
+
+
+def trust(identity: str) -> None:
+    """Lets code that has this hash run for this user, in every process. Raises OSError."""
+    _trusted(identity).parent.mkdir(parents=True, exist_ok=True)
+    _trusted(identity).touch()
+
+
+def require_trusted(identity: str, code: Path, how: str) -> None:
+    """Raises ConfigError, which ends with `how` to trust it, for code that this user has neither made nor trusted."""
+    require(
+        _trusted(identity).exists(),
+        f"{code} is Python code that would be run, and it was not made a tokenizer here; if you trust it: {how}",
+    )
+
+
+def _trusted(identity: str) -> Path:
+    return cache_directory() / "trusted" / identity

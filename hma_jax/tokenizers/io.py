@@ -20,6 +20,7 @@ from hma_jax.config.json import diff, from_dict, to_dict
 from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.arrays import UNREADABLE, write_arrays
 from hma_jax.runtime.files import write_file
+from hma_jax.runtime.user_code import require_trusted, trust
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
@@ -60,6 +61,7 @@ def save_tokenizer(tokenizer: BaseTokenizer, directory: str | Path) -> None:
         (directory / DESCRIPTION).unlink(missing_ok=True)
         if isinstance(tokenizer, PythonTokenizer):
             copy_folder(tokenizer.folder, directory / FILES)
+            trust(tokenizer.identity)  # it has run already
         else:
             write_arrays(directory / WEIGHTS, arrays, compressed=False)
         write_file(directory / DESCRIPTION, json.dumps(description, indent=2, sort_keys=True) + "\n")
@@ -75,7 +77,8 @@ def load_tokenizer(
     *,
     piece: int | None = None,
 ) -> BaseTokenizer:
-    """The tokenizer in `directory`. `piece` is explained at `BaseTokenizer`. Of the kind "python", its code is run.
+    """The tokenizer in `directory`. `piece` is explained at `BaseTokenizer`. Of the kind "python", its code is run, if
+    it was saved by this user or trusted (`trust_tokenizer`).
 
     Raises ConfigError if none is there, if a file is damaged, or if its configuration is not
     `expect` (when given), naming every field that differs.
@@ -91,7 +94,9 @@ def load_tokenizer(
         )
     if kind is PythonTokenizer:
         files = directory / FILES
-        _require_described(files, "folder", folder_identity(config, files), description)  # before its code is run
+        # Before its code is run:
+        _require_described(files, "folder", folder_identity(config, files), description)
+        require_trusted(description["identity"], files, f"hma tokenizer trust {directory}")
         return PythonTokenizer(config, files, piece=piece)
     weights = _read_weights(directory)
     measured = {name: description[name] for name in kind.measured}
@@ -101,6 +106,20 @@ def load_tokenizer(
         raise ConfigError(f"{directory}: {error}; {ADVICE}") from error
     _require_described(directory / WEIGHTS, "file", tokenizer.identity, description)
     return tokenizer
+
+
+def trust_tokenizer(directory: Path) -> str:
+    """Lets the Python code of a tokenizer run for this user; returns its identity. Raises ConfigError for a tokenizer
+    of another kind, and for files that are not those of which it was made."""
+    description = _read_description(directory)
+    require(
+        KINDS[description["kind"]] is PythonTokenizer,
+        f"{directory} is a tokenizer of the kind {description['kind']}, which runs no code of its own; use it as it is",
+    )
+    identity = folder_identity(_config(directory, description), directory / FILES)
+    _require_described(directory / FILES, "folder", identity, description)
+    trust(identity)
+    return identity
 
 
 def _require_described(path: Path, what: str, identity: str, description: dict[str, Any]) -> None:

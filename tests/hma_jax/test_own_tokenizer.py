@@ -11,9 +11,10 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, PythonConfig
+from hma_jax.config import ConfigError, PixelsConfig, PythonConfig
 from hma_jax.evaluation.images import decode_in_pieces
-from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
+from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer, trust_tokenizer
+from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.python import PythonTokenizer, try_out
 
 PAGE = Path(__file__).parents[2] / "docs" / "own_data.md"
@@ -120,6 +121,24 @@ def test_a_changed_file_is_another_tokenizer_and_is_not_run(bright, tmp_path, na
     (tmp_path / "saved" / "files" / "tokenizer.py").write_text("raise SystemExit")
     with pytest.raises(ConfigError, match=r"saved/files is not the folder that tokenizer.json describes"):
         load_tokenizer(tmp_path / "saved")
+
+
+def test_code_of_others_runs_only_where_it_is_trusted(bright, tmp_path, monkeypatch):
+    tokenizer = PythonTokenizer(None, bright)
+    save_tokenizer(tokenizer, tmp_path / "theirs")
+    monkeypatch.setenv("HMA_CACHE_DIR", str(tmp_path / "another user"))
+    with pytest.raises(
+        ConfigError, match=r"theirs/files is Python code .* if you trust it: hma tokenizer trust .*theirs$"
+    ):
+        load_tokenizer(tmp_path / "theirs")
+    assert trust_tokenizer(tmp_path / "theirs") == load_tokenizer(tmp_path / "theirs").identity == tokenizer.identity
+    with (tmp_path / "theirs" / "files" / "network.py").open("a") as file:
+        file.write("\n")
+    with pytest.raises(ConfigError, match="theirs/files is not the folder that tokenizer.json describes"):
+        trust_tokenizer(tmp_path / "theirs")
+    save_tokenizer(PixelTokenizer(PixelsConfig(image_size=8, patch=4)), tmp_path / "pixels")
+    with pytest.raises(ConfigError, match="of the kind pixels, which runs no code of its own"):
+        trust_tokenizer(tmp_path / "pixels")
 
 
 def test_two_folders_have_files_of_the_same_name(bright, tmp_path):

@@ -215,7 +215,7 @@ def _wait_until_settled(root: Path) -> None:
 
 
 def _child(out: Path, measure: str, windows: int = 0) -> dict:
-    from data_pipelines.sources.rlds.index import CACHE_VARIABLE
+    from hma_jax.runtime.files import CACHE_VARIABLE
 
     command = [sys.executable, "-m", "tests.stress.openx_scale", "--measure", measure, "--out", str(out)]
     environment = os.environ | {CACHE_VARIABLE: str(out / "cache")}

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,11 +28,10 @@ from data_pipelines.errors import CorruptRecordError, DataError, UnreachableErro
 from data_pipelines.sources.rlds.listing import list_files
 from data_pipelines.sources.rlds.location import is_remote
 from data_pipelines.sources.rlds.tfrecord import ShardIndex, scan_shard
+from hma_jax.runtime.files import CACHE_VARIABLE, cache_directory
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
-
-CACHE_VARIABLE = "HMA_CACHE_DIR"
 
 SCANS, REMOTE_SCANS = 16, 64
 """Shards that are scanned concurrently: most of the time is spent waiting for the disk or the store."""
@@ -124,9 +122,8 @@ def load_index(directory: Location, split: str, shards: Sequence[Location], scan
 
 def index_path(directory: Location, split: str) -> Path:
     """The cache file of a split's index."""
-    root = os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "hma-jax"
     text = str(directory) if is_remote(directory) else str(directory.absolute())
-    return Path(root) / "index" / f"{hashlib.sha256(f'{text}#{split}'.encode()).hexdigest()[:32]}.columns"
+    return cache_directory() / "index" / f"{hashlib.sha256(f'{text}#{split}'.encode()).hexdigest()[:32]}.columns"
 
 
 # --- making it -----------------------------------------------------------------------------------
