@@ -66,9 +66,9 @@ class PythonTokenizer(BaseTokenizer):
         self._hash = hash_folder(self.folder)
         with naming_line(self._file, PAGE):
             self._own = own = _run(self.folder, self._hash)(self.folder)
-            facts = {name: getattr(own, name) for name in FACTS if hasattr(own, name)}
+            facts = {name: _plain(getattr(own, name)) for name in FACTS if hasattr(own, name)}
             missing = [name for name in ("encode", "decode") if not callable(getattr(own, name, None))]
-            piece = getattr(own, "piece", None) if piece is None else piece
+            piece = _plain(getattr(own, "piece", None)) if piece is None else piece
         missing += [name for name in ("image_size", "grid") if name not in facts]
         require(not missing, f"{self._file}: what {FUNCTION} returns has no {', no '.join(missing)}; add it ({PAGE})")
         says = from_dict(PythonConfig, facts, f"{self._file}: what {FUNCTION} returns")
@@ -78,6 +78,7 @@ class PythonTokenizer(BaseTokenizer):
             "tokenizer; its facts must follow from the files of its folder alone",
         )
         piece = fitting_piece(says.image_shape) if piece is None else piece
+        require(isinstance(piece, int), f"{self._file}: piece must be a whole number, not {piece!r} ({PAGE})")
         self._on_host = not hasattr(own, "params")
         if self._on_host:
             self._set_up(says, {}, jax.local_devices()[:1], piece)
@@ -167,7 +168,7 @@ class PythonTokenizer(BaseTokenizer):
 
 def try_out(tokenizer: PythonTokenizer) -> None:
     """Encodes and decodes a few images of noise. Raises ConfigError for results of another shape, type or range than
-    the code says, and if an image's tokens depend on the images beside it."""
+    the code says, for black images, and if an image's tokens depend on the images beside it."""
     images = np.random.default_rng(0).integers(0, 256, (3, *tokenizer.image_shape, 3), np.uint8)
     together, alone = tokenizer.encode(images), tokenizer.encode(images[1:2])
     other = (np.abs(together[1:2] - alone.astype(np.float64)) > 1e-2 * np.abs(alone)).mean()
@@ -176,7 +177,16 @@ def try_out(tokenizer: PythonTokenizer) -> None:
         f"{tokenizer.folder / FILE}: an image beside others has other tokens ({other:.0%} of them) than alone; encode "
         "must be deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
     )
-    tokenizer.decode(together)
+    require(
+        tokenizer.decode(together).max() > 1,
+        f"{tokenizer.folder / FILE}: decode makes black images of noise; floats must be in 0..255 (not in 0..1 or -1..1) "
+        f"and numbers ({PAGE})",
+    )
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers as Python's: of `np.prod(levels)`, say."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def folder_identity(config: PythonConfig, folder: Path) -> str:

@@ -149,6 +149,7 @@ def test_two_folders_have_files_of_the_same_name(bright, tmp_path):
     assert (second.encode(images) > first.encode(images)).all()
 
 
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -161,6 +162,9 @@ def test_two_folders_have_files_of_the_same_name(bright, tmp_path):
         ("vocab_size = LEVELS**3", "vocab_size = 100", r"encode gives values from 333 to 444; tokens must be in \[0, 100"),
         (".reshape(len(images), 64)", "", r"encode must give integers \[64, 64\], not int64 \[64, 8, 8\]"),
         ("return colours.repeat(8, 1)", "return colours", r"decode must give uint8, .*\[64, 64, 64, 3\], not uint8 \[64, 8"),
+        (".repeat(8, 2)", ".repeat(8, 2) / 255", "decode makes black images of noise; floats must be in 0..255"),
+        (".repeat(8, 2)", ".repeat(8, 2) * np.nan", "decode makes black images of noise; floats must be .* and numbers"),
+        ("vocab_size = LEVELS**3", "vocab_size, piece = 1000, 8.0", "piece must be a whole number, not 8.0"),
         ("images.reshape", "(images - images.mean(0)).reshape", "an image beside others has other tokens .* than alone"),
         ("LEVELS / 256", "LEVELS / none", "line 14: NameError: name 'none' is not defined; correct the file"),
     ],
@@ -169,6 +173,13 @@ def test_what_is_wrong_is_named(tmp_path, old, new, message):
     code = COLOURS.replace("images.reshape", "np.clip(images, 30, 150).reshape") if "333" in message else COLOURS
     with pytest.raises(ConfigError, match=message):
         try_out(PythonTokenizer(None, write(tmp_path / "mine", code, it=(old, new))))
+
+
+def test_numbers_of_numpy_are_facts_too(tmp_path):
+    code = COLOURS.replace("LEVELS**3", "np.prod([LEVELS] * 3)").replace("= 64, 8", "= np.int32(64), np.int64(8)")
+    assert PythonTokenizer(None, write(tmp_path / "mine", code)).config == PythonConfig(
+        image_size=64, grid=8, vocab_size=1000
+    )
 
 
 def test_a_folder_without_code_is_named(tmp_path):
