@@ -7,8 +7,10 @@ lie in a hidden directory beside the dataset. `data_pipelines.sources.lerobot_me
 
 from __future__ import annotations
 
+import glob
 import itertools
 import math
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,6 +27,7 @@ from data_pipelines.export.video import VideoWriter, pixel_format
 from data_pipelines.json_file import read_object
 from data_pipelines.publishing.files import publish, sync
 from data_pipelines.publishing.output_lock import lock_output
+from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.lerobot import EPISODE, REWARD, SUCCESS, TASK, TIME
 from data_pipelines.sources.source import (
     INSTRUCTION_KEYS,
@@ -52,6 +55,9 @@ FILE_BYTES = 2**31
 
 CHUNK = 1000
 """Files in a folder."""
+
+FILE_SIZES = {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+"""LeRobot's own defaults, up to which its tools fill files when they edit the dataset."""
 
 FRAME, INDEX, DONE, END = "frame_index", "index", "next.done", "dataset_to_index"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -87,8 +93,9 @@ def export_lerobot(
 
     With the same source and settings again it resumes, or returns at once if the dataset is finished. Damaged episodes
     are left out where `source` was opened with corrupt='skip'. Raises EpisodeError for a damaged one otherwise,
-    DataError if none is left, ConfigError for a directory that exists and is another dataset.
+    DataError if none is left, ConfigError for a directory that exists and is another dataset, and without PyAV.
     """
+    require(0 < hz < math.inf, f"frames per second must be positive and finite, got {hz}")
     final = Path(out).absolute()
     settings = {
         "exporter": EXPORTER_VERSION,
@@ -102,20 +109,28 @@ def export_lerobot(
     }
     if final.exists():
         return _finished(final, settings)
+    require_module("av", "writing videos")
     try:
         with lock_output(final):
             if final.exists():  # made by another process meanwhile
                 return _finished(final, settings)
-            partial = final.with_name(f".{final.name}.{stable_hash(settings)[:16]}.partial")
+            partial = final.with_name(_partial(final.name, stable_hash(settings)[:16]))
             writer = _Writer(source, fields, partial, hz)
             writer.write(file_bytes, progress)
             writer.finish(settings)
             publish(partial, final)
+            for other in final.parent.glob(_partial(glob.escape(final.name), "[0-9a-f]" * 16)):
+                shutil.rmtree(other, ignore_errors=True)  # begun with other settings, which nothing can finish any more
             return _finished(final, settings)
     except Held as held:
         raise Held(
             f"another process is writing {final} ({held.who}); wait until it has finished, or stop it", held.holder
         ) from None
+
+
+def _partial(name: str, settings: str) -> str:
+    """The name of the directory in which the dataset `name` is made, with the hash of its `settings`."""
+    return f".{name}.{settings}.partial"
 
 
 def _finished(final: Path, settings: Mapping[str, Any]) -> Exported:
@@ -182,8 +197,10 @@ class _Writer:
 
         frames = {name: record.get(key, ()) for name, key in self._fields.cameras.items()}
         steps = len(next(iter(frames.values())))
+        if not steps:
+            raise unusable("it has no frames.")
         for name, of in frames.items():
-            if not steps or len(of) != steps or isinstance(of, np.ndarray):
+            if len(of) != steps or isinstance(of, np.ndarray):
                 raise unusable(f"{self._fields.cameras[name]!r} has {len(of)} frames of {steps}.")
         columns = {
             name: join_actions(record, keys, self._source.features, steps, unusable)
@@ -191,8 +208,8 @@ class _Writer:
         }
         if REWARD_KEY in record:
             rewards = np.asarray(record[REWARD_KEY], np.float32).reshape(-1, 1)
-            if len(rewards) != steps:
-                raise unusable(f"it has {len(rewards)} rewards for {steps} steps.")
+            if len(rewards) != steps or not np.isfinite(rewards).all():
+                raise unusable(f"it has no finite reward for each of its {steps} steps.")
             columns[REWARD] = rewards
         last = (np.arange(steps) == steps - 1)[:, None]
         columns[DONE] = last
@@ -306,6 +323,7 @@ class _Writer:
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),
             "chunks_size": CHUNK,
+            **FILE_SIZES,
             "fps": int(self._hz) if float(self._hz).is_integer() else self._hz,
             "splits": {"train": f"0:{self._episodes}"},
             "data_path": DATA,
@@ -318,6 +336,8 @@ class _Writer:
         write_file(meta / "stats.json", to_strict_json({name: self._statistics(name) for name in features}))
         write_file(meta / "info.json", to_strict_json(info))
         left_out = sum(run.count for run in self._source.runs) - self._episodes
+        for stray in self._root.rglob(".*.tmp"):  # of killed exports
+            stray.unlink()
         origin = {"settings": settings, "episodes": self._episodes, "frames": self._frames, "left_out": left_out}
         write_file(self._root / ORIGIN, to_strict_json(origin))
 

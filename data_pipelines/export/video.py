@@ -7,7 +7,6 @@ from fractions import Fraction
 from pathlib import Path
 
 from data_pipelines.export.statistics import PixelCounts, Statistics
-from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.source import SourceFrame, decode_frame
 
 SAMPLED = 128
@@ -25,7 +24,8 @@ class VideoWriter:
         self._rate = Fraction(hz).limit_denominator(1000)
 
     def __enter__(self) -> VideoWriter:
-        av = require_module("av", "writing videos")
+        import av
+
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(self.path), "w", format="mp4")
         self._stream = self._container.add_stream("libx264", rate=self._rate, options=dict(ENCODING))

@@ -61,6 +61,16 @@ def test_an_export_says_what_it_wrote_and_what_is_lacking(tmp_path, capsys):
     assert "note: there is no observation.state" in out and f"next: hma data inspect {tmp_path}/new\n" in out
     assert main(["data", "inspect", str(tmp_path / "new"), "--out", str(tmp_path / "seen")]) == 0
     assert main([*command, "--hz", "5"]) == 2 and "with other settings" in capsys.readouterr().err
+    assert main([*command, "--hz", "0"]) == 2 and "--hz must be positive and finite" in capsys.readouterr().err
+
+
+def test_an_export_leaves_out_as_many_damaged_episodes_as_there_are(tmp_path, capsys):
+    def change(e: int, features: dict) -> None:
+        features["steps/observation/image"] = [b"no image"] * 2 if e else features["steps/observation/image"]
+
+    place = write_rlds(tmp_path, make_spec("toy"), [2] * 20, change=change)
+    assert main(["data", "export", str(place), "--out", str(tmp_path / "new"), "--hz", "4", "--skip-damaged"]) == 0
+    assert "1 episode, 2 frames at 4 Hz\nleft out 19 damaged episodes" in said(capsys)
 
 
 def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):

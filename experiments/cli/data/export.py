@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from experiments.study_setup import UNSET, command, use_entries
+from experiments.study_setup import UNSET, command, require_local, use_entries
 from experiments.terminal.progress import say, step, wrote
 from experiments.terminal.words import counted
 from hma_jax.config import require
@@ -45,8 +47,10 @@ def data_export(
     from data_pipelines.registry import find_reader
     from data_pipelines.sources.open import open_source
 
+    require_local("--out", out)
+    require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     use_entries(registry)
-    opened = open_source(source, split, corrupt="skip" if skip_damaged else "raise")
+    opened = open_source(source, split, corrupt="skip" if skip_damaged else "raise", max_skipped=sys.maxsize)
     entry = find_reader(opened.name)
     rate = hz or opened.hz or (entry.hz if entry else None)
     require(rate is not None, f"{source}: its files do not say how many frames a second it has; give --hz")
@@ -60,7 +64,9 @@ def data_export(
     if done.left_out:
         say(f"left out {counted(done.left_out, 'damaged episode')}")
     for name, keys in fields.vectors.items():
-        say(f"{name}: {len(fields.names[name])} values of {', '.join(key.removeprefix('steps/') for key in keys)}")
+        say(
+            f"{name}: {counted(len(fields.names[name]), 'value')} of {', '.join(key.removeprefix('steps/') for key in keys)}"
+        )
     if "observation.state" not in fields.vectors:
         say("note: there is no observation.state, which some policies of LeRobot need; --state names its fields")
     wrote(out, then=command("data inspect", out))

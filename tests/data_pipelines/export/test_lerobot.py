@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -71,13 +72,66 @@ def test_an_interrupted_export_continues_and_gives_the_same_tables(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         one_per_file(source, tmp_path / "new", progress=stop)
     assert not (tmp_path / "new").exists()
+    (partial,) = tmp_path.glob(".new.*.partial")
+    (partial / "meta" / "episodes" / ".file-002.parquet.0123abcd.tmp").touch()  # as a killed process leaves one
     read = []
     assert one_per_file(source, tmp_path / "new", progress=lambda done, *_: read.append(done)) == Exported(3, 12, 0)
     assert read == [3]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["new", "toy", "whole"]
+    assert not list((tmp_path / "new").rglob(".*"))
     for path in sorted((tmp_path / "whole").rglob("*.*")):
         if path.is_file() and path.suffix != ".mp4":
             assert path.read_bytes() == (tmp_path / "new" / path.relative_to(tmp_path / "whole")).read_bytes()
+
+
+def test_what_was_begun_with_other_settings_goes_once_the_dataset_is_there(tmp_path):
+    source = open_source(write_rlds(tmp_path, make_spec(), [3, 3]))
+
+    def stop(done: int, total: int, note: str) -> None:
+        raise KeyboardInterrupt
+
+    for name, options in (("new", {}), ("new.b", {}), ("new", {"file_bytes": 1})):
+        with pytest.raises(KeyboardInterrupt):
+            export(source, tmp_path / name, progress=stop, **options)
+    assert len(list(tmp_path.glob(".new.*.partial"))) == 3
+    export(source, tmp_path / "new")
+    (other,) = tmp_path.glob(".new.*.partial")
+    assert other.name.startswith(".new.b.")
+
+
+@pytest.mark.parametrize("hz", [0, -2, float("nan"), float("inf")])
+def test_what_is_no_rate_is_refused(tmp_path, hz):
+    source = open_source(write_rlds(tmp_path, make_spec(), [3]))
+    with pytest.raises(ConfigError, match="frames per second must be positive and finite"):
+        export_lerobot(source, choose_fields(source), tmp_path / "new", hz)
+
+
+def test_that_pyav_is_lacking_is_said_before_anything_is_read_or_written(tmp_path, monkeypatch):
+    source = open_source(write_rlds(tmp_path, make_spec(), [3]))
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.setattr(type(source), "record", lambda *_: pytest.fail("an episode was read"))
+    with pytest.raises(ConfigError, match="writing videos needs the package 'av'"):
+        export(source, tmp_path / "new")
+    assert [p.name for p in tmp_path.iterdir()] == ["toy"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps/reward": np.array([0, np.nan, 1], np.float32)}, "no finite reward for each of its 3 steps"),
+        ({"steps/observation/image": []}, "episode 1: it has no frames"),
+    ],
+    ids=["reward", "frames"],
+)
+def test_an_episode_that_policies_cannot_be_trained_on_is_damaged(tmp_path, change, message):
+    """LeRobot cannot load statistics that are not numbers."""
+    place = write_rlds(
+        tmp_path, make_spec(), [3, 3], change=lambda e, features: features.update(change) if e else None,
+        rewards=lambda e: [0, 0, 1],
+    )  # fmt: skip
+    with pytest.raises(EpisodeError, match=message):
+        export(open_source(place), tmp_path / "new")
+    assert export(open_source(place, corrupt="skip"), tmp_path / "new") == Exported(1, 3, 1)
 
 
 def test_texts_that_change_within_an_episode_are_tasks(tmp_path):
