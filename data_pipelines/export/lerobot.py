@@ -22,7 +22,7 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError, without_advice
 from data_pipelines.export.fields import LeRobotFields
 from data_pipelines.export.statistics import COMBINED, combine, of_values, quantiles
-from data_pipelines.export.tables import arrow, arrow_type, vectors, write_table
+from data_pipelines.export.tables import INDEXED_BY_TASK, arrow, arrow_type, vectors, write_table
 from data_pipelines.export.video import VideoWriter, pixel_format
 from data_pipelines.json_file import read_object
 from data_pipelines.publishing.files import publish, sync
@@ -52,6 +52,9 @@ EXPORTER_VERSION = 1
 
 FILE_BYTES = 2**31
 """A file ends with the episode whose pixels, before they are compressed, reach this size: a minute of work or two."""
+
+FRAME_BYTES = 2**16
+"""A smaller frame counts as one of this size, as it takes as long to write."""
 
 CHUNK = 1000
 """Files in a folder."""
@@ -253,7 +256,8 @@ class _Writer:
             except EpisodeError as error:
                 self._source.skip(self._following, error)
             else:
-                size += sum(len(of) * math.prod(self._shapes[name]) for name, of in episode.frames.items())
+                sizes = {name: max(math.prod(shape), FRAME_BYTES) for name, shape in self._shapes.items()}
+                size += sum(len(of) * sizes[name] for name, of in episode.frames.items())
                 yield episode
             self._following += 1
             if progress is not None:
@@ -332,7 +336,7 @@ class _Writer:
         }
         meta = self._root / "meta"
         tasks = pa.table({"task_index": range(len(self._tasks)), "task": list(self._tasks)})
-        write_table(meta / "tasks.parquet", tasks.replace_schema_metadata({"pandas": _INDEXED_BY_TASK}))
+        write_table(meta / "tasks.parquet", tasks.replace_schema_metadata({"pandas": INDEXED_BY_TASK}))
         write_file(meta / "stats.json", to_strict_json({name: self._statistics(name) for name in features}))
         write_file(meta / "info.json", to_strict_json(info))
         left_out = sum(run.count for run in self._source.runs) - self._episodes
@@ -378,18 +382,6 @@ class _Writer:
             files = (self._root / DATA.format(**_place(number)) for number in range(self._files))
             found |= quantiles(np.concatenate([vectors(pq.read_table(f, columns=[feature])[feature]) for f in files]))
         return {key: value.tolist() for key, value in found.items()}
-
-
-_INDEXED_BY_TASK = to_strict_json({
-    "index_columns": ["task"],
-    "column_indexes": [],
-    "columns": [
-        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None},
-        {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
-    ],
-    "pandas_version": "2.2.0",
-})  # fmt: skip
-"""pandas, with which LeRobot reads the tasks, takes this column for the index."""
 
 
 def _place(number: int) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Columns of vectors in Parquet, as LeRobot stores them."""
+"""Tables in Parquet, as LeRobot stores them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hma_jax.config.json import to_strict_json
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+INDEXED_BY_TASK = to_strict_json({
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "columns": [
+        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None},
+        {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
+    ],
+    "pandas_version": "2.2.0",
+})  # fmt: skip
+"""pandas, with which LeRobot reads the tasks, takes this column for the index."""
 
 
 def arrow_type(values: np.ndarray) -> pa.DataType:

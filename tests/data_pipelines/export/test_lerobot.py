@@ -11,7 +11,7 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.export.fields import choose_fields
-from data_pipelines.export.lerobot import ORIGIN, Exported, export_lerobot
+from data_pipelines.export.lerobot import FRAME_BYTES, ORIGIN, Exported, export_lerobot
 from data_pipelines.sources.lerobot_dataset import LeRobotDataset
 from data_pipelines.sources.open import open_source
 from hma_jax.config import ConfigError
@@ -132,6 +132,13 @@ def test_an_episode_that_policies_cannot_be_trained_on_is_damaged(tmp_path, chan
     with pytest.raises(EpisodeError, match=message):
         export(open_source(place), tmp_path / "new")
     assert export(open_source(place, corrupt="skip"), tmp_path / "new") == Exported(1, 3, 1)
+
+
+def test_a_file_of_small_frames_has_not_more_of_them_than_one_of_larger_ones(tmp_path):
+    """A killed export would lose hours of work on them."""
+    source = open_source(write_rlds(tmp_path, make_spec(), [3, 3]))
+    export(source, tmp_path / "new", file_bytes=3 * FRAME_BYTES)
+    assert len(list((tmp_path / "new" / "data").rglob("*.parquet"))) == 2
 
 
 def test_texts_that_change_within_an_episode_are_tasks(tmp_path):
