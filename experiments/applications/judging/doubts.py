@@ -44,7 +44,8 @@ def describe_control(summary: dict[str, Any]) -> str:
 
 
 def describe_order(summary: dict[str, Any]) -> str:
-    """A warning that the control may order the policies as well as the model does; "" where it is known not to."""
+    """A warning that the control may order the policies as well as the model does; "" where the control's correlation
+    is below the model's interval, or the model has none."""
     spearmans = {
         COMPARED[name]: agreed["policies and starts"]["spearman"] for name, agreed in summary["agreement"].items()
     }

@@ -20,6 +20,8 @@ from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.ladder import OWN_HEAD, RANDOM
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
 from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE, shown
+from experiments.applications.policies.cloning import ClonedPolicy
+from experiments.applications.policies.diffusion import DiffusionPolicy
 from experiments.report.clips import animate, strip
 from experiments.report.pieces import STILL, moving, picture, section, table
 from experiments.report.style import CSS
@@ -30,6 +32,14 @@ CLIPS = 6
 
 ON_PAPER = 6
 """Frames of each of them that are printed."""
+
+POLICIES_EXPLAINED = {
+    RANDOM: (RANDOM, "draws its actions at random"),
+    ClonedPolicy.kind: (f"{ClonedPolicy.kind}-N", "behaviour cloning, after N training steps"),
+    DiffusionPolicy.kind: (f"{DiffusionPolicy.kind}-N", "a small Diffusion Policy, after N training steps"),
+    OWN_HEAD: (OWN_HEAD, "the model itself"),
+}
+"""How the name of a policy that is not the user's begins -> its heading, and what it is."""
 
 COLUMNS_EXPLAINED = {
     REAL: "counted on the real robot",
@@ -44,7 +54,7 @@ MEASURES_EXPLAINED = {
     "spearman": ("Spearman", "correlation of the ranks by success rate with the true ranks; 1 is best"),
     "rank violation": (
         "rank violation",
-        "by how much a policy's true rate differs at most from that of one that is ranked otherwise, on average; 0 is best",
+        "the largest difference in true rate from a policy that is ranked the other way round, on average; 0 is best",
     ),
     "bias": ("bias", "success rate minus the true one, on average over policies; above 0 is too good"),
 }
@@ -84,12 +94,10 @@ def _doubts(summary: dict[str, Any]) -> list[str]:
 def _policies(summary: dict[str, Any]) -> str:
     """What the names of policies and of columns mean."""
     columns = next(iter(summary["policies"].values()))
-    return (
-        "<p>Trained policies are named by their number of training steps: <em>cloned-N</em> by behaviour cloning, "
-        f"<em>diffusion-N</em> a small Diffusion Policy. <em>{RANDOM}</em> draws its actions at random; "
-        f"<em>{OWN_HEAD}</em> is the model itself.</p><p>Success rates: {_listed({c: COLUMNS_EXPLAINED[c] for c in columns})}. "
-        "docs/judging.md says more.</p>"
-    )
+    kinds = dict.fromkeys(name.split("-")[0] for name in summary["policies"] if name not in summary["own"])
+    policies = _listed(dict(POLICIES_EXPLAINED[kind] for kind in kinds))
+    rates = _listed({column: COLUMNS_EXPLAINED[column] for column in columns})
+    return f"<p>Policies: {policies}.</p><p>Success rates: {rates}. docs/judging.md says more.</p>"
 
 
 def _agreement(summary: dict[str, Any]) -> str:

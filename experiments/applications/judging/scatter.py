@@ -27,14 +27,17 @@ BESIDE = ((4, 4), (-4, 4), (4, -4), (-4, -4))
 AWAY = tuple(
     (across * far, up * far)
     for far in (10, 16, 24, 34, 48)
-    for across, up in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
-)
+    for across, up in (
+        (0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1),
+        (0.3, 1), (-0.3, 1), (0.3, -1), (-0.3, -1), (1, 0.3), (-1, 0.3), (1, -0.3), (-1, -0.3),
+    )
+)  # fmt: skip
 """Where a name may stand, in printer's points from its point: at a corner of it, or else further away with a line."""
 
 ACROSS, UP = {-1: "right", 0: "center", 1: "left"}, {-1: "top", 0: "center", 1: "bottom"}
 """Which part of a name stands nearest its point, by the direction in which it stands."""
 
-NEAR, MARKER = 7, 3
+NEAR, MARKER = 7, 4
 """Pixels from another policy's point within which a name could be taken for that one's, and a line would touch it."""
 
 NO_ROOM = "names that find no room are in the table"
@@ -109,27 +112,24 @@ def name_points(panel: Axes, points: Mapping[str, tuple[float, float]], first: S
 def place(words: Sequence[Annotation], panel: Axes) -> bool:
     """Moves each name to where it comes near no other point and covers no name before it, nor does the line to its
     point. Hides those for which there is no such place; whether there is one for all."""
-    points_N2, names_K4, pixels = (
-        panel.transData.transform([word.xy for word in words]),
-        np.empty((0, 4)),
-        panel.figure.dpi / 72,
-    )
+    points_N2 = panel.transData.transform([word.xy for word in words])
+    names_K4, pixels = np.empty((0, 4)), panel.figure.dpi / 72
     for word, own in zip(words, points_N2, strict=True):
         others = points_N2[(points_N2 != own).any(1)]
         word.set_visible(True)  # what is hidden has no size
         size = Text.get_window_extent(word).size  # without the line
-        for place in BESIDE + AWAY:
-            towards = np.sign(place)
-            low = own + np.multiply(place, pixels) + (towards - 1) / 2 * size
+        for offset in BESIDE + AWAY:
+            towards = np.sign(offset)
+            low = own + np.multiply(offset, pixels) + (towards - 1) / 2 * size
             high = low + size
-            line_L2 = own + np.linspace(0, 1, 20)[:, None] * (np.clip(own, low, high) - own)
+            line_L2 = own + np.linspace(0, 1, 40)[:, None] * ((low + high) / 2 - own)  # drawn as far as the name
             inside = (low >= panel.bbox.min).all() and (high <= panel.bbox.max).all()
             near, crossed = _boxes(others, NEAR), np.concatenate([names_K4, _boxes(others, MARKER)])
             if inside and not (_meet(low, high, np.concatenate([names_K4, near])) or _cross(line_L2, crossed)):
                 names_K4 = np.concatenate([names_K4, [[*low, *high]]])
-                word.xyann = place
+                word.xyann = offset
                 word.set(ha=ACROSS[towards[0]], va=UP[towards[1]])
-                word.arrow_patch.set_visible(place in AWAY)
+                word.arrow_patch.set_visible(offset in AWAY)
                 break
         else:
             word.set_visible(False)

@@ -215,7 +215,7 @@ def test_table_summary_and_page(judged, few_draws):
     assert page.count("<figure class=trio>") == 4 == page.count("<figure class=strip>"), "the latter on paper"
     assert "cloned-3" in page and "http" not in page
     assert ">Pearson</th>" in page and "<em>bias</em>: success rate minus the true one" in page
-    assert "<em>true, by state</em>: in the true simulator" in page and "by their number of training steps" in page
+    assert "<em>true, by state</em>: in the true simulator" in page and "after N training steps" in page
 
 
 def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path, capsys):

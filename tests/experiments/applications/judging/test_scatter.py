@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from experiments.applications.judging import scatter
@@ -46,21 +48,43 @@ def test_a_name_without_room_is_hidden(panel):
     assert {word.get_visible() for word in words} == {True, False}
 
 
-def drawn(monkeypatch, tmp_path, name: str) -> tuple[str, list[bool]]:
-    """The caption of a committed judgement's figure, and of each name whether it is seen."""
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """Draws the figure of a committed judgement."""
     figures = []
     monkeypatch.setattr(scatter, "save", lambda figure, _: figures.append(figure))
-    summary = json.loads((RESULTS / f"judge-{name}" / "agreement.json").read_text())
-    draw_scatter({"own": [], "compared with": REFERENCE} | summary, tmp_path / "scatter.png")
-    (figure,) = figures
-    seen = [word.get_visible() for panel in figure.axes for word in panel.texts]
-    plt.close(figure)
-    return figure.get_supxlabel(), seen
+
+    def draw(name: str) -> Figure:
+        summary = json.loads((RESULTS / f"judge-{name}" / "agreement.json").read_text())
+        draw_scatter({"own": [], "compared with": REFERENCE} | summary, tmp_path / "scatter.png")
+        return figures[-1]
+
+    yield draw
+    for figure in figures:
+        plt.close(figure)
 
 
 @pytest.mark.parametrize("name", ["pusher_sand-reach", "metaworld_drawer"])
-def test_names_of_committed_judgements_are_seen_or_the_caption_says_where_they_are(monkeypatch, tmp_path, name):
-    caption, seen = drawn(monkeypatch, tmp_path, name)
+def test_names_of_committed_judgements_are_seen_or_the_caption_says_where_they_are(drawn, name):
+    figure = drawn(name)
+    caption, seen = figure.get_supxlabel(), [word.get_visible() for panel in figure.axes for word in panel.texts]
     assert caption.startswith("lines: 95 % intervals; blue: cloned")
     assert all(seen) == (NO_ROOM not in " ".join(caption.split()))
     assert sum(seen) >= len(seen) - 2
+
+
+def test_the_line_of_a_name_ends_at_its_own_point_and_touches_no_other(drawn):
+    """It leaves from the middle of the name, and was thought to leave from what of the name is nearest."""
+    figure = drawn("pusher_sand-reach")
+    figure.canvas.draw()
+    radius, lines = 3 * figure.dpi / 72, 0  # with its edge
+    for panel in figure.axes:
+        points = panel.transData.transform([word.xy for word in panel.texts])
+        for word, own in zip(panel.texts, points, strict=True):
+            if word.get_visible() and word.arrow_patch.get_visible():
+                start, _, end = word.arrow_patch.get_path().vertices
+                line = start + np.linspace(0, 1, 200)[:, None] * (end - start)
+                others = points[(points != own).any(1)]
+                assert np.linalg.norm(line[:, None] - others, axis=-1).min() > radius, word.get_text()
+                lines += 1
+    assert lines
