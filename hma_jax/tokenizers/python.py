@@ -15,7 +15,7 @@ import logging
 import shutil
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.experimental.buffer_callback import Buffer, ExecutionContext, buffer_callback
 
 from hma_jax.config import PythonConfig, require
 from hma_jax.config.json import from_dict, to_dict
@@ -110,9 +111,8 @@ class PythonTokenizer(BaseTokenizer):
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
         if self._on_host:
-            shape, dtype = self._tokens_of(len(images))
-            call = partial(in_pieces, self._host_encode, size=self.piece)
-            return jax.pure_callback(call, jax.ShapeDtypeStruct(shape, dtype), images)
+            described = jax.ShapeDtypeStruct(*self._tokens_of(len(images)))
+            return _call_host(partial(in_pieces, self._host_encode, size=self.piece), described, images)
         with naming_line(self._file, PAGE):
             tokens = self._own.encode(params, images)
         return self._checked_encoding(tokens, len(images))
@@ -120,8 +120,8 @@ class PythonTokenizer(BaseTokenizer):
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         if self._on_host:
             described = jax.ShapeDtypeStruct((len(tokens), *self.image_shape, 3), jnp.uint8)
-            call = partial(in_pieces, self._host_decode, size=self.piece)
-            return jax.pure_callback(call, described, tokens).astype(jnp.float32)
+            size = min(self.piece, len(tokens))  # a simulator decodes a frame or two at a time
+            return _call_host(partial(in_pieces, self._host_decode, size=size), described, tokens).astype(jnp.float32)
         with naming_line(self._file, PAGE):
             images = self._own.decode(params, tokens)
         return jnp.clip(self._checked_images(images, len(tokens)).astype(jnp.float32), 0, 255)
@@ -164,6 +164,24 @@ class PythonTokenizer(BaseTokenizer):
             fits and tuple(got.shape) == shape,
             f"{self._file}: {what} must give {words} {list(shape)}, not {dtype} {list(got.shape)} ({PAGE})",
         )
+
+
+def _call_host(
+    function: Callable[[np.ndarray], np.ndarray], described: jax.ShapeDtypeStruct, x: jax.Array
+) -> jax.Array:
+    """What `function` makes of `x`, as `described`, in a compiled program.
+
+    On CPUs `pure_callback` can wait forever where a process has a single core: it copies a large `x` on the thread that
+    it keeps busy. A buffer is read in place.
+    """
+
+    def in_place(_: ExecutionContext, out: Buffer, buffer: Buffer) -> None:
+        np.asarray(out)[...] = function(np.asarray(buffer))
+
+    def copied(x: jax.Array) -> jax.Array:
+        return jax.pure_callback(lambda x: function(np.asarray(x)), described, x)
+
+    return jax.lax.platform_dependent(x, cpu=buffer_callback(in_place, described), default=copied)
 
 
 def try_out(tokenizer: PythonTokenizer) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -93,6 +96,29 @@ def test_compiled_programs_encode_and_decode_as_the_host_does(kind, request):
     assert within.dtype == tokens.dtype and np.allclose(within, tokens, rtol=1e-6)
     program = jax.jit(lambda params, tokens: decode_in_pieces(tokenizer.decode_uint8_fn, 2, params, tokens))
     assert np.array_equal(program(tokenizer.params, tokens), tokenizer.decode(tokens))
+
+
+ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import jax, numpy as np
+from hma_jax.tokenizers.python import PythonTokenizer
+tokenizer = PythonTokenizer(None, sys.argv[1])
+images = np.zeros((704, 64, 64, 3), np.uint8)
+jax.block_until_ready(jax.jit(lambda x: tokenizer.encode_fn({}, x + 1))(images))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be kept to one core here")
+def test_on_a_single_core_images_come_to_the_host(colours):
+    subprocess.run([sys.executable, "-c", ONE_CORE, str(colours)], check=True, timeout=120)
+
+
+def test_a_simulator_decodes_no_more_frames_than_it_makes(tmp_path):
+    code = COLOURS.replace("def decode(self, ids):", "def decode(self, ids):\n        assert len(ids) == 2")
+    tokenizer = PythonTokenizer(None, write(tmp_path / "mine", code))
+    jax.block_until_ready(jax.jit(tokenizer.decode_fn)({}, np.zeros((2, 64), np.int32)))
 
 
 def test_a_copy_is_the_same_tokenizer(bright, tmp_path):
