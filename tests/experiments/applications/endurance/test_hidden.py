@@ -29,7 +29,12 @@ def watch(tmp_path, monkeypatch):
 
     def watched(run: str, *options: str, temperature: float = 0.0, some: bool = True) -> None:
         decode = DecodeConfig(temperature=temperature)
-        known = SimpleNamespace(model=SimpleNamespace(params={}), decode=decode, robots={ROBOT.name: ROBOT})
+        known = SimpleNamespace(
+            model=SimpleNamespace(params={}),
+            tokenizer=SimpleNamespace(channels=0),
+            decode=decode,
+            robots={ROBOT.name: ROBOT},
+        )
         monkeypatch.setattr(hidden, "load_simulator", lambda *_, **__: known)
         monkeypatch.setattr(hidden, "find_events", lambda *_: rows if some else [])
         told = ["hidden", run, "--out", str(tmp_path), "--detector", str(tmp_path / "detector.npz"), *options]
