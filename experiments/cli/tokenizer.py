@@ -12,6 +12,7 @@ from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
 from experiments.study_setup import StudySetup, command, make_setup
 from experiments.terminal.progress import console, say, short, step, wrote
+from experiments.terminal.words import counted
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def _write(tokenizer: BaseTokenizer, out: Path) -> None:
     if tokenizer.channels:
         what = f"latents of {tokenizer.channels} channels"
     else:
-        what = f"ids of {tokenizer.factors} factors with {tokenizer.factor_vocab} entries"
+        what = f"ids of {counted(tokenizer.factors, 'factor')} with {tokenizer.factor_vocab:,} entries"
     side = tokenizer.image_size
     console.print(
         f"{tokenizer.kind} {tokenizer.identity}: {side} x {side} pixels to {tokenizer.tokens} tokens, {what}",

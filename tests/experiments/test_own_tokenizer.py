@@ -29,7 +29,7 @@ def test_the_tokenizer_of_the_page_goes_from_tokens_to_evaluation(tmp_path, caps
     colours = write(tmp_path / "colours", COLOURS)
     assert hma("tokenizer", "python", colours, "--out", tok) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "64 x 64 pixels to 64 tokens, ids of 1 factors with 1000 entries" in said and f"--tokenizer {tok}" in said
+    assert "64 x 64 pixels to 64 tokens, ids of 1 factor with 1,000 entries" in said and f"--tokenizer {tok}" in said
     common = (*SMOKE, "--set", "train.steps=3", "--out", out, "--data", data)
     assert hma("tokenize", *common, "--tokenizer", tok) == 0
     prepared, tokenizer = open_prepared_data(Workspace(out)), load_tokenizer(tok)
