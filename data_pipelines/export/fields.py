@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import vector_sizes
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.source import EpisodeSource
@@ -37,12 +37,18 @@ def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequ
     `action` and `observation.state`, where other fields of these names are left out. By default the field `action` or
     `actions`, or all `action/...`; and one of STATES.
 
-    Raises ConfigError for unknown keys, and for a source without a camera.
+    Raises ConfigError for unknown keys, for a source without a camera, and for two cameras of one name.
     """
     images = [key for key, feature in source.features.items() if feature.camera]
     numbers = {key: f.size for key, f in source.features.items() if f.size and not f.image and not f.encoding}
     vectors = list(vector_sizes(source.features))
     require(bool(images), f"{source.location}: it has no camera, so it cannot be written as a LeRobot dataset")
+    cameras = {_camera(key): key for key in images}
+    if lost := [key for key in images if cameras[_camera(key)] != key]:
+        other = cameras[_camera(lost[0])]
+        raise ConfigError(
+            f"{source.location}: the cameras {lost[0]!r} and {other!r} would both be called {_camera(other)!r}; rename one"
+        )
     actions = [step_key(key) for key in action] or default_actions(vectors)
     states = [step_key(key) for key in state] or [step_key(key) for key in STATES if step_key(key) in vectors][:1]
     source.check_keys(images[0], [*actions, *states])
@@ -53,7 +59,7 @@ def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequ
     names = {
         name: tuple(value for key in keys for value in _value_names(key, numbers)) for name, keys in chosen.items()
     }
-    return LeRobotFields({_camera(key): key for key in images}, chosen, names)
+    return LeRobotFields(cameras, chosen, names)
 
 
 def default_actions(keys: Sequence[str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -14,6 +15,7 @@ from data_pipelines.export.fields import choose_fields
 from data_pipelines.export.lerobot import FRAME_BYTES, ORIGIN, Exported, export_lerobot
 from data_pipelines.sources.lerobot_dataset import LeRobotDataset
 from data_pipelines.sources.open import open_source
+from data_pipelines.sources.rlds.features import FlatFeature
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import FPS, HEIGHT, WIDTH, lerobot_actions, number, write_lerobot
 from tests.data_pipelines.fakes import make_spec, png, write_rlds
@@ -233,3 +235,10 @@ def test_what_players_need_to_know_is_in_info(tmp_path):
         "next.success": "bool",
         "observation.images.top": "video",
     }
+
+
+def test_two_cameras_that_would_have_one_name_are_refused(tmp_path):
+    image, place = FlatFeature(image=True, size=0, dtype="uint8"), tmp_path / "toy"
+    features = {"steps/observation/left/rgb": image, "steps/observation/left_rgb": image}
+    with pytest.raises(ConfigError, match="would both be called 'observation.images.left_rgb'"):
+        choose_fields(SimpleNamespace(features=features, location=place))
