@@ -328,7 +328,17 @@ def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path, caps
         np.testing.assert_array_equal(stored[0].chunks, truth.chunks)
         seen = truth.images if split == "val" else tokenizer.decode(tokenizer.encode(truth.images))
         np.testing.assert_array_equal(stored[0].images, seen)
-        asked = ["--actions", str(tmp_path / "pusher_sand"), "--split", split, "--episodes", "1", "--clips", "0"]
+        asked = [
+            "--actions",
+            str(tmp_path / "pusher_sand"),
+            "--split",
+            split,
+            "--episodes",
+            "1",
+            "--clips",
+            "0",
+            "--allow-clipping",
+        ]
         assert main(["generate", str(run), *asked, "--out", str(tmp_path / split)]) == 0
         said = " ".join(capsys.readouterr().out.split())
         note = f"has no frames of pusher_sand, split {split}. PSNR is computed against frames decoded from tokens"
