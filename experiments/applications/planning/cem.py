@@ -5,19 +5,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.applications.planning.search import BestPlan, Score, SearchConfig, SearchResult, draw
+from experiments.applications.planning.search import Score, SearchConfig, draw, finite_costs
 
 
-def plan_cem(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> SearchResult:
-    """The cheapest sequence seen, from `mean` [K, A] on. The best of a batch is among the candidates of the next."""
-    std, best = np.full(mean.shape, config.spread), BestPlan()
+def plan_cem(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The cheapest sequence seen, [K, A], from `mean` on. The best of a batch is among the candidates of the next."""
+    std, best, least = np.full(mean.shape, config.spread), mean, np.inf
     for i in range(config.iterations):
         candidates = draw(rng, mean, std, config.candidates)
         if i:
-            candidates[-1] = best.plan
-        costs = score(candidates)
-        best.update(candidates, costs)
+            candidates[-1] = best
+        costs = finite_costs(score, candidates)
+        if costs.min() < least:
+            best, least = candidates[costs.argmin()], costs.min()
         elites = candidates[np.argsort(costs, kind="stable")[: config.elites]]
         mean = config.momentum * mean + (1 - config.momentum) * elites.mean(0)
         std = np.maximum(config.momentum * std + (1 - config.momentum) * elites.std(0), config.least)
-    return best.result()
+    return best

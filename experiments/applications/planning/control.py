@@ -9,11 +9,12 @@ import numpy as np
 
 from experiments.applications.planning.goals import Cost
 from experiments.applications.planning.models import Model
-from experiments.applications.planning.search import Score, SearchConfig, SearchResult, repeat_knots, warm_start
+from experiments.applications.planning.search import Score, SearchConfig, repeat_knots, warm_start
 from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 
-Search = Callable[[Score, SearchConfig, np.ndarray, np.random.Generator], SearchResult]
+Search = Callable[[Score, SearchConfig, np.ndarray, np.random.Generator], np.ndarray]
+"""A search for the cheapest plan [K, A], given the mean [K, A] to begin with."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Planner:
             return self._cost(self._model.imagine(actions))
 
         rng = np.random.default_rng([self._seed, self._plans])
-        found = self._search(score, self._config, self._mean, rng)
+        plan = self._search(score, self._config, self._mean, rng)
         self._plans += 1
-        self._mean = warm_start(found.plan, self._config, execute)
-        return self._units.denormalise(repeat_knots(found.plan, self._config)[:execute])
+        self._mean = warm_start(plan, self._config, execute)
+        return self._units.denormalise(repeat_knots(plan, self._config)[:execute])

@@ -19,9 +19,6 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
-CONTEXT = START_FRAMES
-"""Frames that a rollout is conditioned on."""
-
 log = logging.getLogger(__name__)
 
 
@@ -40,7 +37,7 @@ class Model(Protocol):
 
 
 class LearnedModel:
-    """A simulator of B episodes, all of them copies of one that has seen the last `CONTEXT` frames.
+    """A simulator of B episodes, all of them copies of one that has seen the last `START_FRAMES` frames.
 
     All candidates use the same random numbers, so that they differ by their actions alone. Where tokens or latents are
     sampled, these numbers are a function of `seed`, which is the episode's, and of the number of frames observed.
@@ -62,7 +59,7 @@ class LearnedModel:
             f"{len(images)} images with {len(actions)} actions between them: there must be an action between each two "
             "images, so one fewer than images",
         )
-        seen = np.stack(images[-CONTEXT:])
+        seen = np.stack(images[-START_FRAMES:])
         chunks = [self._robot.chunk(action) for action in actions[len(actions) + 1 - len(seen) :]]
         between = np.concatenate(chunks) if chunks else np.zeros((0, self._robot.action_dim), np.float32)
         self._warn_once(between)

@@ -44,32 +44,11 @@ class SearchConfig:
         return self.knots * self.hold
 
 
-@dataclass(frozen=True)
-class SearchResult:
-    """The plan that a search returns."""
-
-    plan: np.ndarray  # [K, A]
-    cost: float  # by the model
-    costs: np.ndarray  # [iterations]: the lowest of each batch
-
-
-class BestPlan:
-    """The cheapest sequence so far."""
-
-    def __init__(self) -> None:
-        self.plan, self.cost = np.zeros(0), np.inf
-        self.costs: list[float] = []
-
-    def update(self, candidates: np.ndarray, costs: np.ndarray) -> None:
-        """Raises ConfigError for costs that are not finite."""
-        require(bool(np.isfinite(costs).all()), "the cost of a candidate is not finite")
-        i = int(costs.argmin())
-        self.costs.append(float(costs[i]))
-        if costs[i] < self.cost:
-            self.plan, self.cost = candidates[i].copy(), float(costs[i])
-
-    def result(self) -> SearchResult:
-        return SearchResult(self.plan, self.cost, np.array(self.costs))
+def finite_costs(score: Score, candidates: np.ndarray) -> np.ndarray:
+    """`score(candidates)`. Raises ConfigError for costs that are not finite."""
+    costs = score(candidates)
+    require(bool(np.isfinite(costs).all()), "the cost of a candidate is not finite")
+    return costs
 
 
 def draw(rng: np.random.Generator, mean: np.ndarray, std: np.ndarray, count: int) -> np.ndarray:

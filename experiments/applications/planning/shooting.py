@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.applications.planning.search import BestPlan, Score, SearchConfig, SearchResult
+from experiments.applications.planning.search import Score, SearchConfig, finite_costs
 
 
-def plan_shooting(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> SearchResult:
-    """The cheapest of `iterations` x B sequences that are uniform over the range. `mean` gives their shape alone."""
-    best = BestPlan()
-    for candidates in rng.uniform(-1.0, 1.0, (config.iterations, config.candidates, *mean.shape)):
-        best.update(candidates, score(candidates))
-    return best.result()
+def plan_shooting(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The cheapest of `iterations` x B sequences [K, A] that are uniform over the range. `mean` gives their shape
+    alone."""
+    batches = rng.uniform(-1.0, 1.0, (config.iterations, config.candidates, *mean.shape))
+    costs = np.concatenate([finite_costs(score, candidates) for candidates in batches])
+    return batches.reshape(-1, *mean.shape)[costs.argmin()]

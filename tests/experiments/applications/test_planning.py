@@ -20,7 +20,7 @@ from experiments.applications.planning.control import ActionRange, Planner
 from experiments.applications.planning.goals import block_means, goal_image_cost
 from experiments.applications.planning.models import LearnedModel, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
-from experiments.applications.planning.search import SearchConfig, SearchResult, repeat_knots, warm_start
+from experiments.applications.planning.search import SearchConfig, repeat_knots, warm_start
 from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.closed_loop import start_seeds
 from experiments.applications.policies.tasks import find_task
@@ -45,8 +45,8 @@ def search(by, seed: int = 0, config: SearchConfig = CONFIG):
 
     found = by(score, config, np.zeros_like(TARGET), np.random.default_rng(seed))
     assert [len(b) for b in batches] == [config.candidates] * config.iterations
-    assert all(np.abs(b).max() <= 1 for b in batches) and len(found.costs) == config.iterations
-    return float(((found.plan - TARGET) ** 2).sum()), np.stack(batches)
+    assert all(np.abs(b).max() <= 1 for b in batches)
+    return float(((found - TARGET) ** 2).sum()), np.stack(batches)
 
 
 def test_searches_that_learn_from_their_batches_beat_shooting():
@@ -67,17 +67,17 @@ def test_each_batch_is_drawn_from_what_the_batch_before_says(by):
         mean = 0.1 * 0.2 + 0.9 * batches[0][:4].mean(0)
         std = np.maximum(0.1 * 0.7 + 0.9 * batches[0][:4].std(0), 0.1)
         np.testing.assert_array_equal(batches[1][-1], batches[0][0])  # the best so far
-        np.testing.assert_array_equal(found.plan, batches[0][0])
+        np.testing.assert_array_equal(found, batches[0][0])
     else:
         mean, std = batches[0].mean(0), 0.7 ** (2 / 3) * 0.1 ** (1 / 3)  # of four batches, from 0.7 to 0.1
-        np.testing.assert_allclose(found.plan, batches[-1].mean(0))
+        np.testing.assert_allclose(found, batches[-1].mean(0))
     np.testing.assert_allclose(batches[1][0], mean)
     np.testing.assert_allclose(batches[1][1:-1], np.clip(mean + std * second[1:-1], -1, 1))
 
 
 def test_the_unit_of_costs_does_not_matter():
     plans = [
-        plan_mppi(lambda c, by=by: by * c.sum((1, 2)), CONFIG, np.zeros((3, 2)), np.random.default_rng(0)).plan
+        plan_mppi(lambda c, by=by: by * c.sum((1, 2)), CONFIG, np.zeros((3, 2)), np.random.default_rng(0))
         for by in (1, 1000)
     ]
     np.testing.assert_allclose(*plans)
@@ -117,7 +117,7 @@ def test_every_plan_of_a_planner_has_its_own_numbers_and_a_warm_start():
 
     def search(score, config, mean, rng):
         began.append((rng.random(), mean))
-        return SearchResult(plan, 0.0, np.zeros(1))
+        return plan
 
     robot = Robot("r", 1, (-2.0,), (2.0,), (0.0,))
     one, again, other = (Planner(search, CONFIG, None, robot, None, seed) for seed in (1, 1, 2))
