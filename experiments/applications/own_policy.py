@@ -31,7 +31,6 @@ import numpy as np
 
 from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
-from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import run_policy, start_seeds
 from experiments.applications.policies.demonstrations import (
@@ -40,13 +39,7 @@ from experiments.applications.policies.demonstrations import (
     record,
     save_demonstrations,
 )
-from experiments.applications.policies.diffusion import (
-    DiffusionConfig,
-    DiffusionPolicy,
-    Limits,
-    Predicts,
-    train_diffusion,
-)
+from experiments.applications.policies.diffusion import DiffusionConfig, Limits, Predicts, train_diffusion
 from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.own_head import OwnHeadPolicy
@@ -170,8 +163,7 @@ def make_policy(
         return clone(demos, BcConfig(frames=1, fit=fit), settings.seed, report)
     if name == DIFFUSION:
         config = DiffusionConfig(frames=1, predicts=settings.predicts, limits=settings.limits, fit=fit)
-        made = train_diffusion(demos, config, settings.seed, report)
-        return DiffusionPolicy(config, made[settings.steps], scale_of(demos))
+        return train_diffusion(demos, config, settings.seed, report)[settings.steps]
     return RandomPolicy(robot)
 
 

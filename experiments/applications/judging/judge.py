@@ -155,9 +155,7 @@ def _judge(
         write_file(out / USER_FILE, user_file.read_bytes())
     about_policies = {"robot": robot.name, "task": config.task.name}
     with step("policies") as report:
-        train_ladder(
-            out / "policies", truth.demonstrations, config.ladder, config.seed, about_policies, lambda kind: report
-        )
+        train_ladder(out / "policies", truth.demonstrations, config.ladder, config.seed, about_policies, report)
     head = _find_head(out / "head", truth, simulator, success)
     starts = truth.starts()
     seeds = [config.seed + i for i in range(len(starts))]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
@@ -23,6 +22,9 @@ RANDOM = "random"
 
 OWN_HEAD = "hma"
 """The model itself, where it predicts actions."""
+
+TRAINED = {ClonedPolicy.kind: (BcConfig, train_bc), DiffusionPolicy.kind: (DiffusionConfig, train_diffusion)}
+"""Kind of policy -> its configuration, and what trains it."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +45,19 @@ class LadderConfig:
             count = getattr(self, kind)
             require(count >= 0, f"--{kind} must not be negative, got {count}")
 
-    def fit(self, count: int) -> FitConfig:
+    def fits(self) -> dict[str, FitConfig]:
+        """{kind of policy: its training}, of those that have checkpoints."""
+        counts = {ClonedPolicy.kind: self.cloned, DiffusionPolicy.kind: self.diffusion}
+        return {kind: self._fit(count) for kind, count in counts.items() if count}
+
+    def _fit(self, count: int) -> FitConfig:
         keep = log_spaced_steps(self.steps, count, self.first) if count > 1 else (self.steps,)
         return FitConfig(steps=self.steps, batch=self.batch, learning_rate=self.learning_rate, keep=keep)
 
 
 def names(config: LadderConfig) -> list[str]:
     """The names of all policies, in the order of their training."""
-    policies = [RANDOM]
-    for kind, count in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
-        policies += [f"{kind}-{step}" for step in config.fit(count).keep] if count else []
-    return policies
+    return [RANDOM, *(f"{kind}-{step}" for kind, fit in config.fits().items() for step in fit.keep)]
 
 
 def train_ladder(
@@ -62,25 +66,17 @@ def train_ladder(
     config: LadderConfig,
     seed: int,
     about: dict[str, str],
-    reports: Callable[[str], Report],
+    report: Report,
 ) -> None:
     """Trains what is not in `directory` yet: all checkpoints of a kind, or none. `demos` are recorded if needed."""
     recorded: Demonstrations | None = None
-    for kind, count in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
-        steps: Sequence[int] = config.fit(count).keep if count else ()
-        if all((directory / f"{kind}-{step}" / DESCRIPTION).exists() for step in steps):
+    for kind, fit in config.fits().items():
+        if all((directory / f"{kind}-{step}" / DESCRIPTION).exists() for step in fit.keep):
             continue
         recorded = demos() if recorded is None else recorded
-        scale, fit = scale_of(recorded), config.fit(count)
-        if kind == ClonedPolicy.kind:
-            bc = BcConfig(frames=config.frames, encoder=config.encoder, fit=fit)
-            params = train_bc(recorded, bc, seed, reports(kind))
-            made = {step: ClonedPolicy(bc, p, scale) for step, p in params.items()}
-        else:
-            dp = DiffusionConfig(frames=config.frames, encoder=config.encoder, fit=fit)
-            params = train_diffusion(recorded, dp, seed, reports(kind))
-            made = {step: DiffusionPolicy(dp, p, scale) for step, p in params.items()}
-        for step, policy in made.items():
+        config_type, train = TRAINED[kind]
+        policy_config = config_type(frames=config.frames, encoder=config.encoder, fit=fit)
+        for step, policy in train(recorded, policy_config, seed, report).items():
             save_policy(policy, directory / f"{kind}-{step}", about | {"step": step, "seed": seed})
 
 

@@ -66,10 +66,8 @@ def apply_bc(params: Params, config: BcConfig, frames: jax.Array) -> jax.Array:
     return mlp(params["mlp"], encode(params["encoder"], config.encoder, stack_frames(frames)))
 
 
-def train_bc(
-    demos: Demonstrations, config: BcConfig, seed: int = 0, report: Report = lambda done, total, note: None
-) -> dict[int, Params]:
-    """{step: parameters} for `config.fit.keep` and the last step: policies from hardly trained to fully trained.
+def train_bc(demos: Demonstrations, config: BcConfig, seed: int, report: Report) -> dict[int, ClonedPolicy]:
+    """{step: policy} for `config.fit.keep` and the last step: from hardly trained to fully trained.
 
     A function of its arguments; minutes on one core.
     """
@@ -80,7 +78,8 @@ def train_bc(
         return jnp.mean((planned - data["chunk"][index]) ** 2)
 
     start = init_bc(config, demos.actions.shape[-1], seed)
-    return fit(start, loss, data, len(data["episode"]), config.fit, seed, report)
+    kept, scale = fit(start, loss, data, len(data["episode"]), config.fit, seed, report), scale_of(demos)
+    return {step: ClonedPolicy(config, params, scale) for step, params in kept.items()}
 
 
 @partial(jax.jit, static_argnums=1)
@@ -90,7 +89,7 @@ def _act(params: Params, config: BcConfig, images: jax.Array) -> jax.Array:
 
 
 class ClonedPolicy(ChunkPolicy):
-    """What `train_bc` made, acting."""
+    """A network that `train_bc` trained, acting."""
 
     kind = "cloned"
 
@@ -103,8 +102,6 @@ class ClonedPolicy(ChunkPolicy):
         return out.reshape(len(frames), self.config.chunk, -1)
 
 
-def clone(
-    demos: Demonstrations, config: BcConfig, seed: int = 0, report: Report = lambda done, total, note: None
-) -> ClonedPolicy:
+def clone(demos: Demonstrations, config: BcConfig, seed: int, report: Report) -> ClonedPolicy:
     """The policy after all of its training."""
-    return ClonedPolicy(config, train_bc(demos, config, seed, report)[config.fit.steps], scale_of(demos))
+    return train_bc(demos, config, seed, report)[config.fit.steps]

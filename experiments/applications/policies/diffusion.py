@@ -137,12 +137,12 @@ def draw(
 
 
 def train_diffusion(
-    demos: Demonstrations, config: DiffusionConfig, seed: int = 0, report: Report = lambda done, total, note: None
-) -> dict[int, Params]:
-    """{step: parameters} for `config.fit.keep` and the last step; a function of its arguments."""
-    kept = jnp.asarray(signal(config.levels))
+    demos: Demonstrations, config: DiffusionConfig, seed: int, report: Report
+) -> dict[int, DiffusionPolicy]:
+    """{step: policy} for `config.fit.keep` and the last step; a function of its arguments."""
+    signal_shares, scale = jnp.asarray(signal(config.levels)), scale_of(demos)
     data = make_examples(demos, config.frames, config.chunk, config.encoder.size)
-    least, greatest = bounds(config, scale_of(demos))
+    least, greatest = bounds(config, scale)
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
         light, level_key, noise_key = jax.random.split(key, 3)
@@ -151,13 +151,14 @@ def train_diffusion(
         chunk = jnp.clip(data["chunk"][index], least, greatest)
         level = jax.random.randint(level_key, (len(index),), 0, config.levels, jnp.int32)
         noise = jax.random.normal(noise_key, chunk.shape, jnp.float32)
-        share = kept[level][:, None]
+        share = signal_shares[level][:, None]
         noised = jnp.sqrt(share) * chunk + jnp.sqrt(1 - share) * noise
         wanted = noise if config.predicts == "noise" else chunk
         return jnp.mean((denoise(params, seen, noised, level.astype(jnp.float32)) - wanted) ** 2)
 
     start = init_diffusion(config, demos.actions.shape[-1], seed)
-    return fit(start, loss, data, len(data["episode"]), config.fit, seed, report)
+    kept = fit(start, loss, data, len(data["episode"]), config.fit, seed, report)
+    return {step: DiffusionPolicy(config, params, scale) for step, params in kept.items()}
 
 
 @partial(jax.jit, static_argnums=1)
@@ -167,7 +168,7 @@ def _act(params: Params, config: DiffusionConfig, images: jax.Array, start: jax.
 
 
 class DiffusionPolicy(ChunkPolicy):
-    """What `train_diffusion` made, acting. What it draws is a function of the episode's seed and step."""
+    """A network that `train_diffusion` trained, acting. What it draws is a function of the episode's seed and step."""
 
     kind = "diffusion"
 

@@ -46,7 +46,7 @@ def fit(
     examples: int,
     config: FitConfig,
     seed: int,
-    report: Report = lambda done, total, note: None,
+    report: Report,
 ) -> dict[int, Any]:
     """{step: parameters} of every step that is kept, the last included.
 

@@ -135,7 +135,7 @@ def test_cloning_learns_and_is_a_function_of_its_seed(demos):
     assert sorted(kept) == [1, 50, 150]
     assert losses[150] < 0.8 * losses[50]
     short = BcConfig(encoder=SMALL, fit=FitConfig(steps=1, batch=16))
-    one, again, other = (train_bc(demos, short, seed)[1]["mlp"][0]["w"] for seed in (1, 1, 2))
+    one, again, other = (train_bc(demos, short, seed, lambda *_: None)[1].params["mlp"][0]["w"] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     assert not np.array_equal(one, other)
 
@@ -146,9 +146,9 @@ def test_settings_of_jax_change_no_policy(setting, demos):
     images = demos.images[:2, 0]
 
     def trained() -> tuple[list[np.ndarray], np.ndarray]:
-        params = train_diffusion(demos, config, 1)[2]
+        policy = train_diffusion(demos, config, 1, lambda *_: None)[2]
         shown = random_shift(as_floats(images[:, None]), key_of(1), 2)
-        return [*jax.tree.leaves(params), shown], DiffusionPolicy(config, params, scale_of(demos)).act(images)
+        return [*jax.tree.leaves(policy.params), shown], policy.act(images)
 
     usual, acted = trained()
     with setting():
