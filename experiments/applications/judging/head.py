@@ -6,10 +6,11 @@ the simulator's state labels; some of them as the model's tokenizer would show t
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import jax
@@ -18,6 +19,7 @@ import numpy as np
 import optax
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
+from scipy.stats import rankdata
 
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.files import named, unnamed
@@ -77,35 +79,29 @@ def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Arr
     return mlp(params["mlp"], encode(params["encoder"], config.encoder, stack_frames(frames)))[:, 0]
 
 
-class Head(Protocol):
-    """A success detector on frames. `measured` is its accuracy on recorded episodes that
-    it was not trained on."""
+class Head(ABC):
+    """A success detector on frames. `measured` is its accuracy on recorded episodes that it was not trained on."""
 
     measured: dict[str, float]
+    threshold: float
 
-    @property
-    def threshold(self) -> float: ...
-
+    @abstractmethod
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`, which may have the
         size 1 where `images` have frames of one episode, are those in which the episodes begin."""
-        ...
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         """bool [...]: it is taken for reached."""
-        ...
+        return self.probabilities(images, first) > self.threshold
 
 
-class SuccessHead:
-    """A `Head` that is a trained network."""
+class SuccessHead(Head):
+    """A trained network."""
 
     def __init__(self, config: HeadConfig, params: Params, measured: Mapping[str, float] | None = None):
         self.config, self.params, self.measured = config, params, dict(measured or {})
+        self.threshold = config.threshold
         self._apply = jax.jit(lambda params, frames: jax.nn.sigmoid(apply_head(params, config, as_floats(frames))))
-
-    @property
-    def threshold(self) -> float:
-        return self.config.threshold
 
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         """See `Head`."""
@@ -124,16 +120,13 @@ class SuccessHead:
             parts.append(np.asarray(self._apply(self.params, padded))[: len(part)])
         return np.concatenate(parts)
 
-    def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        return self.probabilities(images, first) > self.threshold
-
 
 def train_head(
     demos: Demonstrations,
     config: HeadConfig,
-    seed: int = 0,
-    reconstruct: Callable[[np.ndarray], np.ndarray] | None = None,
-    report: Report = lambda done, total, note: None,
+    seed: int,
+    reconstruct: Callable[[np.ndarray], np.ndarray],
+    report: Report,
 ) -> SuccessHead:
     """A function of its arguments. Positive and negative frames are drawn equally often.
 
@@ -143,9 +136,8 @@ def train_head(
     steps = demos.steps()
     images, first = demos.images[steps[:, 0], steps[:, 1]], demos.images[steps[:, 0], 0]
     labels = demos.reached[steps[:, 0], steps[:, 1]]
-    if reconstruct is not None:
-        for frames in (images, first):
-            frames[::RECONSTRUCTED] = reconstruct(frames[::RECONSTRUCTED])
+    for frames in (images, first):
+        frames[::RECONSTRUCTED] = reconstruct(frames[::RECONSTRUCTED])
     pairs = np.stack([downsample_uint8(x, config.encoder.size) for x in (first, images)], 1)
     return fit_heads(pairs, labels, config, seed, report)[config.fit.steps]
 
@@ -154,8 +146,8 @@ def fit_heads(
     pairs: np.ndarray,
     labels: np.ndarray,
     config: HeadConfig,
-    seed: int = 0,
-    report: Report = lambda done, total, note: None,
+    seed: int,
+    report: Report,
     shift: int = 0,
 ) -> dict[int, SuccessHead]:
     """{step: head} of every step of training that `config.fit` keeps, the last included.
@@ -208,8 +200,6 @@ def balanced_error(head: SuccessHead, pairs: np.ndarray, labels: np.ndarray) -> 
 
 def auroc(score: np.ndarray, label: np.ndarray) -> float:
     """The probability that a positive scores higher than a negative, ties half; nan where one kind is missing."""
-    from scipy.stats import rankdata
-
     positive = label.astype(bool)
     n, m = int(positive.sum()), int((~positive).sum())
     if not n or not m:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from experiments.applications.judging.head import PIECE, HeadConfig
+from experiments.applications.judging.head import PIECE, Head, HeadConfig
 from experiments.user_input.user_file import function_of
 from hma_jax.config import ConfigError, require
 
@@ -16,8 +16,8 @@ PAGE, NAME = "docs/judging.md", "success"
 SIGNATURE = f"{NAME}(images, first)"
 
 
-class UserSuccess:
-    """A `Head` by a user's function. `measured` is what it is worth on recordings, once that is known."""
+class UserSuccess(Head):
+    """A user's function. `measured` is its accuracy on recordings, once that is known."""
 
     threshold = HeadConfig.threshold
 
@@ -35,9 +35,6 @@ class UserSuccess:
         return np.concatenate([self._call(present[piece], starts[piece]) for piece in pieces]).reshape(
             images.shape[:-3]
         )
-
-    def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        return self.probabilities(images, first) > self.threshold
 
     def _call(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         given = self._function(images.copy(), first.copy())
