@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -47,7 +46,7 @@ from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import write_table
+from experiments.applications.tables import make_once, write_table
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import step, wrote
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
@@ -214,17 +213,17 @@ def compare(
             )  # fmt: skip
         save_demonstrations(made, kept)
     demos, trials = load_demonstrations(kept), {}
+
+    def run_new(name: str) -> tuple[list[bool], list[float]]:
+        with step(name) as report:
+            policy = make_policy(name, simulator, robot, demos, settings, out, report)
+            outcome = run_policy(task, policy, seeds, size, robot.stride)
+        return outcome.success.tolist(), outcome.distance.tolist()
+
     for name in POLICIES:
         path = out / "outcomes" / f"{name.replace(' ', '_')}.json"
-        if not path.exists():
-            if name not in policies:
-                continue
-            path.parent.mkdir(exist_ok=True)
-            with step(name) as report:
-                policy = make_policy(name, simulator, robot, demos, settings, out, report)
-                outcome = run_policy(task, policy, seeds, size, robot.stride)
-            write_file(path, json.dumps([outcome.success.tolist(), outcome.distance.tolist()]))
-        trials[name] = list(zip(*json.loads(path.read_text()), strict=True))
+        if name in policies or path.exists():
+            trials[name] = list(zip(*make_once(path, run_new, name), strict=True))
     return trials
 
 

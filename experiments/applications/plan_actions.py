@@ -22,10 +22,9 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ import numpy as np
 
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.environment import Environment
-from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
 from experiments.analysis.intervals import Interval
 from experiments.applications import FIRST
@@ -55,7 +53,7 @@ from experiments.applications.policies.scripted import make_expert, noisy
 from experiments.applications.policies.tasks import Task, find_task, held, world_of
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import write_table
+from experiments.applications.tables import make_once, write_table
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import require
@@ -138,8 +136,8 @@ def count_expert_actions(task: Task, stride: int) -> int:
 
 
 def pinned(settings: Settings, stride: int) -> dict[str, Any]:
-    """The settings, and what earlier versions had fewer of for models with several actions a frame: an outcome of
-    theirs is one of another goal."""
+    """The settings, and how many actions the expert has where a frame has several: in earlier versions it had fewer,
+    so their goals were others."""
     more = {"expert_actions": count_expert_actions(settings.make_task(), stride)} if stride > 1 else {}
     return asdict(settings) | more
 
@@ -168,17 +166,14 @@ def run_planner(way: str, simulator: Simulator, robot: Robot, settings: Settings
         images.append(fit_image(environment.render(), size))
         reached.append(environment.success())
     success = bool(held(np.array([reached]), task.hold).any())
-    return {"success": success, "distance": distance_of(task.spec, environment), "seconds": float(np.median(seconds))}
+    distance = goal_distance(world_of(task.spec, [environment.get_state()]))
+    return {"success": success, "distance": float(distance[0]), "seconds": float(np.median(seconds))}
 
 
 def decided(reached: Sequence[bool], task: Task) -> bool:
     """Whether the goal was held long enough, or too few frames are left to hold it."""
     run = next((i for i, done in enumerate(reversed(reached)) if not done), len(reached))
     return run >= task.hold or task.frames - len(reached) < task.hold - run
-
-
-def distance_of(spec: EmbodimentSpec, seen: Environment) -> float:
-    return float(goal_distance(world_of(spec, [seen.get_state()]))[0])
 
 
 def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report: Report) -> list[dict]:
@@ -200,6 +195,38 @@ def outcome_paths(out: Path, way: str, starts: int) -> list[Path]:
     """The files of the outcomes: of a planner one for each start, otherwise one for all."""
     name = out / "trials" / way.replace(" ", "_")
     return [Path(f"{name}-{k}.json") for k in range(starts)] if way in PLANNERS else [Path(f"{name}.json")]
+
+
+def compare(run: Path, out: Path, settings: Settings, wanted: Collection[str]) -> dict[str, list[dict]]:
+    """What `read_trials` reads, of the ways of acting `wanted` and of those in `out`, where all outcomes are kept and
+    made once. Raises ConfigError where they were made with other settings."""
+    decode = change_decode(find_decode(run), settings.temperature, unmask_steps=settings.unmask_steps)
+    simulator = load_simulator(run, episodes=settings.search.candidates, decode=decode, history=1)
+    robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
+    seeds = settings.start_seeds()
+    pin_settings(out, run, simulator, pinned(settings, robot.stride))
+    paths = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
+    tried = [way for way in WAYS if way in wanted or all(path.exists() for path in paths[way])]
+    trials: dict[str, list[dict]] = {way: [] for way in tried}
+    for way in (way for way in tried if way not in PLANNERS):
+        with step(way) as update:
+            trials[way] = make_once(paths[way][0], run_cloned, settings, robot, seeds, size, way, update)
+    planners, eta = [way for way in tried if way in PLANNERS], Eta()
+    if planners:
+        say_missed_goals(settings, robot, seeds)
+        with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
+            for k, seed in enumerate(seeds.tolist()):
+                for way in planners:
+                    trials[way].append(make_once(paths[way][k], run_planner, way, simulator, robot, settings, seed))
+                update(k + 1, len(seeds), f"starts{eta(k + 1, len(seeds))}")
+    return trials
+
+
+def say_missed_goals(settings: Settings, robot: Robot, seeds: np.ndarray) -> None:
+    """A note for the user where an expert from these starts does not end at its goal."""
+    missed = sum(not expert_end(settings.make_task(), seed, robot.stride).success() for seed in seeds.tolist())
+    if missed:
+        say(f"note: {missed} of {len(seeds)} pictures of the goal do not show success: the expert does not end at it")
 
 
 def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval, float]]:
@@ -288,38 +315,7 @@ def main() -> None:
     require(args["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {args['candidates']}")
     search = SearchConfig(candidates=args.pop("candidates"), iterations=args.pop("iterations"))
     settings = Settings(search=search, **args)
-    decode = change_decode(find_decode(run), settings.temperature, unmask_steps=settings.unmask_steps)
-    simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
-    robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
-    seeds = settings.start_seeds()
-    pin_settings(out, run, simulator, pinned(settings, robot.stride))
-    (out / "trials").mkdir(exist_ok=True)
-    places = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
-    wanted = [way for way in WAYS if way in wanted or all(path.exists() for path in places[way])]  # tables are of all
-    trials: dict[str, list[dict]] = {}
-    for way in (name for name in (*CLONED, RANDOM) if name in wanted):
-        (path,) = places[way]
-        with step(way) as update:
-            if not path.exists():
-                write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
-        trials[way] = json.loads(path.read_text())
-    planners, eta = [name for name in PLANNERS if name in wanted], Eta()
-    trials |= {way: [] for way in planners}
-    if planners:
-        missed = sum(not expert_end(settings.make_task(), seed, robot.stride).success() for seed in seeds.tolist())
-        if missed:
-            say(
-                f"note: {missed} of {len(seeds)} pictures of the goal do not show success: the expert does not end at it"
-            )
-        with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
-            for k, seed in enumerate(seeds.tolist()):
-                for way in planners:
-                    path = places[way][k]
-                    if not path.exists():
-                        write_file(path, json.dumps(run_planner(way, simulator, robot, settings, seed)))
-                    trials[way].append(json.loads(path.read_text()))
-                update(k + 1, len(seeds), f"starts{eta(k + 1, len(seeds))}")
-    write_results({name: trials[name] for name in WAYS if name in trials}, out)
+    write_results(compare(run, out, settings, wanted), out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 
 

@@ -25,7 +25,6 @@ trajectory; summary.csv and table.md; synthetic.png; frames.png.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -78,7 +77,7 @@ from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import write_table
+from experiments.applications.tables import make_once, write_table
 from experiments.running.workspace import Workspace
 from experiments.study_setup import use_entries
 from experiments.terminal.exit_code import exit_code_of
@@ -179,6 +178,25 @@ def run_trial(
     judged = source.judge(policy)
     errors = action_errors(policy, data[JUDGED_ON], scale_of(data["recorded"]))
     return {**judged, "error": np.round(errors, 5).tolist()}
+
+
+def run_trials(source: DemonstrationSource, data: Mapping[str, Demonstrations], kept: Path) -> Trials:
+    """Every condition that there is data of, with every seed. Each trial is kept in the directory `kept`, and made
+    once."""
+    seeds, conditions = source.settings.seeds, range(len(CONDITIONS) if PASSIVE_KIND in data else PASSIVE)
+    first = sorted(conditions, key=lambda i: i not in (FEW, ALL, MOST, CONTROL, PASSIVE))  # what counts most
+    jobs, eta = [(i, s) for i in first for s in seeds], Eta()
+    trials: Trials = {}
+    with step(f"train and judge {len(jobs)} policies") as update:
+
+        def run_new(n: int, i: int, seed: int) -> dict[str, list[float]]:
+            note = f"{CONDITIONS[i].name}, seed {seed}{eta(n, len(jobs))}"
+            report = lambda done, total, loss: update(n, len(jobs), f"{note}: step {done}, {loss}")
+            return run_trial(source, CONDITIONS[i], data, seed, report)
+
+        for n, (i, seed) in enumerate(jobs):
+            trials[i, seed] = make_once(kept / f"{i}-{seed}.json", run_new, n, i, seed)
+    return trials
 
 
 def action_errors(policy: Policy, demos: Demonstrations, scale: Scale) -> np.ndarray:
@@ -304,21 +322,8 @@ def main() -> None:
     pin_settings(out, run, simulator, asdict(settings), may_differ=("seeds",))
     if passive:
         pin_settings(out, without, passive, {}, file=SECOND)
-    trials_dir = out / "trials"
-    trials_dir.mkdir(exist_ok=True)
     data = make_data(source, simulator, out, passive)
-    trials: Trials = {}
-    conditions = range(len(CONDITIONS) if passive else PASSIVE)
-    first = sorted(conditions, key=lambda i: i not in (FEW, ALL, MOST, CONTROL, PASSIVE))  # what counts most
-    jobs, eta = [(i, s) for i in first for s in settings.seeds], Eta()
-    with step(f"train and judge {len(jobs)} policies") as update:
-        for n, (i, seed) in enumerate(jobs):
-            path = trials_dir / f"{i}-{seed}.json"
-            if not path.exists():
-                note = f"{CONDITIONS[i].name}, seed {seed}{eta(n, len(jobs))}"
-                report = lambda done, total, loss, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {loss}")
-                write_file(path, json.dumps(run_trial(source, CONDITIONS[i], data, seed, report)))
-            trials[i, seed] = json.loads(path.read_text())
+    trials = run_trials(source, data, out / "trials")
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
     write_settings(out, run, simulator, asdict(settings))
     shortest = data["recorded"].lengths[:2].min()

@@ -1,13 +1,23 @@
-"""CSV files of the applications."""
+"""Files of outcomes: JSON while they are being made, tables (CSV) of all of them."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hma_jax.runtime.files import write_file
+
+
+def make_once(path: Path, make: Callable[..., Any], *args: Any) -> Any:
+    """The content of a JSON file; where there is none yet, `make(*args)` is written into it."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, json.dumps(make(*args)))
+    return json.loads(path.read_text())
 
 
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
