@@ -14,7 +14,7 @@ from data_pipelines.suite.simulator import SuiteSimulator
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.policies.learning import Report
 from experiments.applications.policies.policy import Policy
-from experiments.applications.policies.tasks import AnyTask, Task, reached
+from experiments.applications.policies.tasks import AnyTask, Task, world_of
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
@@ -108,7 +108,7 @@ def _run(
 
 def _reached(simulator: AnySimulator, task: AnyTask) -> np.ndarray:
     if isinstance(simulator, SuiteSimulator):
-        return reached(task.spec, [simulator.state(b) for b in range(len(simulator))])
+        return world_of(task.spec, [simulator.state(b) for b in range(len(simulator))]).success()
     return simulator.success() if isinstance(simulator, TrueSimulator) else np.zeros(len(simulator), bool)
 
 

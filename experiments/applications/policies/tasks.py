@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from data_pipelines.simulators.record import instruction
 from data_pipelines.simulators.simulator import PHYSICS
@@ -148,20 +149,15 @@ AnyTask = Task | RecordedTask
 def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int | None = None) -> Task:
     """A task with its usual length, unless another is given. Raises ConfigError for one that there is not."""
     task = Task(robot, name)
-    task = task if task.in_suite else replace(task, frames=PHYSICS_FRAMES)
+    usual_frames = Task.frames if task.in_suite else PHYSICS_FRAMES
     # A tool that wanders passes over the mark; one that was steered there stays.
-    task = replace(task, frames=16, hold=4) if name != OWN else task
-    return replace(task, frames=task.frames if frames is None else frames, hold=task.hold if hold is None else hold)
+    usual_hold = Task.hold if name == OWN else 4
+    return Task(robot, name, usual_frames if frames is None else frames, usual_hold if hold is None else hold)
 
 
 def stack(states: Sequence[State]) -> State:
     """States of one robot as one of all their episodes."""
     return State(**{f.name: np.concatenate([getattr(s, f.name) for s in states]) for f in fields(State)})
-
-
-def reached(spec: EmbodimentSpec, states: Sequence[State]) -> np.ndarray:
-    """bool [n]: the goal of the spec's task is reached in each state."""
-    return world_of(spec, states).success()
 
 
 def world_of(spec: EmbodimentSpec, states: Sequence[State]) -> World:
@@ -174,9 +170,5 @@ def world_of(spec: EmbodimentSpec, states: Sequence[State]) -> World:
 
 def held(reached_NL: np.ndarray, hold: int) -> np.ndarray:
     """bool [N, L]: the goal was reached at this frame and the hold - 1 before it."""
-    runs = np.zeros(reached_NL.shape, int)
-    count = np.zeros(len(reached_NL), int)
-    for t in range(reached_NL.shape[1]):
-        count = np.where(reached_NL[:, t], count + 1, 0)
-        runs[:, t] = count
-    return runs >= hold
+    padded = np.pad(reached_NL, ((0, 0), (hold, 0)))  # by one more than is needed: there may be no frame
+    return sliding_window_view(padded, hold, axis=1).all(-1)[:, 1:]
