@@ -32,7 +32,7 @@ from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
 from experiments.applications.detector_network import Detections, DetectorParams, detect, init_detector, points_loss
-from experiments.applications.scenes import Scenes, draw_scenes, point_names
+from experiments.applications.scenes import Points, Scenes, draw_scenes, point_names
 from experiments.applications.settings_file import FILE, pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
@@ -75,6 +75,14 @@ BLOCK = 64
 """Frames per call."""
 
 
+def in_blocks(call: Callable[[np.ndarray], Any], frames: np.ndarray) -> Any:
+    """What `call` gives for frames [n, ...], arrays [n, ...]. It is called with BLOCK frames at a time, so that one
+    program is compiled."""
+    filled = np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % BLOCK, 0)])
+    parts = [call(filled[i : i + BLOCK]) for i in range(0, len(filled), BLOCK)]
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(frames)], *parts)
+
+
 class Detector:
     """Trained weights, and the robots they were trained on, in the order of the weights."""
 
@@ -85,13 +93,9 @@ class Detector:
     def detect(self, robot: str, frames: np.ndarray) -> Detections:
         """The robot's P points in frames uint8 [n, H, W, 3]. Raises ConfigError for one it was not trained on."""
         require(robot in self.robots, f"the detector was not trained on {robot}; it knows {', '.join(self.robots)}")
-        index, count, parts = self.robots.index(robot), len(point_names(SPECS[robot])), []
-        for first in range(0, len(frames), BLOCK):
-            part = frames[first : first + BLOCK]
-            filled = np.concatenate([part, np.repeat(part[-1:], BLOCK - len(part), 0)])
-            found = self._detect(self.weights, filled, index)
-            parts.append([np.asarray(x)[: len(part), :count] for x in found])
-        return Detections(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+        index, count = self.robots.index(robot), len(point_names(SPECS[robot]))
+        found = in_blocks(lambda block: self._detect(self.weights, block, index), frames)
+        return Detections(*(x[:, :count] for x in found))
 
     def save(self, path: Path) -> None:
         weights = {name: np.asarray(x, np.float16) for name, x in self.weights.items()}
@@ -108,16 +112,16 @@ class Detector:
 
 def batches(scenes: Sequence[Scenes], rng: np.random.Generator, size: int) -> Iterator[tuple]:
     """What `points_loss` takes, of random frames of random robots, with noise; without end."""
-    points, side = max(own.visible.shape[-1] for own in scenes), scenes[0].images.shape[1]
+    points, side = max(own.points.share.shape[-1] for own in scenes), scenes[0].images.shape[1]
     while True:
         images, robots = np.zeros((size, side, side, 3), np.float32), rng.integers(len(scenes), size=size)
         position, known = np.zeros((size, points, 2), np.float32), np.zeros((size, points), np.float32)
         visible = np.zeros((size, points), np.float32)
         for i, robot in enumerate(robots):
             own = scenes[robot]
-            k, p = rng.integers(len(own.images)), own.visible.shape[-1]
+            k, p = rng.integers(len(own.images)), own.points.share.shape[-1]
             images[i] = own.images[k] + rng.uniform(0, MAX_NOISE) * rng.standard_normal((side, side, 3), np.float32)
-            position[i, :p], visible[i, :p], known[i, :p] = own.position[k], own.visible[k], 1
+            position[i, :p], visible[i, :p], known[i, :p] = own.points.position[k], own.points.visible[k], 1
         yield images, robots, position, visible, known
 
 
@@ -133,7 +137,7 @@ def train_detector(
     without the kill. Raises ConfigError without scenes, for a damaged file, or where training diverges."""
     require(bool(scenes), "there is no robot to train a detector on")
     own, rng = list(scenes.values()), np.random.default_rng(0)
-    weights = init_detector(key_of(0), len(own), max(x.visible.shape[-1] for x in own))
+    weights = init_detector(key_of(0), len(own), max(x.points.share.shape[-1] for x in own))
     schedule = optax.warmup_cosine_decay_schedule(0.0, LEARNING_RATE, min(100, steps // 4), steps)
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(schedule, weight_decay=1e-3))
 
@@ -173,44 +177,38 @@ def _resume(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]
 
 
 def detection_errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
-    """Position errors for each kind of point of a robot, detection rates, and how many points that are not visible are
-    detected nevertheless (`ghosts`), by why they are not: see `unseen`."""
-    position, confidence = detector.detect(robot, scenes.images)
-    error = np.linalg.norm(position - scenes.position, axis=-1)
+    """Position errors for each kind of point of a robot, detection rates, and which share of points that are not
+    visible is detected nevertheless (`ghosts`) and how many these points are, by why they are not: see `unseen`."""
+    points, (position, confidence) = scenes.points, detector.detect(robot, scenes.images)
+    error = np.linalg.norm(position - points.position, axis=-1)
     names, rows = point_names(SPECS[robot]), []
     for kind, prefix in (("tool", "tool"), ("object", "colour")):
         kind_points = [i for i, name in enumerate(names) if name.startswith(prefix)]
-        visible, confident = scenes.visible[:, kind_points], confidence[:, kind_points] >= MIN_CONFIDENCE
+        visible, confident = points.visible[:, kind_points], confidence[:, kind_points] >= MIN_CONFIDENCE
         if not visible.any():
             continue  # a robot that touches nothing
         distances = error[:, kind_points][visible]
         within = {f"within_{r:g}px": float(np.mean((distances <= r) & confident[visible])) for r in WITHIN_PX}
-        rows.append({
+        row = {
             "robot": robot, "what": kind, "frames": int(visible.sum()), "median_px": float(np.median(distances)),
             "p90_px": float(np.quantile(distances, 0.9)), **within, "found": float(np.mean(confident[visible])),
-            **{
-                name: value
-                for why, which in unseen(scenes).items()
-                for name, value in _ghosts(why, confident[which[:, kind_points]])
-            },
-        })  # fmt: skip
+        }  # fmt: skip
+        for why, which in unseen(points).items():
+            detected = confident[which[:, kind_points]]
+            row |= {f"ghosts_{why}": float(np.mean(detected)) if detected.size else np.nan, why: detected.size}
+        rows.append(row)
     return rows
 
 
-def unseen(scenes: Scenes) -> dict[str, np.ndarray]:
+def unseen(points: Points) -> dict[str, np.ndarray]:
     """Points that are not visible, bool [n, P] for each reason: `absent`, no object has this colour; `hidden`, none of
     it is in view; `partly`, too little is."""
-    there = ~scenes.absent
+    there = ~points.absent
     return {
-        "absent": scenes.absent,
-        "hidden": there & (scenes.share == 0),
-        "partly": there & (scenes.share > 0) & ~scenes.visible,
+        "absent": points.absent,
+        "hidden": there & (points.share == 0),
+        "partly": there & (points.share > 0) & ~points.visible,
     }
-
-
-def _ghosts(why: str, detected: np.ndarray) -> list[tuple[str, float | int]]:
-    """The columns of points that are not visible: the share that is detected, and how many there are."""
-    return [(f"ghosts_{why}", float(np.mean(detected)) if detected.size else float("nan")), (why, detected.size)]
 
 
 def enlarged(images: np.ndarray) -> np.ndarray:
@@ -229,9 +227,7 @@ def reconstruct(tokenizer: BaseTokenizer, images: np.ndarray) -> np.ndarray:
     """Frames uint8 [n, H, W, 3] encoded and decoded by a tokenizer, enlarged to the detector's size."""
     images = fit_images(images, tokenizer.image_size)
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
-    filled = np.concatenate([images, np.repeat(images[-1:], -len(images) % BLOCK, 0)])
-    parts = [np.asarray(whole(filled[i : i + BLOCK])) for i in range(0, len(filled), BLOCK)]
-    return enlarged(np.concatenate(parts)[: len(images)])
+    return enlarged(in_blocks(whole, images))
 
 
 def reconstructed(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> Scenes:
@@ -294,8 +290,7 @@ def main() -> None:
     )
     pin_settings(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
     if existing := weights.exists():
-        note = f"{short(weights)} of this run exists already; remove it to train it again"
-        say(note)
+        say(f"{short(weights)} of this run exists already; remove it to train it again")
     else:
         make_detector(robots, simulator.tokenizer, args.out)
     print(table.read_text())

@@ -32,22 +32,17 @@ class Points(NamedTuple):
     def visible(self) -> np.ndarray:
         return self.share >= VISIBLE_SHARE
 
-
-class Scenes(NamedTuple):
-    """n true frames with the positions of their points."""
-
-    images: np.ndarray  # uint8 [n, H, W, 3]
-    position: np.ndarray  # float32 [n, P, 2]
-    share: np.ndarray  # float32 [n, P], of it in view
-
-    @property
-    def visible(self) -> np.ndarray:
-        return self.share >= VISIBLE_SHARE
-
     @property
     def absent(self) -> np.ndarray:
-        """Which colours no object has, bool [n, P]: they have no position."""
+        """Which colours no object has, bool [F, P]: they have no position."""
         return ~self.position.any(-1)
+
+
+class Scenes(NamedTuple):
+    """F true frames and their points."""
+
+    images: np.ndarray  # uint8 [F, H, W, 3]
+    points: Points
 
 
 def point_names(spec: EmbodimentSpec) -> tuple[str, ...]:
@@ -86,4 +81,4 @@ def draw_scenes(
     )
     points = points_of(spec, seeds[episode], q, objects)
     images = render_frames(spec, draw_appearance(spec, seeds), rollout.goals, q, objects, episode)
-    return Scenes(images, points.position, points.share)
+    return Scenes(images, points)

@@ -27,7 +27,7 @@ from experiments.applications.detector import (
 )  # fmt: skip
 from experiments.applications.detector_network import Detections, init_detector
 from experiments.applications.in_place import CLOSE_PX, EPISODES, VIEWS, in_place, measure_ends
-from experiments.applications.scenes import Scenes, draw_scenes, point_names
+from experiments.applications.scenes import Points, Scenes, draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from tests.experiments.applications.runs import make_run
@@ -98,8 +98,8 @@ def test_false_detections_are_told_apart_by_why_nothing_is_seen():
     share = np.float32([[1, 1, 0, 0]] * 6 + [[1, 0, 0, 0]] * 3 + [[1, 0.1, 0, 0]])
     position = np.zeros((10, 4, 2), np.float32)
     position[:, :2] = 20
-    scenes = Scenes(np.zeros((10, 64, 64, 3), np.uint8), position, share)
-    confidence = np.where((share < 1) & (scenes.position[..., 0] > 0), 0.9, 0.0)
+    scenes = Scenes(np.zeros((10, 64, 64, 3), np.uint8), Points(position, share))
+    confidence = np.where((share < 1) & (position[..., 0] > 0), 0.9, 0.0)
     detector = SimpleNamespace(detect=lambda *_: Detections(position, confidence))
     _, objects = detection_errors(detector, "gripper_wood", scenes)
     kinds = {name: objects[name] for why in ("absent", "hidden", "partly") for name in (f"ghosts_{why}", why)}
