@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -60,9 +59,7 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
     """The collectives of a program compiled for a mesh of these sizes, those with most bytes first. A collective
     that does not list its groups is taken to be among all devices."""
     devices = math.prod(mesh.values())
-    counts: Counter[Collective] = Counter()
-    received: Counter[Collective] = Counter()
-    whole: Counter[Collective] = Counter()
+    found: dict[Collective, Sent] = {}
     runs, computation = count_runs(text), ""
     channels: set[tuple[str, str]] = set()
     for line in text.splitlines():
@@ -83,12 +80,10 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
         size = count_bytes(match["result"], started=bool(match["start"]) and kind != "all-reduce")
         over = "" if group is None else find_axes(group, mesh)
         collective = Collective(kind, over, name.count("while/body"), explain(kind, name, over, size))
-        counts[collective] += 1
         size = round(size * RECEIVED[kind](len(group or range(devices))))
-        received[collective] += size
-        whole[collective] += size * runs.get(computation, 1)
-    order = sorted(counts, key=lambda c: (-received[c], str(c)))
-    return {collective: Sent(counts[collective], received[collective], whole[collective]) for collective in order}
+        so_far, whole = found.get(collective, Sent(0, 0, 0)), size * runs.get(computation, 1)
+        found[collective] = Sent(so_far.count + 1, so_far.bytes + size, so_far.whole + whole)
+    return dict(sorted(found.items(), key=lambda item: (-item[1].bytes, str(item[0]))))
 
 
 def count_runs(text: str) -> dict[str, int]:

@@ -21,6 +21,7 @@ from experiments.bench.timing import time_by_turns
 from hma_jax.config import EvalConfig, ModelConfig, Setting
 from hma_jax.evaluation.evaluate import evaluate
 from hma_jax.evaluation.summary import paired_difference
+from hma_jax.model.hma import declare_model
 
 SAMPLER_STEPS = {"ddpm": (100, 50, 25, 12, 8, 4), "ddim": (100, 50, 25, 12, 8, 4), "dpm++": (12, 10, 8)}
 PASSES = (8, 4, 2, 1)
@@ -152,7 +153,5 @@ def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
 
 def subject_of(trained: Any) -> Subject:
     """A trained run as what is timed."""
-    from hma_jax.model.hma import declare_model
-
     declared = declare_model(trained.model, trained.table, EXECUTION)
     return Subject(trained.model, EXECUTION, trained.table, declared, jax.device_put(trained.params), 0)

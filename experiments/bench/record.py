@@ -15,6 +15,7 @@ from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
 from experiments.running.machine import describe_machine
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.files import write_file
 
 FORMAT = 1
@@ -81,8 +82,6 @@ class BenchRecord:
 
 def make_record(kind: str, subject: str, command: str, **fields: Any) -> BenchRecord:
     """A record of this machine, now."""
-    from hma_jax.runtime.devices import peak_flops
-
     return BenchRecord(
         kind,
         subject,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -16,6 +15,7 @@ from typing import Any
 
 from experiments.bench.models import EXECUTION, make_subject
 from experiments.bench.programs import RELEASE_SAMPLER, repeatable
+from experiments.bench.timing import time_once
 from hma_jax.config.execution import Dtype
 
 FEW_STEPS = ("dpm++", 10)
@@ -48,15 +48,7 @@ def serve(calls: dict[str, Callable[[], Any]]) -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     for line in sys.stdin:
-        began = time.perf_counter()
-        _wait(calls[line.strip()]())
-        print(time.perf_counter() - began, file=answers, flush=True)
-
-
-def _wait(result: Any) -> None:
-    import jax
-
-    jax.block_until_ready(result)
+        print(time_once(calls[line.strip()])[1], file=answers, flush=True)
 
 
 if __name__ == "__main__":
