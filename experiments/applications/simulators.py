@@ -132,11 +132,7 @@ def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int =
 def describe_robots(simulator: Simulator, workspace: Workspace) -> list[Robot]:
     """The robots of a simulator with the ranges that were recorded, where the study's tokens are at hand."""
     store = TokenStore(workspace.store) if workspace.store.is_dir() else None
-    described = []
-    for entry in simulator.model.table.entries:
-        if entry.action_dim:
-            described.append(_describe(entry, store))
-    return described
+    return [_describe(entry, store) for entry in simulator.model.table.entries if entry.action_dim]
 
 
 def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:

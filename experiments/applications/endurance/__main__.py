@@ -124,7 +124,8 @@ def main() -> None:
                     save_films(made, path)
                 unfinished.unlink(missing_ok=True)
                 films = load_films(path)
-                hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
+                hz = {name: SPECS[name].hz for name in films}
+                tools = {name: len(SPECS[name].body.tools) for name in films}
                 new += rows_of(f"{args.name}/{variant}", kind, which, films, hz, tools, args.every)
             print_rows(new)
             rows += new

@@ -71,8 +71,8 @@ def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
 
 
 def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -> Drive:
-    """The true rollout of `frames` actions of a kind. Deterministic; `start` must have the seed of its episode. Robots
-    draw apart: intervals take them as independent."""
+    """The true rollout of `frames` actions of a kind. Deterministic; `start` must have the seed of its episode. Every
+    robot has random numbers of its own, since intervals take robots as independent."""
     spec = SPECS[robot.name]
     world = World(spec, [start.seed])
     for action in start.actions:
@@ -86,7 +86,7 @@ def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -
             command = behaviour.act()[0]
         else:
             command = _extreme_action(robot, kind, t)
-        action = np.clip(np.asarray(command, np.float32), np.float32(robot.low), np.float32(robot.high))
+        action = robot.clip_to_range(np.asarray(command, np.float32), "clip")[0]
         world.step(action[None].astype(np.float64))
         actions.append(action)
         q.append(world.q.copy())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from PIL import Image
 from experiments.applications.endurance.films import SHOWN, Film
 from experiments.applications.endurance.tables import Row, over_robots
 from experiments.report.plot_style import CONTROL_LINE, STYLE, save, show_caption, show_legend
+from hma_jax.runtime.files import write_file
 
 
 class Panel(NamedTuple):
@@ -81,9 +83,9 @@ def draw_sheet(films: Mapping[str, Film], path: Path) -> None:
     rows = [np.concatenate(list(kind[:columns]), axis=1) for film in films.values() for kind in film.shown]
     sheet = Image.fromarray(np.concatenate(rows)).quantize(128, dither=Image.Dither.NONE)
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".tmp.png")
-    sheet.save(aside, optimize=True)
-    aside.replace(path)
+    content = io.BytesIO()
+    sheet.save(content, "PNG", optimize=True)
+    write_file(path, content.getvalue())
 
 
 def shown_frames(films: Mapping[str, Film]) -> tuple[int, ...]:

@@ -119,7 +119,7 @@ def judge(
         recorded = rollout.actions[e.episode]
         images = fit_images(images, simulator.tokenizer.image_size)
         starts.append(Start(spec.name, images[: e.start + 1], recorded[: e.start], int(seeds[0])))
-        actions.append(np.clip(recorded[e.start : e.start + last], np.float32(robot.low), np.float32(robot.high)))
+        actions.append(robot.clip_to_range(recorded[e.start : e.start + last], "clip")[0])
         true.append((images[-1], points_of(spec, np.repeat(seeds, len(q)), q, objects)))
     films = [simulator.reset(starts, seeds=0).copy()]
     for t in range(last):  # all of them until the last is judged: other numbers of episodes would be compiled anew
@@ -136,8 +136,8 @@ def judge(
                 f"{name}confidence": confidence,
                 f"{name}px": off,
                 f"{name}close": float(confidence >= MIN_CONFIDENCE and off <= CLOSE_PX),
+                f"{name}found": float(confidence >= MIN_CONFIDENCE),
             }
-            row |= {f"{name}found": float(confidence >= MIN_CONFIDENCE)}
         rows.append(row)
     return rows
 

@@ -114,11 +114,7 @@ def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
 
 def read_rows(path: Path) -> list[Row]:
     """What `write_rows` wrote."""
-
-    def value(name: str, text: str) -> object:
-        if name in ("variant", "drive", "robot", "kind"):
-            return text
-        return float(text)
-
+    texts = ("variant", "drive", "robot", "kind")
     with path.open(newline="") as file:
-        return [{name: value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+        rows = list(csv.DictReader(file))
+    return [{name: text if name in texts else float(text) for name, text in row.items()} for row in rows]

@@ -14,6 +14,7 @@ from experiments.analysis.intervals import Interval, interval_of
 from experiments.applications.generating.source import ACTION, IMAGE
 from experiments.applications.generating.trajectories import Trajectories
 from experiments.applications.play.recording import encode_video
+from experiments.applications.tables import write_table
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.runtime.files import write_file
@@ -67,11 +68,11 @@ def compare(
             write_file(clip, encode_video(np.concatenate([pair.recorded, pair.generated], axis=2), rate))
         if progress:
             progress(i + 1, total, "compared")
-    lines = ["episode,frame,psnr,psnr_still"]
-    for number, generated, still_psnr in rows:
-        lines += [
-            f"{number},{given + t},{a:.3f},{b:.3f}" for t, (a, b) in enumerate(zip(generated, still_psnr, strict=True))
-        ]
-    write_file(home / "psnr.csv", "\n".join(lines) + "\n")
+    lines = [
+        [number, given + t, f"{a:.3f}", f"{b:.3f}"]
+        for number, generated, still_psnr in rows
+        for t, (a, b) in enumerate(zip(generated, still_psnr, strict=True))
+    ]
+    write_table(home / "psnr.csv", ["episode", "frame", "psnr", "psnr_still"], lines)
     means = np.array([[generated.mean(), still_psnr.mean()] for _, generated, still_psnr in rows])
     return Comparison(*(interval_of(mean_and_sem(column, np.arange(len(column)))) for column in means.T))

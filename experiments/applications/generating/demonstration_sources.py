@@ -141,7 +141,7 @@ class RecordedSource:
         self.settings = RecordedSettings(**vars(training), robot=robot.name, **about)
 
     def record(self) -> Demonstrations:
-        longer = self._first(self._recorded, self.settings.trajectories)
+        longer = self._first(self._recorded)
         require(
             len(longer) == self.settings.trajectories,
             f"{self._recorded.name}, split {self._recorded.split}, has {len(longer)} trajectories longer than "
@@ -151,17 +151,18 @@ class RecordedSource:
         return as_demonstrations([confined(t, self.robot) for t in longer])
 
     def record_held_out(self) -> Demonstrations:
-        longer = self._first(self._held_out, self.settings.trajectories)
+        longer = self._first(self._held_out)
         require(
             bool(longer),
             f"{self._held_out.name}, split {self._held_out.split}, has no trajectory to evaluate policies on",
         )
         return as_demonstrations(longer)
 
-    def _first(self, trajectories: Trajectories, count: int) -> list[Trajectory]:
+    def _first(self, trajectories: Trajectories) -> list[Trajectory]:
+        """At most as many as policies are trained on."""
         longer = []
         for i in range(len(trajectories)):
-            if len(longer) == count:
+            if len(longer) == self.settings.trajectories:
                 break
             try:
                 one = trajectories[i]

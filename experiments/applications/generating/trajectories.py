@@ -26,6 +26,7 @@ from data_pipelines.sources.source import (
 )
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import FILE as MANIFEST
+from data_pipelines.tokens.manifest import Manifest
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
 from experiments.terminal.words import counted
@@ -273,11 +274,10 @@ def open_trajectories(
         )
     if stored:
         return StoredTrajectories(TokenStore(path.parent), name, split, tokenizer, chosen), chosen
-    if name == chosen.name:
-        _require_corrections(get_spec(name), stores / name)
-    learnt_from = stores / name / MANIFEST
-    max_lost = load_manifest(learnt_from).skipped_count if learnt_from.is_file() else 0
-    max_lost = max(max_lost, MAX_SKIPPED if skip_damaged else 0)
+    learnt_from = _find_manifest(stores / name)
+    if name == chosen.name and learnt_from is not None:
+        _require_corrections(get_spec(name), learnt_from, stores / name)
+    max_lost = max(learnt_from.skipped_count if learnt_from is not None else 0, MAX_SKIPPED if skip_damaged else 0)
     return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size, max_lost), chosen
 
 
@@ -306,11 +306,8 @@ def describe_lacking(recorded: Trajectories) -> str:
 def describe_training(recorded: Trajectories, count: int, stores: Path) -> str:
     """A note for the user where a study whose tokens are in `stores` trains on some of the first `count` trajectories;
     '' where it trains on none, or where that is not known."""
-    path = stores / recorded.name / MANIFEST
-    if not path.is_file():
-        return ""
-    manifest = load_manifest(path)
-    if not manifest.runs:
+    manifest = _find_manifest(stores / recorded.name)
+    if manifest is None or not manifest.runs:
         return ""
     trained = episode_ids(manifest.runs)[np.asarray(manifest.train.episodes, np.int64)]
     seen = int(np.isin(recorded.ids()[:count], trained).sum())
@@ -320,6 +317,11 @@ def describe_training(recorded: Trajectories, count: int, stores: Path) -> str:
         f"note: the run's study trains on {seen:,} of {counted(count, 'episode')}, and PSNR is higher on such than on new "
         f"ones; `--actions {recorded.name} --split val` replays those that are held out"
     )
+
+
+def _find_manifest(tokens: Path) -> Manifest | None:
+    """None where there are no tokens: the run was moved, or converted."""
+    return load_manifest(tokens / MANIFEST) if (tokens / MANIFEST).is_file() else None
 
 
 def _require_fit(spec: DatasetSpec, robot: Robot) -> None:
@@ -334,12 +336,10 @@ def _require_fit(spec: DatasetSpec, robot: Robot) -> None:
     )
 
 
-def _require_corrections(spec: DatasetSpec, tokens: Path) -> None:
-    """Raises ConfigError where the tokens that a model was trained on were made of frames that were corrected in
+def _require_corrections(spec: DatasetSpec, learnt_from: Manifest, tokens: Path) -> None:
+    """Raises ConfigError where the `tokens` that a model was trained on were made of frames that were corrected in
     another way: it would be shown, say, rotated ones."""
-    if not (tokens / MANIFEST).is_file():  # the run was moved, or converted
-        return
-    learnt = load_manifest(tokens / MANIFEST).spec.image_corrections
+    learnt = learnt_from.spec.image_corrections
     there, asked = (" and ".join(corrections) or "none" for corrections in (learnt, spec.image_corrections))
     require(
         learnt == spec.image_corrections,

@@ -24,7 +24,7 @@ from hma_jax.training.runs import Model
 class OwnHeadPolicy:
     """Acts by the action head of a model: gives whole chunks, as the head predicts them, within the robot's range."""
 
-    def __init__(self, model: Model, tokenizer: BaseTokenizer, robot: Robot, decode: DecodeConfig | None = None):
+    def __init__(self, model: Model, tokenizer: BaseTokenizer, robot: Robot):
         """Raises ConfigError for a model that predicts no actions."""
         setting = model.run.train.masking.setting
         require(
@@ -37,11 +37,12 @@ class OwnHeadPolicy:
         self._embodiment, self._params, self._counts = model.table.index(robot.name), model.params, Counts()
         self._tokens: list[list[np.ndarray]] = []  # of each episode, at most T
         self._chunks: list[list[np.ndarray]] = []  # between them
-        settings = decode or DecodeConfig()
+
+        decode = DecodeConfig()
 
         def predict(params, frames, actions_BTU, embodiment_B, seed_B):
             keys = jax.vmap(key_of)(seed_B)
-            return predict_next_actions(model.declared.merge(params), frames, actions_BTU, embodiment_B, keys, settings)
+            return predict_next_actions(model.declared.merge(params), frames, actions_BTU, embodiment_B, keys, decode)
 
         self._predict = jax.jit(predict)
 
@@ -74,8 +75,8 @@ class OwnHeadPolicy:
         out = np.asarray(self._predict(self._params, frames, actions_BTU, which, seeds))
         newest = out[np.arange(count), [len(seen) - 1 for seen in self._tokens]]
         stride, dim = self.robot.stride, self.robot.action_dim
-        low, high = np.array(self.robot.low, np.float32), np.array(self.robot.high, np.float32)
-        chunks = np.clip(newest[:, : stride * dim].reshape(count, stride, dim), low, high).astype(np.float32)
+        predicted = newest[:, : stride * dim].reshape(count, stride, dim)
+        chunks = self.robot.clip_to_range(predicted, "clip")[0].astype(np.float32)
         for done, chunk in zip(self._chunks, chunks, strict=True):
             done.append(np.pad(chunk.ravel(), (0, self.width - chunk.size)))
         return chunks
