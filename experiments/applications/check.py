@@ -42,8 +42,8 @@ def open_study(workspace: Workspace) -> PreparedData:
 def choose_robots(
     run: Path, model: Model, prepared: PreparedData, robots: Sequence[str], windows: int, out: Path
 ) -> tuple[list[str], dict[str, str]]:
-    """(robots to be checked, why each of the others has too few episodes) of those that are asked for, () for all of
-    the study in `out`, whose tokens are the model's.
+    """(the robots to check, {another one: why it has too few episodes}) of `robots`, by default of all that the study
+    in `out` has windows of.
 
     Raises ConfigError where the study does not know a robot, or none is left.
     """
@@ -77,7 +77,8 @@ def check_run(
 
 
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
-    """What took how many, if so many `windows` of a robot are of too few episodes; None if they are of enough."""
+    """Why `windows` windows of a robot are of fewer than MIN_EPISODES episodes, and what to do; None if they are
+    not."""
     (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
     judged, of_all = (len({episode for episode, _ in some}) for some in (subsample_windows(frozen, windows), frozen))
     if judged >= MIN_EPISODES:

@@ -8,7 +8,7 @@ from experiments.applications.settings_file import pin_settings, short_hash
 from hma_jax.simulator.simulator import Simulator
 
 BEHAVIOUR = "drawn for each robot"
-"""How the scripted policies' random numbers are: films that were begun otherwise are not gone on with."""
+"""How random numbers of the scripted policies are drawn: films that were begun otherwise are not continued."""
 
 
 def pin_name(out: Path, name: str, run: Path, simulator: Simulator, detector: Path) -> None:

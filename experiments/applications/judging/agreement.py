@@ -32,9 +32,8 @@ Measure = Callable[[np.ndarray, np.ndarray], float]
 
 def pearson(true: np.ndarray, learned: np.ndarray) -> float:
     """nan where one of them does not vary, and of two, of which it is 1 or -1 whatever they are."""
-    if (
-        len(true) < 3 or np.ptp(true) == 0 or np.ptp(learned) == 0
-    ):  # the mean of equal rates need not be one of them to the last bit
+    # The mean of equal rates need not be one of them to the last bit, so the spread says whether they vary.
+    if len(true) < 3 or np.ptp(true) == 0 or np.ptp(learned) == 0:
         return math.nan
     a, b = true - true.mean(), learned - learned.mean()
     return float((a * b).sum() / math.sqrt(float((a * a).sum() * (b * b).sum())))
@@ -70,8 +69,8 @@ MEASURES: dict[str, Measure] = {
 class Agreement:
     """Measures of two worlds' success rates, with intervals over other policies of the kind and other starts."""
 
-    measures: dict[str, Interval]  # of fewer than LEAST_POLICIES without the interval, but for the bias
-    over_starts: dict[str, Interval]  # of these policies, were there no end of starts: see `_of_true_rates`
+    measures: dict[str, Interval]  # with fewer than LEAST_POLICIES policies only the bias has an interval
+    over_starts: dict[str, Interval]  # of the same policies from other starts alone: see `_of_true_rates`
 
 
 def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS) -> Agreement:

@@ -78,8 +78,8 @@ class SimulatedTruth:
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
-        """Demonstrations that are longer than asked for were not so in earlier versions, unless none that is shorter
-        can succeed."""
+        """The length of demonstrations where it is not the one asked for, which earlier versions recorded; left out
+        where none of that length could have succeeded."""
         frames, asked = self._demonstrated_frames(), self.config.demonstration_frames
         return {"demonstrated_frames": frames} if frames != asked and self.config.task.hold <= asked else {}
 

@@ -1,9 +1,9 @@
 """A robot without a true simulator: recordings that say whether they succeeded teach the head, and episodes begin as
 they did.
 
-A recording is looked at from where a policy would take over, the last frame of a start. Where its rewards say frame by
-frame whether the goal is reached, all of them teach the head. Otherwise those at which nobody knows, between the first
-half of a success and its last `hold` frames, are left out.
+A recording counts from where a policy would take over, the last frame of a start. Where its rewards say frame by frame
+whether the goal is reached, all its frames teach the head. Otherwise frames of unknown label, between the first half of
+a success and its last `hold` frames, are left out.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ class RecordedTruth:
         )
 
     def _read_rewards(self, least: float | None, frames: Sequence[int]) -> list[np.ndarray] | None:
-        """By their rewards, of every recording at which of the frames that are looked at the goal is reached,
-        bool [n]."""
+        """For every recording: in which of the n frames that are looked at its rewards say that the goal is reached,
+        bool [n]. None without a `least` reward."""
         if least is None:
             return None
         reached = []
@@ -226,9 +226,9 @@ class RecordedTruth:
 
 
 def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of a recording without rewards of which it is known whether the goal is reached, int [n], and whether it
-    is, bool [n]: no frame of a failure, of a success all of its last `hold` and none of its first half, as far as these
-    leave it.
+    """The frames of a recording without rewards whose label is known, int [n], and these labels, bool [n]. The goal is
+    reached in no frame of a failure; in each of the last `hold` frames of a success, and in none of its first half
+    before them.
     """
     if not success:
         return np.arange(length), np.zeros(length, bool)

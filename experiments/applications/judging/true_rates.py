@@ -101,7 +101,7 @@ def _grid() -> tuple[np.ndarray, np.ndarray]:
     factor_G22[:, 0, 0], factor_G22[:, 1, 0] = true_G, learned_G * r_G
     factor_G22[:, 1, 1] = learned_G * np.sqrt(1 - r_G**2)
     of_r_G = np.where(np.abs(r_G) == 1, PERFECT, (1 - 2 * PERFECT) / (len(CORRELATIONS) - 2))
-    return factor_G22, np.log(of_r_G * true_G * learned_G)  # spreads stand the wider apart, the larger they are
+    return factor_G22, np.log(of_r_G * true_G * learned_G)  # spreads are evenly spaced in their logarithm
 
 
 def _sd(successes: np.ndarray, episodes: np.ndarray | int) -> np.ndarray:

@@ -100,9 +100,8 @@ def _start(simulator: Simulator, truth: Truth, session: Session, values: Message
     starts = [start for start in simulator.starts if start.robot == robot.name]
     number, seed = whole(values.get("start", 0)), whole(values.get("seed", 0))
     require(number < len(starts), f"{robot.name} has {len(starts)} starts; there is no start {number}")
-    true = (
-        None if session.truth is None else _begin_truth(truth, robot, starts[number])
-    )  # may fail: before anything changes
+    # This may fail, so it comes before anything changes.
+    true = None if session.truth is None else _begin_truth(truth, robot, starts[number])
     simulator.reset(starts[number], seeds=[seed], episodes=[session.episode])
     session.robot, session.start, session.truth, session.recorded = robot, number, true, False
 
@@ -203,9 +202,8 @@ def picture(image: np.ndarray) -> str:
 def numbers(value: Any) -> np.ndarray:
     """ConfigError for what is no list of finite numbers."""
     flat = isinstance(value, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
-    fits = (
-        flat and len(value) <= MAX_VALUES and all(abs(v) <= LARGEST_VALUE for v in value)
-    )  # ints may have any number of digits
+    # A test of being finite would not do: ints may have any number of digits.
+    fits = flat and len(value) <= MAX_VALUES and all(abs(v) <= LARGEST_VALUE for v in value)
     require(
         fits,
         f"an action is a list of at most {MAX_VALUES} finite numbers, from {-LARGEST_VALUE:g} to {LARGEST_VALUE:g}",
