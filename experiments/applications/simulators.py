@@ -121,8 +121,8 @@ def in_suite(robot: Robot) -> bool:
 
 
 def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int = 0) -> list[Start]:
-    """`frames` frames, of `size`, of episodes that begin as the robot's held-out ones (`suite_starts`): of the suite's
-    first `count` those that are long enough, or so many new ones of its physics simulator."""
+    """Starts of `frames` frames of `size` pixels: of the first `count` held-out episodes of the suite those that are
+    long enough (`suite_starts`), or `count` new episodes of the robot's physics simulator."""
     if not in_suite(robot):
         return physics_starts(robot.name, count, frames, stride=robot.stride, image_size=size, seed=seed)
     made = suite_starts(robot.name, count, frames, stride=robot.stride, seed=seed)
@@ -131,7 +131,7 @@ def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int =
 
 def describe_robots(simulator: Simulator, workspace: Workspace) -> list[Robot]:
     """The robots of a simulator with the ranges that were recorded, where the study's tokens are at hand."""
-    store = TokenStore(workspace.store) if workspace.store.is_dir() else None
+    store = _find_store(workspace)
     return [_describe(entry, store) for entry in simulator.model.table.entries if entry.action_dim]
 
 
@@ -153,16 +153,16 @@ def mark_absolute_actions(simulator: Simulator, run: Path | str) -> None:
     Robots described in a file of the run, and those of the suite, have the mark already. No simulated frame depends on
     it.
     """
-    study = Workspace.of_run(Path(run))
-    if (Path(run) / ROBOTS).exists() or not study.store.is_dir():
+    store = _find_store(Workspace.of_run(Path(run)))
+    if store is None or (Path(run) / ROBOTS).exists():
         return
-    store = TokenStore(study.store)
-    recorded_robots = [
-        robot for robot in simulator.robots.values() if robot.name not in SPECS and robot.name in store.names
-    ]
-    simulator.update_robots(
-        [replace(robot, keeps=True) for robot in recorded_robots if _are_absolute(store, robot.name)]
-    )
+    recorded = [name for name in simulator.robots if name not in SPECS and name in store.names]
+    absolute = [name for name in recorded if _are_absolute(store, name)]
+    simulator.update_robots([replace(simulator.robots[name], keeps=True) for name in absolute])
+
+
+def _find_store(workspace: Workspace) -> TokenStore | None:
+    return TokenStore(workspace.store) if workspace.store.is_dir() else None
 
 
 def _are_absolute(store: TokenStore, name: str) -> bool:
@@ -175,7 +175,7 @@ def _are_absolute(store: TokenStore, name: str) -> bool:
 def find_starts(simulator: Simulator, workspace: Workspace) -> tuple[Start, ...]:
     """Starts of every robot: of held-out episodes of its true simulator, otherwise those whose frames the token store
     kept."""
-    store = TokenStore(workspace.store) if workspace.store.is_dir() else None
+    store = _find_store(workspace)
     starts: list[Start] = []
     for robot in simulator.robots.values():
         if has_truth(robot):
@@ -186,8 +186,8 @@ def find_starts(simulator: Simulator, workspace: Workspace) -> tuple[Start, ...]
 
 
 def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Start], np.ndarray]:
-    """At most `count` starts of episodes that no suite of seed 0 has, with images of `size`, and what was done in the
-    `frames` after each: chunks [n, frames, stride, A]. Fewer where the robot's episodes are too short."""
+    """At most `count` starts of episodes that no suite of seed 0 has, with images of `size` pixels, and the actions of
+    the `frames` after each, chunks [n, frames, stride, A]. Fewer where the robot's episodes are too short."""
     whole = suite_starts(robot.name, 16 * count, START_FRAMES + frames, stride=robot.stride, seed=1, most=count)
     given = (START_FRAMES - 1) * robot.stride
     starts = [Start(s.robot, fit_images(s.images[:START_FRAMES], size), s.actions[:given], s.seed) for s in whole]
@@ -197,8 +197,8 @@ def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Sta
 
 def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int]) -> list[Start]:
     manifest, starts = store.manifest(robot.name), []
-    every = robot.stride // manifest.frame_step
-    if not every or robot.stride % manifest.frame_step:
+    every, rest = divmod(robot.stride, manifest.frame_step)
+    if rest:
         return []
     for i in range(len(manifest.val.episodes)):
         episode = store.episode(robot.name, "val", i)

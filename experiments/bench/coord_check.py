@@ -5,13 +5,14 @@ The measuring and the judging are in `hma_jax.diagnostics.coordinate_check`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from experiments.applications.tables import write_table
 from experiments.bench.models import make_table, random_batch
 from experiments.study import Study
+from experiments.terminal.progress import Update
 from hma_jax.config import MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
 from hma_jax.diagnostics.coordinate_check import Size, measure
 
@@ -41,7 +42,7 @@ def measure_widths(
     steps: int,
     seeds: int,
     learning_rate: float,
-    report: Callable[[int, int, str], None] = lambda done, total, note: None,
+    report: Update = lambda done, total, note: None,
 ) -> list[Size]:
     """The sizes of activations of the study's model at `widths`, with its optimiser and its setting of masking. Windows
     are short and random, of one robot. `report` is called with (widths that are done, all of them, the next)."""

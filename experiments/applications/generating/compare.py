@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,13 +15,12 @@ from experiments.applications.generating.source import ACTION, IMAGE
 from experiments.applications.generating.trajectories import Trajectories
 from experiments.applications.play.recording import encode_video
 from experiments.applications.tables import write_table
+from experiments.terminal.progress import Update
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.runtime.files import write_file
 
 ORIGIN_KEY = "episode_metadata/file_path"
-
-Progress = Callable[[int, int, str], None]
 
 
 class Pair(NamedTuple):
@@ -55,7 +54,7 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    directory: Path, recorded: Trajectories, given: int, clips: int, rate: float, progress: Progress | None = None
+    directory: Path, recorded: Trajectories, given: int, clips: int, rate: float, progress: Update | None = None
 ) -> Comparison:
     """Writes `psnr.csv` and the first `clips` episodes as MP4 beside `directory`: recording left, model right."""
     rows, home, total = [], directory.parent, len(RldsDataset(directory))

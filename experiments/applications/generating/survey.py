@@ -3,13 +3,13 @@ say if they succeeded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
 from experiments.applications.generating.trajectories import Trajectories
+from experiments.terminal.progress import Update
 from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 
@@ -54,9 +54,7 @@ class Survey:
         )
 
 
-def survey(
-    recorded: Trajectories, count: int, robot: Robot, progress: Callable[[int, int, str], None] = lambda *_: None
-) -> Survey:
+def survey(recorded: Trajectories, count: int, robot: Robot, progress: Update = lambda *_: None) -> Survey:
     """Reads the actions of the first `count` recordings, not their frames. Values that the robot never changes do not
     count. Raises EpisodeError for a damaged one, where `recorded` does not leave it out."""
     low, high = np.asarray(robot.low, np.float32), np.asarray(robot.high, np.float32)
