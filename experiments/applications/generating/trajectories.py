@@ -246,13 +246,13 @@ def open_trajectories(
     *,
     skip_damaged: bool = False,
 ) -> tuple[Trajectories, Robot]:
-    """The trajectories at `place`, and who replays them: `robot`, or the one that the dataset, or the one that it is
-    joined to, is called after.
+    """(the trajectories at `place`, the robot that replays them): `robot`, by default the one that has the name of the
+    dataset, or of the dataset that it is joined to.
 
     `place` is a dataset's directory, one of a token store (`STORE/NAME`), or the name of a dataset in the token store
     `stores`. Raises ConfigError for what is none of them, or of no known robot, and for an entry that corrects images
-    otherwise than that store was made; DataError for damage, but for as many episodes as were left out of the tokens of
-    the same dataset in `stores`, or with `skip_damaged` as many as that leaves out by default.
+    otherwise than that store was made; DataError for more damaged episodes than were left out of the tokens of the same
+    dataset in `stores`, with `skip_damaged` for more than MAX_SKIPPED, if that is more.
     """
     path = Path(place)
     if not path.exists() and stores.is_dir() and "/" not in place:
@@ -376,7 +376,7 @@ def rewards_of_frames(native_N: np.ndarray, stride: int) -> np.ndarray:
 
 
 def describe(trajectories: Trajectories) -> dict[str, Any]:
-    """What tells these recordings, and what is taken of them, from others."""
+    """What identifies these recordings, and what is taken of them."""
     spec = trajectories.spec
     taken = {"image_key": spec.camera_key, "action_layout": spec.action_layout()}
     return {"dataset": trajectories.name, "split": trajectories.split, "contents": trajectories.fingerprint, **taken}

@@ -180,8 +180,8 @@ def measure_head(head: Head, demos: Demonstrations, task: Task) -> dict[str, flo
 def worth_of(
     head: Head, frames: np.ndarray, labels: np.ndarray, by_head: np.ndarray, successes: np.ndarray
 ) -> dict[str, float]:
-    """From probabilities [n] and labels of frames, and what the head says of episodes [N] beside what is true of
-    them."""
+    """Accuracies, from probabilities and labels [n] of frames, and from successes of episodes [N] by the head and true
+    ones."""
     return {
         "frames": float(len(labels)),
         "positive": float(labels.mean()),

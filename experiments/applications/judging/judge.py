@@ -86,9 +86,9 @@ def judge_recorded(
     split: str = "train",
     counted: Sequence[str] = (),
 ) -> Judgement:
-    """The same for a robot without a true simulator, whose recordings in `dataset` say what success looks like. Of the
-    starts and episodes at once that are asked for, as many as recordings are held out. `counted` are the policies that
-    the real robot was seen to act by.
+    """The same for a robot without a true simulator, whose recordings in `dataset` say what success looks like. There
+    are no more starts, nor episodes at once, than recordings are held out. `counted` are the policies whose successes
+    on the real robot were counted.
 
     Raises ConfigError as `judge_run` does, for recordings that are not the robot's, and for too few of them;
     EpisodeError for one that cannot be read.

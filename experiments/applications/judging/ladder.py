@@ -37,7 +37,7 @@ class LadderConfig:
     first: int = 60  # the step of the first checkpoint
     batch: int = 64
     learning_rate: float = 2e-3
-    frames: int = 1  # one shows all there is; of two, what was just done can be read, and is then merely done again
+    frames: int = 1  # from two a policy would read what was just done, and merely repeat it
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def __post_init__(self):

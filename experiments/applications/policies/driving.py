@@ -18,7 +18,7 @@ from experiments.applications.policies.scripted import make_expert, noisy
 from experiments.applications.policies.tasks import Task
 
 JITTER = 2.0
-"""Frames over which the hand of a physics simulator's expert forgets by what it misses."""
+"""Correlation time, in frames, of the errors of a physics simulator's expert."""
 
 
 class ExpertRollouts(NamedTuple):
@@ -68,8 +68,8 @@ def _drive_suite(
 def _drive_physics(
     task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool
 ) -> ExpertRollouts:
-    """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its hand forgets by what it misses
-    over `JITTER` frames, where that of the data forgets over 0.1 s; `play` wanders."""
+    """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its errors have a correlation time of
+    `JITTER` frames instead of 0.1 s. With `play` actions wander around rest."""
     spec, world = task.physics, PhysicsWorld(task.physics, image_size)
     shape = len(seeds), task.frames
     images = np.zeros((*shape, image_size, image_size, 3), np.uint8)
