@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from experiments.bench.models import Subject
 from hma_jax.config import DecodeConfig, SamplerConfig, TrainConfig
-from hma_jax.generation import steps
+from hma_jax.generation import rollout_naive, steps
 from hma_jax.generation.cache import Window
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
@@ -22,35 +22,57 @@ RELEASE_SAMPLER = ("ddpm", 100)
 """How the release samples latents."""
 
 
+class Frames:
+    """A pass over `rows` windows, and every way of making their last frame or the next one, as functions of parameters
+    to be jitted."""
+
+    def __init__(self, subject: Subject, decode: DecodeConfig, rows: int):
+        batch = subject.batch(rows)
+        self._declared, self._decode, self._size = subject.declared, decode, subject.config.frames
+        self._tokens, self._actions, self._embodiment = (batch[key] for key in ("tokens", "actions", "embodiment"))
+        self._keys = jax.random.split(jax.random.key(subject.seed), rows)
+        self._past, self._newest = self._tokens[:, :-1], self._tokens[:, -2]
+
+    def _window(self, params: Any) -> Window:
+        return Window.over(self._declared.merge(params), self._actions, None, self._embodiment)
+
+    def start(self, params: Any) -> Any:
+        """The cache of windows that lack their last frame, for `fill` and `stream`."""
+        return self._window(params).start(self._past, self._size - 1)
+
+    def forward(self, params: Any) -> jax.Array:
+        model = self._declared.merge(params)
+        return model(self._tokens, None, model.align(self._actions), self._embodiment).token_outputs
+
+    def recompute(self, params: Any) -> jax.Array:
+        model = self._declared.merge(params)
+        return rollout_naive(model, self._past, self._actions, self._embodiment, self._keys, self._decode)
+
+    def slide(self, params: Any) -> jax.Array:
+        return steps.slide(self._window(params), self._past, self._keys, self._decode)
+
+    def fill(self, params: Any, cache: Any) -> Any:
+        last = jnp.int32(self._size - 1)
+        return steps.fill(self._window(params), cache, self._newest, last, self._keys, self._decode)
+
+    def stream(self, params: Any, cache: Any) -> Any:
+        beyond = jnp.int32(self._size)
+        return steps.stream(self._window(params), cache, self._newest, beyond, self._keys, self._decode)
+
+
 def program(
     subject: Subject, name: str, sampler: tuple[str, int] = RELEASE_SAMPLER, rows: int = 1
 ) -> tuple[Callable[..., Any], *tuple[Any, ...]]:
     """(a function to be jitted, its arguments) for step, forward, fill or slide. The last two make a frame with
     two passes over it, `fill` as the last of a window."""
-    declared, batch, config = subject.declared, subject.batch(rows), subject.config
     if name == "step":
-        step = make_train_step(declared, subject.table, config, TrainConfig(batch=rows, seed=subject.seed))
-        return step, init_state(declared, subject.table, subject.seed), batch
-    weights, keys = subject.inference_params, jax.random.split(jax.random.key(0), rows)
-    decode = DecodeConfig(2, sampler=SamplerConfig(*sampler))
-    past, newest = batch["tokens"][:, :-1], batch["tokens"][:, -2]
-
-    def window(params: Any) -> Window:
-        return Window.over(declared.merge(params), batch["actions"], None, batch["embodiment"])
-
-    def forward(params: Any) -> jax.Array:
-        model = declared.merge(params)
-        return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).token_outputs
-
-    def slide(params: Any) -> Any:
-        return steps.slide(window(params), past, keys, decode)
-
-    def fill(params: Any, cache: Any) -> Any:
-        return steps.fill(window(params), cache, newest, jnp.int32(config.frames - 1), keys, decode)
-
+        settings = TrainConfig(batch=rows, seed=subject.seed)
+        step = make_train_step(subject.declared, subject.table, subject.config, settings)
+        return step, init_state(subject.declared, subject.table, subject.seed), subject.batch(rows)
+    frames, weights = Frames(subject, DecodeConfig(2, sampler=SamplerConfig(*sampler)), rows), subject.inference_params
     if name == "fill":
-        return fill, weights, jax.jit(lambda p: window(p).start(past, config.frames - 1))(weights)
-    return {"forward": forward, "slide": slide}[name], weights
+        return frames.fill, weights, jax.jit(frames.start)(weights)
+    return {"forward": frames.forward, "slide": frames.slide}[name], weights
 
 
 def repeatable(
@@ -60,9 +82,14 @@ def repeatable(
     function, *args = program(subject, name, sampler, rows)
     carried = CARRIED.get(name)
     compiled = jax.jit(function, donate_argnums=() if carried is None else carried)
+    return carrying(compiled, args, carried)
+
+
+def carrying(call: Callable[..., Any], args: list[Any], carried: int | None) -> Callable[[], Any]:
+    """Calls with `args`, of which number `carried` is each time what the call before returned as its first result."""
 
     def once() -> Any:
-        result = compiled(*args)
+        result = call(*args)
         if carried is not None:
             args[carried] = result[0]
         return result
