@@ -28,6 +28,7 @@ from data_pipelines.sources.convertible import ConvertibleSource, Skipped, UnitE
 from data_pipelines.sources.rlds.schema import RATE_KEY
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
+from data_pipelines.sources.source import action_fields
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 from hma_jax.runtime.locks import Held
@@ -57,13 +58,12 @@ class _Shard:
 def suggest_spec(source: ConvertibleSource, name: str) -> DatasetSpec:
     """The registry entry of a converted dataset: its first camera and its action."""
     layout = source.layout
-    field = "action" if any(key.partition("/")[0] == "action" for key in layout.vectors) else "actions"
-    actions = {key: size for key, size in layout.vectors.items() if key.partition("/")[0] == field}
+    actions = action_fields(layout.vectors)
     return DatasetSpec(
         name,
         image_key=next(iter(layout.images)),
         action_keys=tuple(actions),
-        action_dims=tuple(actions.values()),
+        action_dims=tuple(layout.vectors[key] for key in actions),
         hz=source.hz,
         note=source.description,
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from data_pipelines.sources.rlds.schema import field_slice, step_key
-from data_pipelines.sources.source import vector_sizes
+from data_pipelines.sources.source import action_fields, vector_sizes
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ class LeRobotFields:
 
 def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequence[str] = ()) -> LeRobotFields:
     """All cameras and vectors of `source`; `action` and `state` are the keys, relative to a step, of what becomes
-    `action` and `observation.state`, where other fields of these names are left out. By default the field `action` or
-    `actions`, or all `action/...`; and one of STATES.
+    `action` and `observation.state`, where other fields of these names are left out. By default `action_fields` and one
+    of STATES.
 
     Raises ConfigError for unknown keys, for a source without a camera, and for two cameras of one name.
     """
@@ -49,7 +49,7 @@ def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequ
         raise ConfigError(
             f"{source.location}: the cameras {lost[0]!r} and {other!r} would both be called {_camera(other)!r}; rename one"
         )
-    actions = [step_key(key) for key in action] or default_actions(vectors)
+    actions = [step_key(key) for key in action or action_fields([key.removeprefix("steps/") for key in vectors])]
     states = [step_key(key) for key in state] or [step_key(key) for key in STATES if step_key(key) in vectors][:1]
     source.check_keys(images[0], [*actions, *states])
     chosen = {ACTION: tuple(actions), STATE: tuple(states)}
@@ -60,12 +60,6 @@ def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequ
         name: tuple(value for key in keys for value in _value_names(key, numbers)) for name, keys in chosen.items()
     }
     return LeRobotFields(cameras, chosen, names)
-
-
-def default_actions(keys: Sequence[str]) -> list[str]:
-    """The flat keys of an action, by their names."""
-    one = [key for key in map(step_key, ("action", "actions")) if key in keys][:1]
-    return one or [key for key in keys if key.startswith(step_key("action/"))]
 
 
 def _value_names(key: str, sizes: Mapping[str, int]) -> list[str]:

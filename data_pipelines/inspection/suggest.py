@@ -15,6 +15,7 @@ from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.registry.spec import MAX_STRIDE
 from data_pipelines.sources.convertible import unsupported_images_text
 from data_pipelines.sources.rlds.schema import METADATA, RATE_KEY, field_slice
+from data_pipelines.sources.source import NO_ACTION, action_fields
 from data_pipelines.windows.slicer import WindowSlicer
 from data_pipelines.windows.windows import MIN_TRAIN_FRAMES
 from hma_jax.config import ConfigError
@@ -22,7 +23,6 @@ from hma_jax.config import ConfigError
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 DEPTHS = re.compile(r"depth|dispar", re.IGNORECASE)
 OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)
-NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
 
 NO_RATE = 0.0
 """Placeholder for an unknown rate, which `DatasetSpec` refuses."""
@@ -162,9 +162,7 @@ def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, s
 
 def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str]:
     by_key = {a.key: a for a in facts.actions}
-    keys = [key for key in ("action", "actions") if key in by_key][:1]  # the second in other programs' LeRobot datasets
-    if not keys:
-        keys = [k for k in by_key if k.startswith("action/") and not NO_ACTION.search(k)]
+    keys = action_fields(by_key)
     if not keys:
         parts = [f for f in facts.fields if f.key.partition("/")[0] in ("action", "actions")]
         kept = ", ".join(f.key for f in parts if f.kind == "bytes")

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -35,6 +36,9 @@ INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruc
 
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
+
+NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
+"""Names of flags that say where an episode begins or ends, which some datasets store beside the action."""
 
 REWARD_KEY = "steps/reward"
 """Optional: the reward of each step's action, whose effect the next frame shows."""
@@ -250,6 +254,13 @@ def vector_sizes(features: Mapping[str, FlatFeature]) -> dict[str, int]:
         if f.size and not f.image and not f.encoding and key.startswith(("steps/observation/", "steps/action"))
         and "embedding" not in key and key not in INSTRUCTION_KEYS
     }  # fmt: skip
+
+
+def action_fields(keys: Collection[str]) -> list[str]:
+    """Those of a step's fields `keys` that are its action, by their names: `action`, or else `actions`, as other
+    programs call it in LeRobot datasets, or else all `action/...` but flags (NO_ACTION)."""
+    one = [key for key in ("action", "actions") if key in keys][:1]
+    return one or [key for key in keys if key.startswith("action/") and not NO_ACTION.search(key)]
 
 
 def find_instructions(record: Mapping[str, Any], steps: int) -> list[str]:

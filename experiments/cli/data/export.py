@@ -36,7 +36,7 @@ def data_export(
         split: The split to read; several are joined by +.
         hz: Frames per second. Default: what the files say, or else the dataset's registry entry.
         action: Fields that make up the action, such as action/joints action/gripper or action[:7]. Default: those of
-            the registry entry, or else the field `action`, or all of action/*.
+            the registry entry, or else the field `action`, or all of action/* except flags that end an episode.
         state: Fields that make up observation.state. Default: observation/state or observation/proprio.
         skip_damaged: Leave out damaged episodes and count them, instead of stopping.
         registry: TOML file with your own registry entries.

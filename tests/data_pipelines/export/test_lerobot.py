@@ -16,6 +16,7 @@ from data_pipelines.export.lerobot import FRAME_BYTES, ORIGIN, Exported, export_
 from data_pipelines.sources.lerobot_dataset import LeRobotDataset
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.features import FlatFeature
+from data_pipelines.sources.source import action_fields
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import FPS, HEIGHT, WIDTH, lerobot_actions, number, write_lerobot
 from tests.data_pipelines.fakes import make_spec, png, write_rlds
@@ -242,3 +243,26 @@ def test_two_cameras_that_would_have_one_name_are_refused(tmp_path):
     features = {"steps/observation/left/rgb": image, "steps/observation/left_rgb": image}
     with pytest.raises(ConfigError, match="would both be called 'observation.images.left_rgb'"):
         choose_fields(SimpleNamespace(features=features, location=place))
+
+
+def test_flags_of_an_end_are_fields_of_their_own_beside_the_action(tmp_path):
+    number = {name: FlatFeature(image=False, size=size) for name, size in (("arm", 2), ("terminate_episode", 3))}
+    features = {"steps/observation/image": FlatFeature(image=True, size=0, dtype="uint8")}
+    features |= {f"steps/action/{name}": feature for name, feature in number.items()}
+    source = SimpleNamespace(features=features, location=tmp_path, check_keys=lambda *keys: None)
+    flag = "terminate_episode"
+    assert choose_fields(source).vectors == {"action": ("steps/action/arm",), f"action.{flag}": (f"steps/action/{flag}",)}
+    assert choose_fields(source).names["action"] == ("arm_0", "arm_1")
+
+
+@pytest.mark.parametrize(
+    "keys, chosen",
+    [
+        (["action/arm", "actions", "action"], ["action"]),
+        (["action/arm", "actions"], ["actions"]),
+        (["action_dict/arm", "action/hand", "action/arm", "action/is_last"], ["action/hand", "action/arm"]),
+        (["action_dict/arm", "observation/action/arm"], []),
+    ],
+)
+def test_an_action_is_known_by_its_name(keys, chosen):
+    assert action_fields(keys) == chosen
