@@ -11,9 +11,8 @@ import os
 import platform
 import shutil
 import time
+from collections.abc import Iterator
 from pathlib import Path
-
-import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.files import publish
@@ -21,9 +20,7 @@ from data_pipelines.publishing.output_lock import OutputLock
 from data_pipelines.simulators.record import build_features
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.simulators.worker import facts_path, record_path
-from data_pipelines.sources.rlds.tfrecord import payload_bytes, write_shard
-from data_pipelines.sources.rlds.writer import VERSION, shard_name, write_info
-from data_pipelines.suite.write import SHARD_FRAMES
+from data_pipelines.sources.rlds.writer import VERSION, write_info, write_shards
 from hma_jax.runtime.files import write_file
 
 STATS = "stats.json"
@@ -46,22 +43,18 @@ def write_dataset(
             f"{spec.name}: states have different numbers of values ({found}), but those of a dataset have one. The "
             "backend's `vector` must give as many in every environment of the robot"
         )
+
+    def records(first: int, end: int) -> Iterator[bytes]:
+        return (record_path(staging, i).read_bytes() for i in range(first, end))
+
     frames = sum(f["frames"] for f in facts)
-    shards = max(1, min(episodes, round(frames / SHARD_FRAMES)))
-    bounds = np.linspace(0, episodes, shards + 1).astype(int)
-    lengths, payload = [], 0
-    for k in range(shards):
-        path = scratch / shard_name(spec.name, k, shards)
-        records = (record_path(staging, i).read_bytes() for i in range(bounds[k], bounds[k + 1]))
-        lengths.append(write_shard(path, records))
-        payload += payload_bytes(path, lengths[-1])
+    train = write_shards(scratch, spec.name, "train", range(episodes), frames, records)
     layout = ", ".join(f"{what} {dim}" for what, dim in spec.layout)
     write_info(
         scratch,
         spec.name,
         build_features(spec, size, facts[0]["states"]),
-        lengths,
-        payload,
+        {"train": train},
         f"Simulated by {spec.package}: {', '.join(spec.envs)}; actions at {spec.hz:g} Hz: {layout}.",
         metadata,
         module="data_pipelines.simulators",

@@ -1,12 +1,13 @@
 """One dataset of the suite on disk, laid out as tensorflow_datasets writes RLDS.
 
-Owns fields, records and shards of one dataset. What happens in an episode comes
+Owns fields and records of one dataset. What happens in an episode comes
 from `rollout`, its pictures from `render`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +15,21 @@ import numpy as np
 
 from data_pipelines.sources.rlds import writer as rlds_writer
 from data_pipelines.sources.rlds.example import encode_example
-from data_pipelines.sources.rlds.tfrecord import payload_bytes, write_shard
 from data_pipelines.sources.rlds.writer import (
     STEP_FIELDS,
     TEXT,
     Field,
     encode_jpeg,
     image_field,
-    shard_name,
     step_features,
     vector_field,
     write_info,
+    write_shards,
 )
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.spec import IMAGE_KEY, IMAGE_SIZE, EmbodimentSpec
-
-SHARD_FRAMES = 4000
-"""About this many native frames go into one shard."""
 
 BLOCK = 16
 """Episodes rendered together."""
@@ -62,35 +59,20 @@ def write_dataset(
     rollout = simulate(spec, np.concatenate(list(seeds.values())))
     written, first = {}, 0
     for split, count in episodes.items():
-        written[split] = _write_split(spec, directory, split, rollout, first, first + count)
-        first += count
-    lengths, size = written.pop("train")
+        own = range(first, first + count)
+        frames = int(rollout.lengths[own].sum())
+        written[split] = write_shards(directory, spec.name, split, own, frames, partial(_records, spec, rollout))
+        first = own.stop
     write_info(
         directory,
         name=spec.name,
         features=build_features(spec),
-        lengths=lengths,
-        size=size,
+        splits=written,
         description=f"Simulated robot of the family {spec.family!r} ({spec.convention} actions, {spec.hz} Hz).",
         metadata={**metadata, "positions": list(spec.points)},
-        more=written,
+        module="data_pipelines.suite",
     )
     return int(rollout.lengths.sum())
-
-
-def _write_split(
-    spec: EmbodimentSpec, directory: Path, split: str, rollout: Rollout, start: int, stop: int
-) -> tuple[list[int], int]:
-    """The shards of episodes start..stop-1 of a rollout: records in each, and bytes of all payloads."""
-    frames = int(rollout.lengths[start:stop].sum())
-    shards = max(1, min(stop - start, round(frames / SHARD_FRAMES)))
-    bounds = np.linspace(start, stop, shards + 1).astype(int)
-    lengths, size = [], 0
-    for k in range(shards):
-        path = directory / shard_name(spec.name, k, shards, split)
-        lengths.append(write_shard(path, _records(spec, rollout, bounds[k], bounds[k + 1])))
-        size += payload_bytes(path, lengths[-1])
-    return lengths, size
 
 
 def _records(spec: EmbodimentSpec, rollout: Rollout, start: int, stop: int) -> Iterator[bytes]:

@@ -1,21 +1,27 @@
 """Writing an RLDS directory in tfds's layout: the schema, the flags of a step, and the metadata files.
 
 Owns what all writers of episodes share; each writer decides which fields a dataset has. Records are made by
-`example.encode_example`, shards by `tfrecord.write_shard`.
+`example.encode_example`, single shards by `tfrecord.write_shard`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import simplejpeg
 
+from data_pipelines.sources.rlds.tfrecord import payload_bytes, write_shard
+
 VERSION = "1.0.0"
 JPEG_QUALITY = 95
+
+SHARD_FRAMES = 4000
+"""About this many native frames go into one shard."""
 
 IMAGE, TEXT = "image", "text"
 
@@ -73,6 +79,25 @@ def shard_name(dataset: str, index: int, count: int, split: str = "train") -> st
     return f"{dataset}-{split}.tfrecord-{index:05d}-of-{count:05d}"
 
 
+Split = tuple[Sequence[int], int]
+"""What was written of a split: records in each shard, and bytes of all payloads."""
+
+
+def write_shards(
+    directory: Path, dataset: str, split: str, episodes: range, frames: int, records: Callable[[int, int], Iterable[bytes]]
+) -> Split:
+    """The shards of a split: `records(first, end)` gives those of some of its `episodes`, which have so many native
+    `frames` in all."""
+    shards = max(1, min(len(episodes), round(frames / SHARD_FRAMES)))
+    bounds = np.linspace(episodes.start, episodes.stop, shards + 1).astype(int).tolist()
+    lengths, size = [], 0
+    for k, (first, end) in enumerate(pairwise(bounds)):
+        path = directory / shard_name(dataset, k, shards, split)
+        lengths.append(write_shard(path, records(first, end)))
+        size += payload_bytes(path, lengths[-1])
+    return lengths, size
+
+
 def build_features(step: Mapping[str, Field], episode: Mapping[str, Field]) -> Any:
     """The tfds features of episodes; keys such as `observation/image` nest at each slash."""
     # Costs over a second and is needed only where a dataset is finished.
@@ -102,35 +127,29 @@ def write_info(
     directory: Path,
     name: str,
     features: Any,
-    lengths: Sequence[int],
-    size: int,
+    splits: Mapping[str, Split],
     description: str,
     metadata: Mapping[str, Any],
-    module: str = "data_pipelines.suite",
-    more: Mapping[str, tuple[Sequence[int], int]] = {},
+    module: str,
 ) -> None:
-    """features.json, dataset_info.json and metadata.json, by tfds itself.
-
-    `lengths` are records per shard, `size` the bytes of all payloads, `metadata` what
-    metadata.json shall hold, `module` what made the dataset. `more` are splits besides "train":
-    lengths and size of each.
-    """
+    """features.json, dataset_info.json and metadata.json, by tfds itself; `metadata` is what metadata.json shall hold,
+    `module` what made the dataset."""
     import tensorflow_datasets as tfds
     from tensorflow_datasets.core.dataset_info import DatasetIdentity
 
     identity = DatasetIdentity(
         name=name, version=tfds.core.Version(VERSION), data_dir=str(directory), module_name=module
     )
-    splits = [
+    facts = [
         tfds.core.SplitInfo(
             name=split,
-            shard_lengths=list(records),
-            num_bytes=payload,
+            shard_lengths=list(lengths),
+            num_bytes=size,
             filename_template=tfds.core.ShardedFileTemplate(
                 data_dir=directory, dataset_name=name, split=split, filetype_suffix="tfrecord"
             ),
         )
-        for split, (records, payload) in {"train": (lengths, size), **more}.items()
+        for split, (lengths, size) in splits.items()
     ]
     info = tfds.core.DatasetInfo(
         builder=identity,
@@ -139,6 +158,6 @@ def write_info(
         metadata=tfds.core.MetadataDict(metadata),
     )
     info.set_file_format("tfrecord")
-    info.set_splits(tfds.core.splits.SplitDict(splits))
+    info.set_splits(tfds.core.splits.SplitDict(facts))
     info.write_to_directory(directory)
     features.save_config(str(directory))

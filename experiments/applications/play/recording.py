@@ -112,7 +112,7 @@ class Recording:
             place.mkdir(parents=True)
             write_shard(place / shard_name(name, 0, 1), [record])
             write_info(
-                place, name=name, features=features, lengths=[1], size=len(record),
+                place, name=name, features=features, splits={"train": ([1], len(record))},
                 description=f"One episode of {self.robot.name}, played by hand in a learned simulator.",
                 metadata={**({RATE_KEY: self.rate} if self.rate else {}), "stride": self.robot.stride, "generated": True},
                 module="experiments.applications.play",
