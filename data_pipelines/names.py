@@ -22,9 +22,14 @@ def is_dataset_name(text: object) -> bool:
     return isinstance(text, str) and _NAME.fullmatch(text) is not None
 
 
+def snake_case(text: str) -> str:
+    """`text` in lower-case letters, digits and '_'; "" if none is left."""
+    return re.sub(r"[^a-z0-9_]+", "_", text.lower()).strip("_")
+
+
 def made_name(text: str) -> str:
-    """A name, made from `text`, for a dataset that is written: lower-case letters, digits and '_'; first a letter."""
-    name = re.sub(r"[^a-z0-9_]+", "_", text.lower()).strip("_")
+    """A name, made from `text`, for a dataset that is written: as `snake_case`, first a letter."""
+    name = snake_case(text)
     return name if name[:1].isalpha() else f"dataset_{name}"
 
 
@@ -44,8 +49,9 @@ def truncate(text: object) -> str:
     return text if len(text) <= max_length else f"{text[:max_length]} ..."
 
 
-def quote(value: object, max_length: int = 80) -> str:
+def quote(value: object) -> str:
     """A value read from an untrusted file, for a message: on one line, of bounded length."""
+    max_length = 80
     if isinstance(value, (list, dict)):  # of any depth
         return f"a {type(value).__name__} of {len(value):,}"
     text = ascii(value[:max_length]) if isinstance(value, (str, bytes)) else ascii(value)

@@ -7,7 +7,6 @@ An episode is named by its `episode_index`.
 from __future__ import annotations
 
 import functools
-import re
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.names import snake_case
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_episodes, hash_meta
@@ -62,7 +62,7 @@ class LeRobotDataset(EpisodeSource):
         require(split == "train", f"{root}: no split {split!r}; a LeRobot dataset has only 'train'.")
         self.location, self.split = Path(root), split
         self.schema = self.location / "meta" / "info.json"
-        self.name = dataset_name(self.location)
+        self.name = lerobot_name(self.location)
         self._read = LeRobotSource(root, may_lose=corrupt == "skip")
         meta = self._read.meta
         self._entries, self.version = meta.episodes, meta.version
@@ -222,7 +222,7 @@ class _Frames(Sequence[SourceFrame]):
         return frame
 
 
-def dataset_name(root: Path) -> str:
+def lerobot_name(root: Path) -> str:
     """The directory's name as the name of a dataset. Raises DataError if no valid character is left of it.
 
     In the cache of the Hugging Face hub, `datasets--ORG--NAME/snapshots/REVISION`, it is NAME, whatever the revision.
@@ -230,7 +230,7 @@ def dataset_name(root: Path) -> str:
     repository, folder, own = ("", "", "", *root.absolute().parts)[-3:]
     if folder == "snapshots" and repository.startswith("datasets--"):
         own = repository.rpartition("--")[2]
-    name = re.sub(r"[^a-z0-9_]+", "_", own.lower()).strip("_")
+    name = snake_case(own)
     if not name:
         raise DataError(
             f"{root}: a LeRobot dataset gets the name of its folder, but this name contains none of a to z and 0 to "

@@ -7,25 +7,49 @@ from __future__ import annotations
 
 import difflib
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from data_pipelines.errors import MAX_LISTED, DataError, UnreachableError
 from data_pipelines.sources.joined import JoinedSource, Parts
+from data_pipelines.sources.lerobot_dataset import LeRobotDataset, lerobot_name
+from data_pipelines.sources.lerobot_meta import read_info
+from data_pipelines.sources.rlds import schema
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
-from data_pipelines.sources.rlds.schema import read_rate as rlds_rate
-from data_pipelines.sources.rlds.schema import resolve_version
+from data_pipelines.sources.robomimic import read_environment
+from data_pipelines.sources.robomimic_dataset import RobomimicDataset, robomimic_name
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
+
+class Format(NamedTuple):
+    """How a format is read: its episodes; its name and its rate in Hz (None: not said) without a look at these."""
+
+    source: Callable[..., EpisodeSource]
+    name: Callable[[Location], str]
+    hz: Callable[[Location], float | None]
+
+
+FORMATS = {
+    "rlds": Format(RldsDataset, schema.dataset_name, lambda place: schema.read_rate(schema.resolve_version(place))),
+    "lerobot": Format(LeRobotDataset, lerobot_name, lambda place: float(read_info(place)["fps"])),
+    "robomimic": Format(
+        RobomimicDataset,
+        lambda place: robomimic_name(read_environment(place)[0]),
+        lambda place: read_environment(place)[1],
+    ),
+}
+
 HDF5 = (".hdf5", ".h5")
 
 
 def find_format(location: str | Location) -> str:
-    """'rlds', 'lerobot' or 'robomimic', by the files at `location`; 'rlds' for every other URL.
+    """One of FORMATS, by the files at `location`; 'rlds' for every other URL.
 
     Raises as `resolve_version` for a path on a disk that is no dataset, and says what may have been meant.
     """
@@ -33,7 +57,7 @@ def find_format(location: str | Location) -> str:
     found = _signs(place)
     if found == "rlds" and isinstance(place, Path):
         try:
-            resolve_version(place)
+            schema.resolve_version(place)
         except UnreachableError:
             raise
         except DataError as error:
@@ -75,7 +99,7 @@ def _is_dataset(place: Path) -> bool:
     if _signs(place) != "rlds":
         return True
     try:
-        resolve_version(place)
+        schema.resolve_version(place)
     except DataError:
         return False
     return True
@@ -99,53 +123,19 @@ def open_source(
         own = sys.maxsize  # the limit is of all parts together
         parts = [open_source(p, split, corrupt=corrupt, max_skipped=own, files=files) for p in location.places]
         return JoinedSource(location.name, parts, corrupt, max_skipped)
-    options = {"corrupt": corrupt, "max_skipped": max_skipped}
-    kind = find_format(location)
-    if kind == "lerobot":
-        from data_pipelines.sources.lerobot_dataset import LeRobotDataset
-
-        return LeRobotDataset(locate(location), split, **options)
-    if kind == "robomimic":
-        from data_pipelines.sources.robomimic_dataset import RobomimicDataset
-
-        return RobomimicDataset(locate(location), split, **options)
-    from data_pipelines.sources.rlds.dataset import RldsDataset
-
-    return RldsDataset(location, split, files=files, **options)
+    source = FORMATS[find_format(location)].source
+    shared = {"files": files} if source is RldsDataset else {}
+    return source(locate(location), split, corrupt=corrupt, max_skipped=max_skipped, **shared)
 
 
 def read_rate(location: Location | Parts) -> float | None:
     """Native frames per second, as the files of a dataset say, or those of the first of `Parts` that do; None where
     none does. No episode is looked for, which may take hours. Raises DataError for a location that is no dataset."""
-
-    def rate_of(place: Location) -> float | None:
-        kind = find_format(place)
-        if kind == "lerobot":
-            from data_pipelines.sources.lerobot_meta import read_info
-
-            return float(read_info(place)["fps"])
-        if kind == "robomimic":
-            from data_pipelines.sources.robomimic import read_environment
-
-            return read_environment(place)[1]
-        return rlds_rate(resolve_version(place))
-
     places = location.places if isinstance(location, Parts) else (location,)
-    return next((hz for hz in map(rate_of, places) if hz is not None), None)
+    rates = (FORMATS[find_format(place)].hz(place) for place in places)
+    return next((hz for hz in rates if hz is not None), None)
 
 
 def source_name(location: str | Location) -> str:
     """The name of the dataset at `location`, by which the registry knows it. Raises DataError for none."""
-    kind = find_format(location)
-    if kind == "lerobot":
-        from data_pipelines.sources.lerobot_dataset import dataset_name
-
-        return dataset_name(locate(location))
-    if kind == "robomimic":
-        from data_pipelines.sources.robomimic import read_environment
-        from data_pipelines.sources.robomimic_dataset import dataset_name as name_of
-
-        return name_of(read_environment(locate(location))[0])
-    from data_pipelines.sources.rlds.schema import dataset_name as rlds_name
-
-    return rlds_name(location)
+    return FORMATS[find_format(location)].name(locate(location))

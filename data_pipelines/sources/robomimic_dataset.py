@@ -7,7 +7,6 @@ time. A demonstration is named by the file and its number.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
+from data_pipelines.names import snake_case
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.robomimic import RobomimicSource, damage_as, hdf5_path, read_rows, succeeded
@@ -55,7 +55,7 @@ class RobomimicDataset(EpisodeSource):
         self.location = self.schema = Path(path)
         self.split, self.version, self.files = split, "", 1
         self._read = RobomimicSource(path, RobomimicSettings(filter_key=None if split == "train" else split))
-        self.name = dataset_name(self._read.task)
+        self.name = robomimic_name(self._read.task)
         self._demos = list(self._read.units)
         self.features = self._read.layout.flat_features(self._read.unsupported_images)
         several = "+" in split
@@ -201,9 +201,9 @@ class _LazyFrames(Sequence[SourceFrame]):
             return frame
 
 
-def dataset_name(task: str) -> str:
+def robomimic_name(task: str) -> str:
     """`robomimic_<task>`, as names of datasets are written."""
-    return re.sub(r"[^a-z0-9_]+", "_", f"robomimic_{task}".lower()).strip("_")
+    return snake_case(f"robomimic_{task}")
 
 
 def _path(key: str, ending: str = "") -> str:

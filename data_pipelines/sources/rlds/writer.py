@@ -84,7 +84,12 @@ Split = tuple[Sequence[int], int]
 
 
 def write_shards(
-    directory: Path, dataset: str, split: str, episodes: range, frames: int, records: Callable[[int, int], Iterable[bytes]]
+    directory: Path,
+    dataset: str,
+    split: str,
+    episodes: range,
+    frames: int,
+    records: Callable[[int, int], Iterable[bytes]],
 ) -> Split:
     """The shards of a split: `records(first, end)` gives those of some of its `episodes`, which have so many native
     `frames` in all."""
