@@ -7,8 +7,8 @@ is named by its part and by its name there, so that it keeps its name whatever e
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -82,11 +82,9 @@ class JoinedSource(EpisodeSource):
         for part in self.parts:
             part.save_steps()
 
-    @contextmanager
-    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
+    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> AbstractContextManager[OpenEpisode]:
         part, own = self._part(i)
-        with part.open_episode(own, image_key, action_keys) as episode:
-            yield replace(episode, index=i)
+        return part.open_episode(own, image_key, action_keys)
 
     def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
         part, own = self._part(i)

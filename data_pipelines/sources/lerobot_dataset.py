@@ -10,7 +10,7 @@ import functools
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -117,10 +117,8 @@ class LeRobotDataset(EpisodeSource):
     def steps(self) -> np.ndarray:
         return self._lengths.astype(np.int32)
 
-    @contextmanager
-    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
-        with self._open(i, image_key, action_keys, with_success=self._read.layout.knows_success) as episode:
-            yield episode
+    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> AbstractContextManager[OpenEpisode]:
+        return self._open(i, image_key, action_keys, with_success=self._read.layout.knows_success)
 
     def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
         """As `EpisodeSource.frames`; those of a video are read without the episode's table."""
@@ -153,7 +151,7 @@ class LeRobotDataset(EpisodeSource):
                 advice = "Repair it, or read with corrupt='skip'."
                 return decode_frame(frame, lambda what: EpisodeError(f"{where}, step {n} {what}. {advice}"))
 
-            yield OpenEpisode(i, actions, success, fetch, decode)
+            yield OpenEpisode(actions, success, fetch, decode)
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         where, entry = self._where(i), self._entries[i]

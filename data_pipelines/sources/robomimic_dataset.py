@@ -106,7 +106,7 @@ class RobomimicDataset(EpisodeSource):
                 record, keys, self.features, len(frames),
                 lambda what: EpisodeError(f"{where}: {what}").at(self.location, -1),
             )  # fmt: skip
-            yield OpenEpisode(i, actions, success, frames.__getitem__, lambda n, data: data)
+            yield OpenEpisode(actions, success, frames.__getitem__, lambda n, data: data)
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         where, found = self._where(i), {}

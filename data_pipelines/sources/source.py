@@ -66,7 +66,6 @@ SourceFrame = bytes | np.ndarray
 class RawEpisode:
     """One episode as recorded. `images`: every `frame_step`-th of the N native frames."""
 
-    index: int
     images: list[np.ndarray]  # uint8 [H, W, 3] each
     actions: np.ndarray  # float32 [N, A], native rate, raw units
     success: bool | None
@@ -81,7 +80,6 @@ class RawEpisode:
 class OpenEpisode:
     """An episode whose frames are decoded one by one, while it is open."""
 
-    index: int
     actions: np.ndarray  # float32 [N, A], native rate, raw units
     success: bool | None
     fetch: Callable[[int], SourceFrame]
@@ -202,7 +200,7 @@ class EpisodeSource(ABC):
         """
         with self.open_episode(i, image_key, action_keys) as episode:
             images = [episode.image(t) for t in range(0, episode.steps, frame_step)]
-            return RawEpisode(i, images, episode.actions, episode.success)
+            return RawEpisode(images, episode.actions, episode.success)
 
     def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
         """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers. They are those that

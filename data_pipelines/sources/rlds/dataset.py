@@ -141,7 +141,6 @@ class RldsDataset(EpisodeSource):
             success = record.get(SUCCESS_KEY)
             known = isinstance(success, np.ndarray) and len(success) == 1  # a text, "False" too, says nothing here
             yield OpenEpisode(
-                i,
                 actions,
                 bool(success[0]) if known else None,
                 lambda step: encoded[step],
