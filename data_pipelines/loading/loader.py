@@ -132,7 +132,7 @@ class _WindowStream:
         if self.shuffle_actions:
             episode, start = windows.locate(self._other(at, i))
             item = self.store.episode(windows.name, "train", episode)
-        actions = slicer.actions(item, start, self.action_width)
+        actions = slicer.chunks(item.actions, start, self.action_width)
         if self.shuffle_actions:  # the chunks of a shorter window are repeated, so that every real frame has one
             actions = actions[np.arange(slicer.frames) % slicer.count_real(item, start)] * row["real"][:, None]
         return row | {"actions": actions}

@@ -132,35 +132,31 @@ def freeze_manifest(
     *,
     rate: float | None,
     prompt: int | None = None,
-    spacing: int | None = None,
 ) -> EvalManifest:
     """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.
 
     Windows of short episodes have at least the `prompt` frames and one more; all are whole without a prompt, or where
     it fills the window, as that of a policy may.
-    Starts within an episode lie `spacing` model frames apart; the default, `frames`, makes
-    windows disjoint, so that standard errors do not count the same pixels twice.
+    Windows are disjoint, so that standard errors do not count the same pixels twice.
     DIFFERS: the release evaluates the first windows of each dataset (reference section 6.1).
 
     Raises DataError if no dataset has a window.
     """
-    spacing = frames if spacing is None else spacing
     require(windows_per_dataset >= 1, f"windows_per_dataset must be at least 1, got {windows_per_dataset}")
-    require(spacing >= 1, f"spacing must be at least 1, got {spacing}")
     require(len(datasets) >= 1, "no dataset was given to evaluate on")
     least = frames if prompt is None else least_judged(prompt, frames)
     sets = {name: val_windows(store, name, frames, least, rate=rate) for name in sorted(set(datasets))}
     require_windows(sets)
     chosen, shortest, settings = [], frames, ChoiceSettings(windows_per_dataset, prompt)
     for name, windows in sets.items():
-        apart = np.flatnonzero(windows.start % (spacing * windows.slicer.spacing) == 0)
+        apart = np.flatnonzero(windows.start % (frames * windows.slicer.spacing) == 0)
         order = np.argsort(hash64(apart, stream_seed(seed, "evaluation", name)), kind="stable")
         picked = np.sort(apart[order[:windows_per_dataset]])
         pairs = tuple(windows.locate(int(i)) for i in picked)
         steps = store.manifest(name).val.steps
         shortest = min([shortest, *(int(windows.slicer.max_real(steps[episode])) for episode, _ in pairs)])
         chosen.append(DatasetWindows(name, pairs, "" if pairs else windows.why_empty()))
-    return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen), rate, shortest, settings)
+    return EvalManifest(frames, seed, frames, store.hash(tuple(sets)), tuple(chosen), rate, shortest, settings)
 
 
 def eval_batches(
@@ -273,7 +269,7 @@ class _Rows:
         mean, std = (x[self._names.index(name)] for x in self._statistics)
         row = {
             "tokens": slicer.tokens(item, start),
-            "actions": slicer.actions(item, start, width),
+            "actions": slicer.chunks(item.actions, start, width),
             "images": slicer.slice_frames(item.frames, item, start),
             "embodiment": np.int32(self._table.index(name)),
             "dataset": name,

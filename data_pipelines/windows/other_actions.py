@@ -55,7 +55,7 @@ class OtherWindows:
         return found
 
     def actions(self, name: str, others: Sequence[OtherWindow], width: int) -> np.ndarray:
-        """float32 [n, T, U = width]: the chunks of each, as `WindowSlicer.actions` cuts them."""
+        """float32 [n, T, U = width]: the chunks of each, as `WindowSlicer.chunks` cuts them."""
         slicer = self._slicers[name]
         chunks = [slicer.chunks(self._actions(name, o.split, o.episode), o.start, width) for o in others]
         return np.stack(chunks) if chunks else np.zeros((0, self._frames, width), np.float32)

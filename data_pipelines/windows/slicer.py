@@ -63,13 +63,9 @@ class WindowSlicer:
         dtype = np.float32 if item.tokens.dtype.kind == "f" else np.int32
         return self.slice_frames(item.tokens, item, start).astype(dtype)
 
-    def actions(self, item: StoredEpisode, start: int, width: int) -> np.ndarray:
-        """float32 [T, U = width]: the action chunk of each frame, sub-step-major, raw units,
-        followed by zeros."""
-        return self.chunks(item.actions, start, width)
-
     def chunks(self, actions: np.ndarray, start: int, width: int) -> np.ndarray:
-        """As `actions`, from the native actions [N, A] of an episode."""
+        """float32 [T, U = width]: the chunk of each frame, of the native actions [N, A] of an episode, sub-step-major,
+        raw units, followed by zeros."""
         first = start * self.frame_step
         real = int(self.max_real(len(actions) - first))
         chunk = actions[first : first + real * self.stride].reshape(real, self.stride * actions.shape[1])

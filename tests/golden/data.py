@@ -154,7 +154,7 @@ def _check_item(case: Case, stores: dict[str, OnDisk], key: str, want: np.ndarra
     item = StoredEpisode(0, None, data.frames[rows], data.actions[rows], None)
     first = start - rows[0]
     if key.endswith("action_ids"):
-        got = slicer.actions(item, first, width=data.actions.shape[1] * stride)
+        got = slicer.chunks(item.actions, first, width=data.actions.shape[1] * stride)
     else:
         got = slicer.slice_frames(item.tokens, item, first)
     case.compare(key, np.asarray(got).reshape(want.shape), want, 1e-6 if key.endswith("latents") else 0.0)

@@ -122,7 +122,7 @@ def test_windows_of_an_imported_store_are_what_the_release_reads(tmp_path, kind,
         store = TokenStore(root)
         item, cut = store.episode("toy_arm", "train", episode), make_slicer(store, "toy_arm", frames, 2.0)
         if field == "action_ids":
-            got = cut.actions(item, first, width=items[key].shape[1])
+            got = cut.chunks(item.actions, first, width=items[key].shape[1])
         else:
             got = cut.tokens(item, first)
         np.testing.assert_allclose(got.reshape(items[key].shape), items[key], rtol=tolerance)

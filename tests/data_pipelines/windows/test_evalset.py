@@ -35,13 +35,6 @@ def test_windows_of_an_episode_do_not_overlap(store):
             assert (start + 4) * facts.spec.stride <= facts.val.steps[episode]
 
 
-def test_spacing_allows_overlap_when_asked(store):
-    counts = [
-        len(freeze_manifest(store, ("arm",), 4, 500, 0, spacing=s, rate=2.0).datasets[0].windows) for s in (4, 2, 1)
-    ]
-    assert counts == [6, 12, 24]  # two episodes of 15 model frames
-
-
 def test_windows_are_whole_where_the_prompt_fills_them(store, manifest):
     filled = freeze_manifest(store, store.names, 4, 5, 0, prompt=4, rate=2.0)
     assert filled == manifest and filled.hash() == manifest.hash() and filled.settings == ChoiceSettings(5, 4)

@@ -58,7 +58,7 @@ def test_frames_and_actions_of_a_window_belong_together(steps, real):
         assert windows.slicer.real_mask(item, start).tolist() == [t < real for t in range(4)]
         native = windows.slicer.tokens(item, start)[:, 0]
         assert native.tolist() == [start * 3 + 6 * k + 1 if k < real else 0 for k in range(4)]
-        chunks = windows.slicer.actions(item, start, width=15)
+        chunks = windows.slicer.chunks(item.actions, start, width=15)
         assert chunks.shape == (4, 15) and (chunks[:, 12:] == 0).all() and (chunks[real:] == 0).all()
         assert (chunks[:real, 0:12:2] == native[:real, None] + np.arange(6)).all()
         assert (chunks[:real, 1:12:2] == native[:real, None] + np.arange(6) + 0.5).all()
