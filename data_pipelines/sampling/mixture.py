@@ -24,26 +24,23 @@ class Mixture:
 
 
 def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float) -> np.ndarray:
-    """float64 probabilities ∝ counts^(1/tau), 0 where the count is 0 (paper section 4;
-    reference section 4.3). tau = 1 is proportional sampling, larger is flatter.
+    """float64 probabilities ∝ counts^(1/tau) of positive `counts` (paper section 4; reference section 4.3). tau = 1 is
+    proportional sampling, larger is flatter.
     """
     require(tau > 0, f"the mixture temperature tau must be positive, got {tau}")
     counts = np.asarray(counts, np.float64)
-    if counts.sum() <= 0:
-        raise DataError("every dataset of the mixture is empty; add one with data")
-    powers = np.where(counts > 0, (counts / counts.sum()) ** (1.0 / tau), 0.0)
+    powers = (counts / counts.sum()) ** (1.0 / tau)
     if not powers.any():  # tau is so small that even the largest is too small for a number
         powers = (counts == counts.max()).astype(np.float64)
     return powers / powers.sum()
 
 
-def make_mixture(counts: Mapping[str, int], tau: float, reasons: Mapping[str, str] | None = None) -> Mixture:
+def make_mixture(counts: Mapping[str, int], tau: float, reasons: Mapping[str, str]) -> Mixture:
     """The mixture of the datasets in `counts` (name -> examples).
 
-    Those with none are left out; `reasons` may say why. If none remains: DataError with all
-    the reasons.
+    Those with none are left out; `reasons` say why. If none remains: DataError with all the reasons.
     """
-    dropped = {n: (reasons or {}).get(n, "it is empty") for n, c in counts.items() if c == 0}
+    dropped = {n: reasons[n] for n, c in counts.items() if c == 0}
     if len(dropped) == len(counts):
         details = "; ".join(f"{name}: {why}" for name, why in dropped.items())
         raise DataError(f"no dataset can be used: {details}.")

@@ -45,9 +45,8 @@ class Encoder:
         self._collect()
 
     def take(self, count: int) -> np.ndarray:
-        """The tokens of the next `count` frames, which are ready."""
-        taken = [np.zeros((0, *self._shape()), np.int32)]
-        missing = count
+        """The tokens of the next `count` frames, one at least, which are ready."""
+        taken, missing = [], count
         while missing:
             piece = self._tokens.popleft()
             taken.append(piece[:missing])
@@ -55,11 +54,7 @@ class Encoder:
                 self._tokens.appendleft(piece[missing:])
             missing -= len(taken[-1])
         self.ready -= count
-        return np.concatenate(taken[1:] or taken)
-
-    def _shape(self) -> tuple[int, ...]:
-        t = self._tokenizer
-        return (t.tokens, t.channels) if t.channels else (t.tokens,)
+        return np.concatenate(taken)
 
     def _start(self) -> None:
         images = np.stack(self._frames)

@@ -240,7 +240,7 @@ class _Work:
         """Takes the episodes from `pending` that have all their tokens."""
         while pending and pending[0].end is not None and encoder.ready >= pending[0].frame_count:
             episode = pending.popleft()
-            tokens = encoder.take(episode.frame_count)
+            tokens = encoder.take(episode.frame_count) if episode.frame_count else None
             if episode.end.error is not None:
                 yield self._skip(episode.end.error)
                 continue
