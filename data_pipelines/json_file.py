@@ -1,4 +1,4 @@
-"""Reading JSON files of unknown origin: a value, or a DataError that names the file and says what to do.
+"""Reading JSON files of unknown origin: an object, or a DataError that names the file and says what to do.
 
 Owns the limits: parsing takes many times the memory of the text, so the size of a file and the number of its
 values are checked first.
@@ -29,15 +29,11 @@ STRUCTURE = (b",", b":", b"[", b"{")
 def read_object(path: Path | UPath, *, if_missing: str, advice: str) -> dict[str, Any]:
     """The JSON object in `path`. DataError with `if_missing` where there is no such file, and with
     `advice` where it cannot be read."""
-    value = read_json(path, if_missing=if_missing, advice=advice)
-    if not isinstance(value, dict):
-        raise DataError(f"{path} holds no JSON object. {advice}")
-    return value
-
-
-def read_json(path: Path | UPath, *, if_missing: str, advice: str) -> Any:
-    """As `read_object`, for a JSON value of any type."""
-    return _parse(_read(path, if_missing), path, advice)
+    try:
+        text = read_head(path, MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise DataError(f"{path} is missing: {if_missing}") from None
+    return _parse(text, path, advice)
 
 
 def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -49,31 +45,24 @@ def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[in
                 number += 1
                 if line.isspace():
                     continue
-                value = _parse(line, f"{path}: line {number}", advice)
-                if not isinstance(value, dict):
-                    raise DataError(f"{path}: line {number} holds no JSON object. {advice}")
-                yield number, value
+                yield number, _parse(line, f"{path}: line {number}", advice)
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {if_missing}") from None
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error}). {advice}") from error
 
 
-def _read(path: Path | UPath, if_missing: str) -> bytes:
-    try:
-        return read_head(path, MAX_BYTES + 1)
-    except FileNotFoundError:
-        raise DataError(f"{path} is missing: {if_missing}") from None
-
-
-def _parse(text: bytes, where: object, advice: str) -> Any:
+def _parse(text: bytes, where: object, advice: str) -> dict[str, Any]:
     if len(text) > MAX_BYTES:
         raise DataError(f"{where} has more than {MAX_BYTES:,} bytes, too many for such a file. {advice}")
     if len(text) > MAX_VALUES and sum(map(text.count, STRUCTURE)) > MAX_VALUES:
         raise DataError(f"{where} has more than {MAX_VALUES:,} values, too many for such a file. {advice}")
     try:
-        return json.loads(text.decode("utf-8-sig"))
+        value = json.loads(text.decode("utf-8-sig"))
     except ValueError as error:
         raise DataError(f"{where} cannot be read ({error}). {advice}") from error
     except RecursionError:
         raise DataError(f"{where} cannot be read (it is nested too deeply). {advice}") from None
+    if not isinstance(value, dict):
+        raise DataError(f"{where} holds no JSON object. {advice}")
+    return value

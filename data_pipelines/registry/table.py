@@ -27,14 +27,7 @@ def register(specs: Iterable[DatasetSpec]) -> None:
 
 def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
     """All entries in effect, by origin."""
-    groups = {
-        "own and samples": OWN,
-        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,
-        "other datasets of the paper": BEYOND_OPENX,
-        "embedded suite (simulated)": _suite(),
-        "simulator suite (extra sim)": _simulators(),
-    }
-    left = {title: tuple(s for s in specs if s.name not in _registered) for title, specs in groups.items()}
+    left = {title: tuple(s for s in specs if s.name not in _registered) for title, specs in _groups().items()}
     return {title: specs for title, specs in ({"given by you": tuple(_registered.values())} | left).items() if specs}
 
 
@@ -88,17 +81,20 @@ def find_reader(own_name: str) -> DatasetSpec | None:
 
 
 def _table() -> dict[str, DatasetSpec]:
-    return _built_in() | _registered
+    return {spec.name: spec for specs in _groups().values() for spec in specs} | _registered
 
 
 @functools.cache
-def _built_in() -> dict[str, DatasetSpec]:
+def _groups() -> dict[str, tuple[DatasetSpec, ...]]:
     return {
-        spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OPENX_REST, *BEYOND_OPENX, *_suite(), *_simulators())
+        "own and samples": OWN,
+        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,
+        "other datasets of the paper": BEYOND_OPENX,
+        "embedded suite (simulated)": _suite(),
+        "simulator suite (extra sim)": _simulators(),
     }
 
 
-@functools.cache
 def _suite() -> tuple[DatasetSpec, ...]:
     from data_pipelines.suite.embodiments import EMBODIMENTS  # not needed to know the real ones
     from data_pipelines.suite.spec import IMAGE_KEY
@@ -119,7 +115,6 @@ def _suite() -> tuple[DatasetSpec, ...]:
     )
 
 
-@functools.cache
 def _simulators() -> tuple[DatasetSpec, ...]:
     from data_pipelines.simulators.embodiments import EMBODIMENTS
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -159,17 +159,8 @@ def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | 
 
 
 def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
-    """What a manifest says of a tokenizer."""
-    return TokenizerFacts(
-        identity=tokenizer.identity,
-        image_size=tokenizer.image_size,
-        grid=tokenizer.grid,
-        tokens=tokenizer.tokens,
-        vocab_size=tokenizer.vocab_size,
-        factors=tokenizer.factors,
-        factor_vocab=tokenizer.factor_vocab,
-        channels=tokenizer.channels,
-    )
+    """What a manifest says of a tokenizer, which has the same fields."""
+    return TokenizerFacts(**{f.name: getattr(tokenizer, f.name) for f in fields(TokenizerFacts)})
 
 
 @dataclass

@@ -32,7 +32,6 @@ def read_hands(path: Path, min_score: float) -> np.ndarray:
     A hand counts from `min_score` on. Raises UnitError, naming the record, for anything else than
     N messages in the order of their frames.
     """
-    positions = np.full((0, 4), np.nan)
     rows = []
     for record, message in enumerate(_messages(path)):
         if message.frame_number != record + 1:
@@ -48,7 +47,7 @@ def read_hands(path: Path, min_score: float) -> np.ndarray:
                 box = hand.bbox
                 row[2 * hand.side :][:2] = (box.left + box.right) / 2, (box.top + box.bottom) / 2
         rows.append(row)
-    return np.stack(rows) if rows else positions
+    return np.reshape(rows, (-1, 4))
 
 
 def _messages(path: Path) -> Iterator[Any]:
