@@ -37,6 +37,7 @@ from data_pipelines.sources.source import (
     SourceFrame,
     decode_frame,
     find_instructions,
+    find_success,
     join_actions,
 )
 from hma_jax.config import require
@@ -216,8 +217,8 @@ class _Writer:
             columns[REWARD] = rewards
         last = (np.arange(steps) == steps - 1)[:, None]
         columns[DONE] = last
-        if SUCCESS_KEY in record:
-            columns[SUCCESS] = last & bool(np.asarray(record[SUCCESS_KEY]).ravel()[0])
+        if (success := find_success(record)) is not None:
+            columns[SUCCESS] = last & success
         columns[FRAME] = np.arange(steps)[:, None]
         columns[TIME] = (columns[FRAME] / self._hz).astype(np.float32)
         dtypes = {name: values.dtype.name for name, values in columns.items()}

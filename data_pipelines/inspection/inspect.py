@@ -31,6 +31,7 @@ from data_pipelines.sources.source import (
     SourceFrame,
     decode_frame,
     find_instructions,
+    find_success,
 )
 from hma_jax.config import require
 
@@ -386,10 +387,9 @@ class _CameraLog:
 
 
 def _example(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> ExampleEpisode:
-    success = record.get(SUCCESS_KEY)
-    known = isinstance(success, np.ndarray) and len(success) == 1
-    flag = bool(success[0]) if known else None
-    return ExampleEpisode(i, steps, flag, find_instructions(record, steps)[0], times, shrink(looked), actions)
+    frames = {camera: [shrink(frame) for frame in own] for camera, own in looked.items()}
+    text = find_instructions(record, steps)[0]
+    return ExampleEpisode(i, steps, find_success(record), text, times, frames, actions)
 
 
 def _size(values: np.ndarray | list[bytes]) -> int:

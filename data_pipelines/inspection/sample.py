@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +24,9 @@ class ExampleEpisode:
     actions: dict[str, np.ndarray]  # field -> [N, A]
 
 
-def shrink(frames: Mapping[str, Sequence[np.ndarray]], height: int = HEIGHT) -> dict[str, list[np.ndarray]]:
-    """The frames of every camera, none higher than `height`."""
-    return {camera: [_shrink(frame, height) for frame in own] for camera, own in frames.items()}
-
-
-def _shrink(frame: np.ndarray, height: int) -> np.ndarray:
-    if frame.shape[0] <= height:
+def shrink(frame: np.ndarray) -> np.ndarray:
+    """The frame, no higher than HEIGHT."""
+    if frame.shape[0] <= HEIGHT:
         return frame
-    width = max(round(frame.shape[1] * height / frame.shape[0]), 1)
-    return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BOX))
+    width = max(round(frame.shape[1] * HEIGHT / frame.shape[0]), 1)
+    return np.asarray(Image.fromarray(frame).resize((width, HEIGHT), Image.Resampling.BOX))

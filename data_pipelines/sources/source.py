@@ -276,6 +276,13 @@ def find_instructions(record: Mapping[str, Any], steps: int) -> list[str]:
     return [""] * steps
 
 
+def find_success(record: Mapping[str, Any]) -> bool | None:
+    """Whether the episode reached its goal, by a record that was read with SUCCESS_KEY; None where it has no such flag:
+    a text, "False" too, says nothing here."""
+    success = record.get(SUCCESS_KEY)
+    return bool(success[0]) if isinstance(success, np.ndarray) and len(success) == 1 else None
+
+
 def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception]) -> np.ndarray:
     """uint8 [H, W, 3] of a frame as its source holds it.
 

@@ -40,6 +40,7 @@ from data_pipelines.sources.source import (
     EpisodeSource,
     OpenEpisode,
     decode_frame,
+    find_success,
     join_actions,
 )
 
@@ -138,11 +139,9 @@ class RldsDataset(EpisodeSource):
             actions = join_actions(
                 record, action_keys, self.features, len(encoded), lambda what: self._unusable(i, what)
             )
-            success = record.get(SUCCESS_KEY)
-            known = isinstance(success, np.ndarray) and len(success) == 1  # a text, "False" too, says nothing here
             yield OpenEpisode(
                 actions,
-                bool(success[0]) if known else None,
+                find_success(record),
                 lambda step: encoded[step],
                 lambda step, data: self._image(i, image_key, step, data),
             )

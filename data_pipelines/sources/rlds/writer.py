@@ -28,11 +28,10 @@ IMAGE, TEXT = "image", "text"
 
 @dataclass(frozen=True)
 class Field:
-    """One feature: an image (`encoding` jpeg or png), text, or an array of `dtype`."""
+    """One feature: a JPEG image, text, or an array of `dtype`."""
 
     dtype: str
     shape: tuple[int | None, ...] = ()
-    encoding: str = "jpeg"
 
 
 def image_field(height: int | None, width: int | None) -> Field:
@@ -110,7 +109,7 @@ def build_features(step: Mapping[str, Field], episode: Mapping[str, Field]) -> A
 
     def leaf(field: Field) -> Any:
         if field.dtype == IMAGE:
-            return tf.Image(shape=field.shape, dtype=np.uint8, encoding_format=field.encoding)
+            return tf.Image(shape=field.shape, dtype=np.uint8, encoding_format="jpeg")
         if field.dtype == TEXT:
             return tf.Text()
         dtype = np.dtype(field.dtype).type
