@@ -46,7 +46,7 @@ W = TypeVar("W", bound=World)
 class TrueSimulator(ABC, Generic[W]):
     """B episodes of true robots, as they really go; nothing is random after the start."""
 
-    def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int, outside: Outside = "clip"):
+    def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int = 64, outside: Outside = "clip"):
         """Raises ConfigError for robots that there are not, or with other actions."""
         [episodes] = whole_numbers("episodes", [episodes])
         require_choice(outside, get_args(Outside), "outside")

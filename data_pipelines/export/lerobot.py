@@ -270,14 +270,12 @@ class _Writer:
 
         place = _place(self._files)
         data, rows, begin = self._root / DATA.format(**place), [], self._frames
+        videos = {
+            name: VideoWriter(self._root / VIDEO.format(video_key=name, **place), self._hz)
+            for name in self._fields.cameras
+        }
         with ExitStack() as stack:
-            writer, videos = (
-                None,
-                {
-                    name: VideoWriter(self._root / VIDEO.format(video_key=name, **place), self._hz)
-                    for name in self._fields.cameras
-                },
-            )
+            writer = None
             for episode in episodes:
                 index, steps, start = self._episodes + len(rows), len(episode.texts), self._frames
                 columns = {

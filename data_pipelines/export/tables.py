@@ -42,16 +42,10 @@ def arrow(values: np.ndarray) -> pa.Array:
 
 def vectors(column: pa.ChunkedArray) -> np.ndarray:
     """float32 [N, size]; the reverse of `arrow`."""
-    rows = len(column)
-    return np.concatenate(
-        [np.asarray(chunk.flatten() if _is_list(chunk) else chunk) for chunk in column.chunks]
-    ).reshape(rows, -1)
+    from pyarrow import compute, types
 
-
-def _is_list(chunk: pa.Array) -> bool:
-    import pyarrow as pa
-
-    return pa.types.is_fixed_size_list(chunk.type) or pa.types.is_list(chunk.type)
+    flat = compute.list_flatten(column) if types.is_fixed_size_list(column.type) else column
+    return flat.to_numpy().reshape(len(column), -1)
 
 
 def write_table(path: Path, table: pa.Table) -> None:

@@ -23,7 +23,7 @@ from data_pipelines.sources.identity import describe
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
-from data_pipelines.sources.rlds.schema import field_slice, read_features, read_info, step_key
+from data_pipelines.sources.rlds.schema import field_slice, read_info, step_key
 from data_pipelines.sources.source import (
     INSTRUCTION_KEYS,
     SUCCESS_KEY,
@@ -203,7 +203,11 @@ def inspect_dataset(
 def _describe(source: EpisodeSource) -> tuple[tuple[FieldFacts, ...], tuple[SplitFacts, ...]]:
     """Fields of a step and of the episode, and all splits."""
     if isinstance(source, RldsDataset):
-        return _read_schema(source.directory)
+        splits = (
+            SplitFacts(name, sum(split.shard_lengths), len(split.shard_lengths), split.bytes)
+            for name, split in sorted(read_info(source.directory).splits.items())
+        )
+        return tuple(_field(key, feature) for key, feature in sorted(source.features.items())), tuple(splits)
     fields = []
     for key, feature in source.features.items():
         if feature.image:
@@ -214,16 +218,6 @@ def _describe(source: EpisodeSource) -> tuple[tuple[FieldFacts, ...], tuple[Spli
             what = "number", (feature.size,), "float32"
         fields.append(FieldFacts(key.removeprefix("steps/"), *what, per_step=True))
     return tuple(fields), (SplitFacts(source.split, len(source), source.files, int(source.sizes().sum())),)
-
-
-def _read_schema(directory: Location) -> tuple[tuple[FieldFacts, ...], tuple[SplitFacts, ...]]:
-    """Fields of a step and of the episode, and all splits."""
-    splits = [
-        SplitFacts(name, sum(split.shard_lengths), len(split.shard_lengths), split.bytes)
-        for name, split in sorted(read_info(directory).splits.items())
-    ]
-    fields = [_field(key, feature) for key, feature in sorted(read_features(directory).items())]
-    return tuple(fields), tuple(splits)
 
 
 def _field(key: str, feature: FlatFeature) -> FieldFacts:

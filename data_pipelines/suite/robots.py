@@ -55,7 +55,7 @@ def arm(
     return Body(tuple(links), tuple(joints), (len(links) - 1,), (-1,))
 
 
-def gripper(size: float = 0.2, radius: float = 0.06) -> Body:
+def gripper(size: float, radius: float) -> Body:
     """Two fingers on one joint: 0 closed, 1 open. The tool is the point between them."""
     links = [Link(length=0.6 * size)]
     for side in (1, -1):
@@ -71,31 +71,6 @@ def gripper(size: float = 0.2, radius: float = 0.06) -> Body:
             )
         )
     return Body(tuple(links), (Joint(0.0, 1.0, 4.0),), (0,), (0,))
-
-
-def finger(
-    phalanges: int,
-    *,
-    angle: float = 0.0,
-    length: float = 0.25,
-    radius: float = 0.07,
-    curl: tuple[float, float] = (-0.2, 1.3),
-    paint: int = 1,
-) -> Body:
-    """A finger that curls. It carries no tool."""
-    links = [
-        Link(
-            parent=i - 1,
-            joint=i,
-            angle=angle if i == 0 else 0.0,
-            length=length * 0.9**i,
-            radius=radius * 0.92**i,
-            paint=paint,
-            touches=True,
-        )
-        for i in range(phalanges)
-    ]
-    return Body(tuple(links), (Joint(*curl, 3.5),) * phalanges, (), ())
 
 
 def gantry(
@@ -163,21 +138,18 @@ def rover(
     return Body(tuple(links), (slide, slide, heading), (2,), (-1,))
 
 
-def claw(fingers: int, phalanges: int, *, length: float = 0.17, radius: float = 0.06) -> Body:
-    """Fingers that fan out from a wrist; they carry no tool of their own."""
-    return join(
-        *(
-            finger(
-                phalanges,
-                angle=0.8 * (2 * i / (fingers - 1) - 1),
-                length=length,
-                radius=radius,
-                curl=(-0.7, 0.7),
-                paint=2,
-            )
-            for i in range(fingers)
-        )
-    )
+def claw(fingers: int, phalanges: int, *, length: float, radius: float) -> Body:
+    """Fingers that fan out from a wrist and curl; they carry no tool of their own."""
+
+    def finger(angle: float) -> Body:
+        links = [
+            Link(parent=i - 1, joint=i, angle=0.0 if i else angle, length=length * 0.9**i, radius=radius * 0.92**i, paint=2,
+                 touches=True)
+            for i in range(phalanges)
+        ]  # fmt: skip
+        return Body(tuple(links), (Joint(-0.7, 0.7, 3.5),) * phalanges, (), ())
+
+    return join(*(finger(0.8 * (2 * i / (fingers - 1) - 1)) for i in range(fingers)))
 
 
 def two_arms(

@@ -11,9 +11,9 @@ from data_pipelines.suite.controls import Control, Drive
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.rollout import episode_seeds, simulate
-from data_pipelines.suite.spec import IMAGE_SIZE, EmbodimentSpec
+from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.true_simulator import TrueSimulator
-from hma_jax.simulator.robots import KEYS, Outside, Robot, rest_action
+from hma_jax.simulator.robots import KEYS, Robot, rest_action
 from hma_jax.simulator.starts import Start
 
 UNITS = {"delta": "per step", "velocity": "per second", "absolute": "position"}
@@ -22,11 +22,6 @@ SPECS = {spec.name: spec for spec in EMBODIMENTS}
 
 class SuiteSimulator(TrueSimulator[Environment]):
     """B episodes of the suite's robots."""
-
-    def __init__(
-        self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int = IMAGE_SIZE, outside: Outside = "clip"
-    ):
-        super().__init__(robots, episodes=episodes, image_size=image_size, outside=outside)
 
     @staticmethod
     def dims() -> dict[str, int]:
