@@ -9,10 +9,11 @@ come last since no action of theirs can be judged. So every prefix is of many fa
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from data_pipelines.suite.families import FAMILIES, UNSEEN_FAMILIES
 from data_pipelines.suite.spec import EmbodimentSpec
+from hma_jax.config import require
 
 Family = tuple[EmbodimentSpec, ...]
 
@@ -37,6 +38,17 @@ UNSEEN = _in_rounds(UNSEEN_FAMILIES)
 """Ten robots that no study trains on unless it names them."""
 
 EMBODIMENTS = TRAINED + UNSEEN
+
+SPECS = {spec.name: spec for spec in EMBODIMENTS}
+
+
+def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
+    """Specs by name, in the given order; all of them for None. ConfigError for unknown names."""
+    if names is None:
+        return EMBODIMENTS
+    unknown = [name for name in names if name not in SPECS]
+    require(not unknown, f"unknown embodiment(s) {', '.join(unknown)}; the suite has {', '.join(SPECS)}")
+    return tuple(SPECS[name] for name in names)
 
 
 def siblings(spec: EmbodimentSpec) -> tuple[EmbodimentSpec, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_pipelines.suite.appearance import draw_appearance
-from data_pipelines.suite.embodiments import EMBODIMENTS
+from data_pipelines.suite.embodiments import select
 from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
@@ -22,12 +22,7 @@ class Environment:
 
     def __init__(self, robot: str | EmbodimentSpec):
         """Raises ConfigError for a name that the suite has not."""
-        known = {spec.name: spec for spec in EMBODIMENTS}
-        require(
-            isinstance(robot, EmbodimentSpec) or robot in known,
-            f"unknown embodiment {robot!r}; the suite has {', '.join(known)}",
-        )
-        self.spec = robot if isinstance(robot, EmbodimentSpec) else known[robot]
+        self.spec = robot if isinstance(robot, EmbodimentSpec) else select([robot])[0]
         self._world = World(self.spec, [0])
 
     def reset(self, seed: int) -> None:

@@ -19,7 +19,7 @@ from data_pipelines.publishing.files import publish
 from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.sources.rlds.writer import VERSION
-from data_pipelines.suite.embodiments import EMBODIMENTS
+from data_pipelines.suite.embodiments import select
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import write_dataset
 from hma_jax.config import ConfigError, require
@@ -41,16 +41,6 @@ VALIDATION = 24
 
 Progress = Callable[[str, int, int], None]
 """Called with (name of the dataset just finished or found complete, how many are, of how many)."""
-
-
-def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
-    """Specs by name, in the given order; all of them for None. ConfigError for unknown names."""
-    if names is None:
-        return EMBODIMENTS
-    known = {spec.name: spec for spec in EMBODIMENTS}
-    unknown = [n for n in names if n not in known]
-    require(not unknown, f"unknown embodiment(s) {', '.join(unknown)}; the suite has {', '.join(known)}")
-    return tuple(known[n] for n in names)
 
 
 def episode_count(spec: EmbodimentSpec, scale: float, fewest: int = MIN_EPISODES) -> int:
@@ -100,17 +90,7 @@ def generate_suite(
         raise ConfigError(f"cannot write to the suite's directory {root}: no permission; choose another")
 
     paths = [root / spec.name / VERSION for spec in specs]
-    missing = []
-    finished = 0
-    for spec, path in zip(specs, paths, strict=True):
-        if is_complete(path, fingerprint(spec, scale, seed, validation, fewest)):
-            finished += 1
-            if progress:
-                progress(spec.name, finished, len(specs))
-        else:
-            missing.append(spec)
-    # The longest first.
-    missing.sort(key=lambda s: -(episode_count(s, scale, fewest) + validation) * s.hz * sum(s.seconds))
+    missing, finished = [], 0
 
     def report(name: str) -> None:
         nonlocal finished
@@ -118,13 +98,20 @@ def generate_suite(
         if progress:
             progress(name, finished, len(specs))
 
+    for spec, path in zip(specs, paths, strict=True):
+        if is_complete(path, fingerprint(spec, scale, seed, validation, fewest)):
+            report(spec.name)
+        else:
+            missing.append(spec)
+    # The longest first.
+    missing.sort(key=lambda s: -(episode_count(s, scale, fewest) + validation) * s.hz * sum(s.seconds))
     if workers == 1 or len(missing) <= 1:
         for spec in missing:
-            _make(spec.name, root, scale, seed, validation, fewest)
+            _make(spec, root, scale, seed, validation, fewest)
             report(spec.name)
         return paths
     with _processes(min(workers, len(missing))) as pool:
-        jobs = {pool.submit(_make, spec.name, root, scale, seed, validation, fewest): spec.name for spec in missing}
+        jobs = {pool.submit(_make, spec, root, scale, seed, validation, fewest): spec.name for spec in missing}
         for job in as_completed(jobs):
             job.result()
             report(jobs[job])
@@ -159,10 +146,9 @@ def _enter_process(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewest: int) -> None:
+def _make(spec: EmbodimentSpec, root: Path, scale: float, seed: int, validation: int, fewest: int) -> None:
     """One dataset, unless another process makes it meanwhile."""
-    (spec,) = select([name])
-    final, expected = root / name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
+    final, expected = root / spec.name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
     with lock_output(final.with_name(f".{VERSION}"), wait=math.inf) as lock:
         if is_complete(final, expected):
             return

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_pipelines.registry.spec import FRAME_RATE, stride_of
 from data_pipelines.suite.controls import Control, Drive
-from data_pipelines.suite.embodiments import EMBODIMENTS
+from data_pipelines.suite.embodiments import SPECS
 from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
@@ -17,7 +17,6 @@ from hma_jax.simulator.robots import KEYS, Robot, rest_action
 from hma_jax.simulator.starts import Start
 
 UNITS = {"delta": "per step", "velocity": "per second", "absolute": "position"}
-SPECS = {spec.name: spec for spec in EMBODIMENTS}
 
 
 class SuiteSimulator(TrueSimulator[Environment]):

@@ -25,7 +25,7 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
     what was recorded, under the recorded actions.
     """
     from data_pipelines.errors import DataError
-    from data_pipelines.suite.generate import select
+    from data_pipelines.suite.embodiments import select
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.evalset import EvalManifest

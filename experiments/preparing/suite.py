@@ -78,7 +78,8 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
     """How the inputs of a dataset that is there differ from `suite`; [] if only the simulator does; None if it
     is as it should be, is not there, or lacks shards and is to be made in any case."""
     from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
-    from data_pipelines.suite.generate import episode_count, fingerprint, select
+    from data_pipelines.suite.embodiments import select
+    from data_pipelines.suite.generate import episode_count, fingerprint
 
     (spec,) = select([name])
     expected = fingerprint(spec, suite.scale, suite.seed, suite.validation, suite.fewest)

@@ -22,7 +22,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from data_pipelines.suite.generate import generate_suite, select
+from data_pipelines.suite.embodiments import select
+from data_pipelines.suite.generate import generate_suite
 from tests.data_pipelines.tokens.job_process import contents
 from tests.stress.tokenize_process import Work, read, tokenize
 
