@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -118,16 +119,7 @@ def generate_sim(
 
     fingerprints = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
     with ExitStack() as locks:
-        run = _Run(
-            root=root,
-            fingerprints=fingerprints,
-            episodes=episodes,
-            size=size,
-            seed=seed,
-            total=len(specs) * episodes,
-            progress=progress,
-            stack=locks,
-        )
+        run = _Run(root, fingerprints, episodes, size, seed, progress, locks)
         jobs = [job for spec in specs for job in run.plan(spec)]
         failures = run.work(jobs, workers)
     if failures:
@@ -139,27 +131,23 @@ def generate_sim(
     return [root / spec.name / VERSION for spec in specs]
 
 
+@dataclass
 class _Run:
     """One call of `generate_sim`: what is finished, and the running processes."""
 
-    def __init__(
-        self,
-        *,
-        root: Path,
-        fingerprints: Mapping[str, str],
-        episodes: int,
-        size: int,
-        seed: int,
-        total: int,
-        progress: Progress | None,
-        stack: ExitStack,
-    ):
-        self.root, self.fingerprints, self.episodes, self.size, self.seed = root, fingerprints, episodes, size, seed
-        self.done, self.total, self.progress = 0, total, progress
-        self.lock, self.finishing = threading.Lock(), threading.Lock()
-        self.children: set[subprocess.Popen] = set()
-        self.stopped = False
-        self.stack, self.output_locks = stack, dict[str, OutputLock]()
+    root: Path
+    fingerprints: Mapping[str, str]
+    episodes: int
+    size: int
+    seed: int
+    progress: Progress | None
+    stack: ExitStack  # in which the locks of datasets are held
+    done: int = 0  # episodes
+    stopped: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    finishing: threading.Lock = field(default_factory=threading.Lock)
+    children: set[subprocess.Popen] = field(default_factory=set)
+    output_locks: dict[str, OutputLock] = field(default_factory=dict)
 
     def staging(self, name: str) -> Path:
         """The directory in which the episodes of an unfinished dataset are collected."""
@@ -265,4 +253,4 @@ class _Run:
         with self.lock:
             self.done += episodes
             if self.progress:
-                self.progress(name, self.done, self.total)
+                self.progress(name, self.done, len(self.fingerprints) * self.episodes)

@@ -25,7 +25,7 @@ import google_crc32c
 import numpy as np
 
 from data_pipelines.errors import CorruptRecordError, UnreachableError
-from data_pipelines.sources.rlds.location import Descriptor, RandomAccessFile, is_remote, locate, open_random_access
+from data_pipelines.sources.rlds.location import Descriptor, RandomAccessFile, is_remote, open_random_access
 from hma_jax.runtime.files import naming
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _mask(crc: int) -> int:
     return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | None]:
+def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
     """The index of a file, from a scan that skips the payloads, and the error that stopped it.
 
     It stops where a header's checksum is wrong or the file ends inside a record: the offset of the next record is then
@@ -81,7 +81,6 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
     damage. The scan reads block by block: a block holds many records if they are small, little more than a header if
     they are large.
     """
-    path = locate(path)
     offsets: list[int] = []
     lengths: list[int] = []
     checksums: list[int] = []
@@ -122,12 +121,11 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
     return index, damage
 
 
-def read_record(path: str | Location, offset: int, length: int) -> bytes:
+def read_record(path: Location, offset: int, length: int) -> bytes:
     """The payload of `length` bytes of the record that starts at byte `offset` of `path`.
 
     Raises CorruptRecordError if the file is shorter than its index says or if the payload does not match its checksum.
     """
-    path = locate(path)
     with open_random_access(path) as file:
         body = _read(file, path, offset, offset + HEADER, length + FOOTER)
     payload = body[:length]
@@ -144,14 +142,13 @@ def read_parts(file: RandomAccessFile, path: Location, offset: int, spans: Itera
 
 
 @contextmanager
-def open_record(path: str | Location, offset: int, length: int) -> Iterator[bytes | FileView]:
+def open_record(path: Location, offset: int, length: int) -> Iterator[bytes | FileView]:
     """The verified payload of a record, for the time of a `with`, in bounded memory.
 
     Up to MAX_WHOLE_READ bytes it is read at once. A larger payload is verified in pieces and given as a view that reads
     on access; from a remote store it passes through an unnamed temporary file, so that every byte is fetched
     once. Raises CorruptRecordError as `read_record` does, UnreachableError if there is no room for that file.
     """
-    path = locate(path)
     if length <= MAX_WHOLE_READ:
         yield read_record(path, offset, length)
         return
@@ -242,12 +239,11 @@ def _verify(crc: int, footer: bytes, path: Location, offset: int) -> None:
         raise CorruptRecordError(path, offset, "the checksum of the record's data does not match")
 
 
-def write_shard(path: str | Path, records: Iterable[bytes]) -> int:
+def write_shard(path: Path, records: Iterable[bytes]) -> int:
     """Writes `records` as one TFRecord file and returns their number.
 
     The file appears under its name only when it is complete. Raises OSError, which names it.
     """
-    path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     count = 0
     try:

@@ -251,7 +251,10 @@ def test_flags_of_an_end_are_fields_of_their_own_beside_the_action(tmp_path):
     features |= {f"steps/action/{name}": feature for name, feature in number.items()}
     source = SimpleNamespace(features=features, location=tmp_path, check_keys=lambda *keys: None)
     flag = "terminate_episode"
-    assert choose_fields(source).vectors == {"action": ("steps/action/arm",), f"action.{flag}": (f"steps/action/{flag}",)}
+    assert choose_fields(source).vectors == {
+        "action": ("steps/action/arm",),
+        f"action.{flag}": (f"steps/action/{flag}",),
+    }
     assert choose_fields(source).names["action"] == ("arm_0", "arm_1")
 
 
