@@ -28,13 +28,12 @@ STATS = "stats.json"
 
 def write_dataset(
     spec: SimSpec, home: Path, lock: OutputLock, staging: Path, *, episodes: int, size: int, metadata: dict
-) -> Path:
+) -> None:
     """`<home>/<version>/` from the episodes in `staging`, which are then removed.
 
     `lock` is that of the dataset in `home`: who holds it may remove the staging directories of other settings. Raises
     DataError for episodes whose states have different widths: a dataset has one.
     """
-    scratch, final = lock.scratch, home / VERSION
     facts = [json.loads(facts_path(staging, i).read_text()) for i in range(episodes)]
     examples = {f["states"]: f["env"] for f in facts}
     if len(examples) > 1:
@@ -48,10 +47,10 @@ def write_dataset(
         return (record_path(staging, i).read_bytes() for i in range(first, end))
 
     frames = sum(f["frames"] for f in facts)
-    train = write_shards(scratch, spec.name, "train", range(episodes), frames, records)
+    train = write_shards(lock.scratch, spec.name, "train", range(episodes), frames, records)
     layout = ", ".join(f"{what} {dim}" for what, dim in spec.layout)
     write_info(
-        scratch,
+        lock.scratch,
         spec.name,
         build_features(spec, size, facts[0]["states"]),
         {"train": train},
@@ -60,10 +59,9 @@ def write_dataset(
         module="data_pipelines.simulators",
     )
     _write_stats(home / STATS, spec, size, facts)
-    publish(scratch, final)
+    publish(lock.scratch, home / VERSION)
     for left in home.glob(f".{VERSION}.episodes.*"):
         shutil.rmtree(left)
-    return final
 
 
 def _write_stats(path: Path, spec: SimSpec, size: int, facts: list[dict]) -> None:

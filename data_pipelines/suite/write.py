@@ -49,12 +49,9 @@ def build_features(spec: EmbodimentSpec) -> Any:
 
 def write_dataset(
     spec: EmbodimentSpec, directory: Path, *, episodes: Mapping[str, int], seed: int, metadata: Mapping[str, Any]
-) -> int:
-    """Simulates and writes a whole dataset into `directory`; returns its native frames.
-
-    `episodes` counts them by split, "train" among them. Not atomic: `generate` passes
-    a scratch directory.
-    """
+) -> None:
+    """Simulates and writes a whole dataset into `directory`. `episodes` counts them by split. Not atomic: `generate`
+    passes a scratch directory."""
     seeds = {split: episode_seeds(spec, count, seed, split) for split, count in episodes.items()}
     rollout = simulate(spec, np.concatenate(list(seeds.values())))
     written, first = {}, 0
@@ -72,7 +69,6 @@ def write_dataset(
         metadata={**metadata, "positions": list(spec.points)},
         module="data_pipelines.suite",
     )
-    return int(rollout.lengths.sum())
 
 
 def _records(spec: EmbodimentSpec, rollout: Rollout, start: int, stop: int) -> Iterator[bytes]:
