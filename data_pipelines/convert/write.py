@@ -31,7 +31,6 @@ from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_na
 from data_pipelines.sources.source import action_fields
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
-from hma_jax.runtime.locks import Held
 
 CONVERTER_VERSION = 1
 """Raise it when a converter writes other bytes for the same source."""
@@ -104,13 +103,7 @@ def convert(
     new = [directory for directory in (final.parent, Path(out)) if not directory.exists()]
     with ExitStack() as stack:
         stack.callback(_remove_empty, new)
-        try:
-            stack.enter_context(lock_output(final.with_name(f".{VERSION}")))
-        except Held as held:
-            raise Held(
-                f"another conversion is writing {final.parent} ({held.who}); wait until it has finished, or stop it",
-                held.holder,
-            ) from None
+        stack.enter_context(lock_output(final.with_name(f".{VERSION}"), called=final.parent))
         if final.exists():  # made by another process meanwhile
             return _finished(final, fingerprint, source, name)
         partial = final.with_name(f".{VERSION}.{fingerprint[:16]}.partial")

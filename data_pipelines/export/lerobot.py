@@ -43,7 +43,6 @@ from data_pipelines.sources.source import (
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash, to_strict_json
 from hma_jax.runtime.files import write_file
-from hma_jax.runtime.locks import Held
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -114,22 +113,17 @@ def export_lerobot(
     if final.exists():
         return _finished(final, settings)
     require_module("av", "writing videos")
-    try:
-        with lock_output(final):
-            if final.exists():  # made by another process meanwhile
-                return _finished(final, settings)
-            partial = final.with_name(_partial(final.name, stable_hash(settings)[:16]))
-            writer = _Writer(source, fields, partial, hz)
-            writer.write(file_bytes, progress)
-            writer.finish(settings)
-            publish(partial, final)
-            for other in final.parent.glob(_partial(glob.escape(final.name), "[0-9a-f]" * 16)):
-                shutil.rmtree(other, ignore_errors=True)  # begun with other settings, which nothing can finish any more
+    with lock_output(final):
+        if final.exists():  # made by another process meanwhile
             return _finished(final, settings)
-    except Held as held:
-        raise Held(
-            f"another process is writing {final} ({held.who}); wait until it has finished, or stop it", held.holder
-        ) from None
+        partial = final.with_name(_partial(final.name, stable_hash(settings)[:16]))
+        writer = _Writer(source, fields, partial, hz)
+        writer.write(file_bytes, progress)
+        writer.finish(settings)
+        publish(partial, final)
+        for other in final.parent.glob(_partial(glob.escape(final.name), "[0-9a-f]" * 16)):
+            shutil.rmtree(other, ignore_errors=True)  # begun with other settings, which nothing can finish any more
+        return _finished(final, settings)
 
 
 def _partial(name: str, settings: str) -> str:

@@ -39,12 +39,12 @@ class OutputLock:
 
 
 @contextmanager
-def lock_output(output: Path, *, wait: float = 0.0) -> Iterator[OutputLock]:
+def lock_output(output: Path, *, wait: float = 0.0, called: Path | None = None) -> Iterator[OutputLock]:
     """Holds the lock of `output`, whose parent directory is made if it is missing.
 
     Removes the scratch directories that dead holders left. While another process holds the lock: raises Held, which
-    names it, or waits first until it is released, `wait` seconds at most. By then `output` may exist: check again.
-    Raises OSError.
+    names it and `called` (default: `output`), as users know the output, or waits first until it is released, `wait`
+    seconds at most. By then `output` may exist: check again. Raises OSError.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -53,9 +53,13 @@ def lock_output(output: Path, *, wait: float = 0.0) -> Iterator[OutputLock]:
             try:
                 lock = stack.enter_context(exclusive(lock_file(output), lease=True, remove=True))
                 break
-            except Held:
+            except Held as held:
                 if time.monotonic() >= deadline:
-                    raise
+                    raise Held(
+                        f"another process is writing {called or output} ({held.who}); wait until it has finished, or "
+                        "stop it",
+                        held.holder,
+                    ) from None
                 time.sleep(next(pauses))
         for stale in output.parent.glob(f"{output.name}.scratch.*"):
             shutil.rmtree(stale, ignore_errors=True)

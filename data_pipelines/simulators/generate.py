@@ -31,7 +31,6 @@ from data_pipelines.simulators.write import write_dataset
 from data_pipelines.sources.rlds.schema import read_features
 from data_pipelines.sources.rlds.writer import VERSION
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.locks import Held
 
 GENERATOR_VERSION = 2
 """Raise it when simulation, behaviour, rendering or encoding change: datasets of older versions are then recognised
@@ -157,8 +156,9 @@ class _Run:
         """The jobs that a dataset still needs; if there are none, the dataset is finished here."""
         name = spec.name
         if not is_complete(self.root / name / VERSION, self.fingerprints[name]):
-            self.output_locks[name] = self.acquire(name)  # looked at again: another process may have made it by then
-        if is_complete(self.root / name / VERSION, self.fingerprints[name]):
+            lock = lock_output(self.root / name / f".{VERSION}", called=self.root / name)
+            self.output_locks[name] = self.stack.enter_context(lock)  # until the whole run ends
+        if is_complete(self.root / name / VERSION, self.fingerprints[name]):  # another process may have made it by then
             self.count(name, self.episodes)
             return []
         staging = self.staging(name)
@@ -169,18 +169,6 @@ class _Run:
             self.finish(spec)
         chunks = [missing[i : i + JOB_EPISODES] for i in range(0, len(missing), JOB_EPISODES)]
         return [Job(name, tuple(chunk), self.seed, self.size, str(staging)) for chunk in chunks]
-
-    def acquire(self, name: str) -> OutputLock:
-        """Held until the whole run ends. Raises Held."""
-        home = self.root / name
-        try:
-            return self.stack.enter_context(lock_output(home / f".{VERSION}"))
-        except Held as held:
-            raise Held(
-                f"{home}: {held.who} is making this dataset; wait until it has finished, stop it, or choose other "
-                "datasets",
-                held.holder,
-            ) from None
 
     def missing(self, name: str) -> list[int]:
         return [i for i in range(self.episodes) if not record_path(self.staging(name), i).is_file()]
