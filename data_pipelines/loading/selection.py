@@ -52,14 +52,10 @@ class LoaderConfig:
 
 @dataclass(frozen=True)
 class TrainingWindows:
-    """The windows a config draws from, and how often. `too_short` counts episodes per dataset."""
+    """The windows a config draws from, and how often."""
 
     sets: dict[str, WindowSet]
     mixture: Mixture
-
-    @property
-    def too_short(self) -> dict[str, int]:
-        return {name: s.too_short for name, s in self.sets.items() if s.too_short}
 
 
 def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:

@@ -65,7 +65,8 @@ class LeRobotMeta:
 def read_info(root: Path) -> dict[str, Any]:
     """info.json. Raises DataError, naming the field, for what is missing, damaged or of another version."""
     info_path = root / "meta" / "info.json"
-    info = _json(info_path)
+    missing = "give the root of a LeRobot dataset, with meta, data and videos."
+    info = read_object(info_path, if_missing=missing, advice=ADVICE)
     version = info.get("codebase_version")
     if version not in VERSIONS:
         raise DataError(
@@ -147,7 +148,8 @@ def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     names = [f"stats/{name}/{value}" for name in shapes for value in ("min", "max", "mean", "std")]
     known = False
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):  # 3.0
-        columns = [(name, column.to_pylist()) for name, column in _columns(path, names)]
+        table = read_table(path, names)
+        columns = [(name, table[name].to_pylist()) for name in names if name in table.column_names]
         digest.update(repr(columns).encode())
         known |= bool(columns)
     of_episodes = root / "meta" / "episodes_stats.jsonl"  # 2.1
@@ -155,11 +157,6 @@ def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     if statistics.exists():
         digest.update(retry(statistics, functools.partial(_hash_file, statistics)).encode())
     return digest
-
-
-def _columns(path: Path, columns: list[str]) -> list[tuple[str, Any]]:
-    table = read_table(path, columns)
-    return [(name, table[name]) for name in columns if name in table.column_names]
 
 
 def _hash_file(path: Path) -> str:
@@ -317,11 +314,6 @@ def _texts(row: Mapping[str, Any], where: str) -> tuple[str, ...]:
     if not isinstance(tasks, list):
         raise DataError(f"{where} has no usable 'tasks' ({quote(tasks)}). {ADVICE}")
     return tuple(map(str, tasks))
-
-
-def _json(path: Path) -> dict[str, Any]:
-    missing = "give the root of a LeRobot dataset, with meta, data and videos."
-    return read_object(path, if_missing=missing, advice=ADVICE)
 
 
 def _json_lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:

@@ -88,10 +88,10 @@ class RobomimicSource:
                 digest.update(f"{name}:".encode())
                 where = f"{self.path}: data/{name}"
                 with suppress(UnitError), damage_as(where):  # reading the demonstration says what is wrong
-                    rows = self.array(file["data"][name], "actions", where)
+                    rows = read_rows(file["data"][name], "actions", where)
                     digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
                     for camera in self.cameras:
-                        picture = read_rows(file["data"][name], f"obs/{camera}{self.ending}", slice(1), where)
+                        picture = read_rows(file["data"][name], f"obs/{camera}{self.ending}", where, slice(1))
                         digest.update(np.ascontiguousarray(picture).tobytes())
         return digest.hexdigest()[:16]
 
@@ -100,11 +100,11 @@ class RobomimicSource:
         where = f"{self.path}: data/{name}"
         with self.open() as file, damage_as(where):
             demo = file["data"][name]
-            actions = self.array(demo, "actions", where)
+            actions = read_rows(demo, "actions", where)
             steps = len(actions)
             images = {}
             for camera in self.cameras:
-                frames = self.array(demo, f"obs/{camera}{self.ending}", where)
+                frames = read_rows(demo, f"obs/{camera}{self.ending}", where)
                 if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) != steps:
                     raise UnitError(
                         f"{where}/obs/{camera}{self.ending} is {frames.dtype} {list(frames.shape)}; {steps} actions "
@@ -114,7 +114,7 @@ class RobomimicSource:
             vectors = {"action": actions.reshape(steps, -1)}
             for key in self.layout.vectors:
                 if key != "action":
-                    rows = self.array(demo, hdf5_path(key), where)
+                    rows = read_rows(demo, hdf5_path(key), where)
                     vectors[key] = rows.reshape(len(rows), -1)
             rewards = np.asarray(demo["rewards"]) if "rewards" in demo else None
             dones = np.asarray(demo["dones"]) if "dones" in demo else None
@@ -129,9 +129,6 @@ class RobomimicSource:
 
     def open(self) -> Any:
         return _open_file(self.path)
-
-    def array(self, demo: Any, key: str, where: str) -> np.ndarray:
-        return read_rows(demo, key, slice(None), where)
 
     def _read_layout(
         self, demo: Any, wanted: tuple[str, ...]
@@ -209,8 +206,8 @@ def damage_as(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
         raise kind(f"{where} is damaged ({error}). {advice}") from error
 
 
-def read_rows(demo: Any, key: str, rows: slice, where: str) -> np.ndarray:
-    """Some rows of a dataset of a demonstration. Raises UnitError, UnreachableError for a failing disk."""
+def read_rows(demo: Any, key: str, where: str, rows: slice = slice(None)) -> np.ndarray:
+    """Rows of a dataset of a demonstration. Raises UnitError, UnreachableError for a failing disk."""
 
     def read() -> np.ndarray:
         try:

@@ -100,7 +100,7 @@ class RobomimicDataset(EpisodeSource):
                 if "actions" in demo and len(frames) != len(demo["actions"]):
                     self._refuse(i, f"{len(frames)} frames of {camera!r} for {len(demo['actions'])} actions")
                 fields = {field_slice(key)[0] for key in keys}
-                record = {f: read_rows(demo, _path(f), slice(None), where) for f in fields}
+                record = {f: read_rows(demo, _path(f), where) for f in fields}
                 success = self._success(demo, where)
             actions = join_actions(
                 record, keys, self.features, len(frames),
@@ -116,13 +116,13 @@ class RobomimicDataset(EpisodeSource):
                 if key in self.features and self.features[key].image:
                     found[key] = _LazyFrames(self, i, key, len(_Frames(demo, _path(key, self._read.ending), where)))
                 elif key in self.features:
-                    found[key] = read_rows(demo, _path(key), slice(None), where).astype(np.float32).ravel()
+                    found[key] = read_rows(demo, _path(key), where).astype(np.float32).ravel()
                 elif key == INSTRUCTION_KEY:
                     found[key] = [self._read.task.encode()] * max(int(self._lengths[i]), 0)
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
                     found[key] = np.array([success], np.int64)
                 elif key == REWARD_KEY and "rewards" in demo:
-                    found[key] = read_rows(demo, "rewards", slice(None), where).astype(np.float32)
+                    found[key] = read_rows(demo, "rewards", where).astype(np.float32)
         return found
 
     @contextmanager
@@ -150,7 +150,7 @@ class RobomimicDataset(EpisodeSource):
 
     def _success(self, demo: Any, where: str) -> bool | None:
         rewards, dones = (
-            read_rows(demo, key, slice(None), where) if key in demo else None for key in ("rewards", "dones")
+            read_rows(demo, key, where) if key in demo else None for key in ("rewards", "dones")
         )
         return succeeded(rewards, dones)
 
@@ -178,7 +178,7 @@ class _Frames(Sequence[SourceFrame]):
         at = n // self._rows
         if at != self._at:
             rows = slice(at * self._rows, (at + 1) * self._rows)
-            self._at, self._block = at, read_rows(self._demo, self._key, rows, self._where)
+            self._at, self._block = at, read_rows(self._demo, self._key, self._where, rows)
             self.nbytes += self._block.nbytes
         return self._block[n - at * self._rows].copy()  # a view would keep the whole block as long as the frame is used
 
