@@ -42,9 +42,9 @@ class OutputLock:
 def lock_output(output: Path, *, wait: float = 0.0, called: Path | None = None) -> Iterator[OutputLock]:
     """Holds the lock of `output`, whose parent directory is made if it is missing.
 
-    Removes the scratch directories that dead holders left. While another process holds the lock: raises Held, which
-    names it and `called` (default: `output`), as users know the output, or waits first until it is released, `wait`
-    seconds at most. By then `output` may exist: check again. Raises OSError.
+    Removes the scratch directories that dead holders left. While another process holds the lock, waits for up to `wait`
+    seconds, then raises Held, which names that process and the output as it is `called` (default: `output`). After a
+    wait `output` may exist: check again. Raises OSError.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:

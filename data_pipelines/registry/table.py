@@ -62,9 +62,9 @@ def find_spec(name: str) -> DatasetSpec | None:
 
 
 def find_reader(own_name: str) -> DatasetSpec | None:
-    """The entry by which files are read that name their dataset so: one that joins it with others, or else the one
-    called so; None without either. Raises ConfigError if several join it, and for a dataset that is called as one that
-    others are joined to and it is not."""
+    """The entry that reads the files whose own name is `own_name`: one that joins them with others, or else the one
+    of that name, or None. Raises ConfigError if several entries join them, or if the entry of that name joins other
+    files only."""
     joining = [spec for spec in _table().values() if own_name in spec.joins]
     require(
         len(joining) <= 1,

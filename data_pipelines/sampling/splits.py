@@ -78,10 +78,10 @@ def held_out(dataset: str, ids: np.ndarray, amount: HeldOut) -> np.ndarray:
 def subset(
     dataset: str, ids: np.ndarray, members: np.ndarray, present: np.ndarray, count: int | None, salt: str
 ) -> np.ndarray:
-    """Positions in `present`, ascending, of the episodes among the `count` that are drawn.
+    """Positions in `present`, ascending, of those of `count` drawn episodes that are present.
 
-    Drawn from `members` (bool per entry of `ids`), whether they are `present` (numbers of episodes) or were skipped:
-    a skipped episode that is drawn is not replaced by another.
+    `members`: bool per entry of `ids`, the episodes to draw from; `present`: numbers of those that were not skipped. A
+    skipped episode that is drawn is not replaced by another.
     """
     numbers = np.flatnonzero(members)
     drawn = np.zeros(len(ids), bool)

@@ -50,9 +50,8 @@ def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
 
 
 def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: int) -> list[str] | None:
-    """What differs between the settings of the existing dataset and those asked for; [] if only the versions of the
-    packages or of the generator do. None if nothing differs, or the dataset is missing or incomplete and is made in any
-    case."""
+    """Which settings of the existing dataset differ from those asked for; [] if only the versions of the packages or of
+    the generator do. None if nothing differs, or if there is no complete dataset, so that one is made in any case."""
     if not directory.exists():
         return None
     metadata = read_metadata(directory)

@@ -38,7 +38,7 @@ class Layout:
     knows_success: bool
 
     def flat_features(self, unsupported_images: Mapping[str, tuple[int, ...]]) -> dict[str, FlatFeature]:
-        """The same fields as an `EpisodeSource` states them, after the `unsupported_images` with their shapes."""
+        """The fields as `EpisodeSource.features` has them, with the `unsupported_images` (key -> shape) first."""
         return {
             **{
                 step_key(key): FlatFeature(image=False, size=0, shape=shape)

@@ -48,8 +48,8 @@ class EpisodeEntry:
 class LeRobotMeta:
     """`features` as info.json has them; `tasks` by task_index.
 
-    `stated`: how many episodes there are by info.json. Where fewer are listed, `lost_why` is a message on it, else "".
-    `may_lose`: whether the numbers of those listed say which ones are lost, of at most MAX_LOST.
+    `stated`: the number of episodes that info.json says. `lost_why`: the message if fewer are listed, else "".
+    `may_lose`: whether the listed numbers show which ones are lost, and these are at most MAX_LOST.
     """
 
     version: str

@@ -149,9 +149,7 @@ class RobomimicDataset(EpisodeSource):
         raise EpisodeError(f"{self._where(i)}: {what}; leave it out with corrupt='skip'.").at(self.location, -1)
 
     def _success(self, demo: Any, where: str) -> bool | None:
-        rewards, dones = (
-            read_rows(demo, key, where) if key in demo else None for key in ("rewards", "dones")
-        )
+        rewards, dones = (read_rows(demo, key, where) if key in demo else None for key in ("rewards", "dones"))
         return succeeded(rewards, dones)
 
 

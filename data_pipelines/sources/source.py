@@ -255,8 +255,8 @@ def vector_sizes(features: Mapping[str, FlatFeature]) -> dict[str, int]:
 
 
 def action_fields(keys: Collection[str]) -> list[str]:
-    """Those of a step's fields `keys` that are its action, by their names: `action`, or else `actions`, as other
-    programs call it in LeRobot datasets, or else all `action/...` but flags (NO_ACTION)."""
+    """Which of a step's fields `keys` are its action, by their names: `action`, or else `actions`, as other programs
+    call it in LeRobot datasets, or else all `action/...` but flags (NO_ACTION)."""
     one = [key for key in ("action", "actions") if key in keys][:1]
     return one or [key for key in keys if key.startswith("action/") and not NO_ACTION.search(key)]
 

@@ -54,9 +54,9 @@ MIN_FRAME_BYTES = 4
 
 
 class Video:
-    """An opened video. `rate` in frames per second, `width` and `height` in pixels; `max_frames` is an
-    upper bound on its frames that follows from the file's size, whatever its header claims. It is asked for frames
-    `hz` times a second, 0: at any times."""
+    """An opened video. `rate` in frames per second, `width` and `height` in pixels. `max_frames` bounds the number of
+    its frames by the file's size, whatever its header claims. `hz`: frames are asked for at this rate; 0: at any
+    times."""
 
     def __init__(self, path: Path, container: Any, hz: float):
         self._path, self._container, self._hz = path, container, hz
@@ -79,7 +79,7 @@ class Video:
 
         Raises UnitError if none is within half a frame interval and half of 1 / `hz`.
         """
-        # Of a video with fewer frames than rows, a row could be given one that shows what the row's action did.
+        # If a video had fewer frames than rows, the nearest frame could show what the row's action did.
         near = 0.5 / max(self.rate, self._hz) + 1e-4
         before, after = self._neighbours
         if (

@@ -64,11 +64,11 @@ def _keys(spec: EmbodimentSpec) -> tuple[tuple[float, ...], ...]:
 def suite_starts(
     name: str, count: int, frames: int, *, stride: int | None = None, seed: int = 0, most: int | None = None
 ) -> list[Start]:
-    """The first `frames` frames of episodes that begin as the first `count` held-out ones of a suite made with `seed`:
-    of those that are long enough, at most of `most` of them (None: of all).
+    """The first `frames` frames of up to `most` episodes (None: all that are long enough), which begin as the first
+    `count` held-out ones of a suite made with `seed`.
 
-    Their actions are drawn anew: they are not those of the suite's episodes, and depend on `count`. A frame is seen
-    every `stride` native steps; None: as nearly twice a second as they can be.
+    Actions are drawn anew: they are not those of the suite's episodes, and depend on `count`. A frame is shown every
+    `stride` native steps; None: as near to FRAME_RATE as can be.
     """
     spec = SPECS[name]
     stride, numbers = stride or stride_of(spec.hz, FRAME_RATE), episode_seeds(spec, count, seed, "val")

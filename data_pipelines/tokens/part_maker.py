@@ -95,10 +95,8 @@ class PartMaker:
         self._done[part.number] = facts.lost
 
     def _is_finished(self, part: Part) -> bool:
-        """Whether a part is finished, by whichever process.
-
-        A part with skipped episodes, made when that was allowed, does not count where it is not: made again, it raises.
-        """
+        """Whether a part is finished, by whichever process. One with skipped episodes is not where none may be skipped:
+        made again, it raises the error."""
         if part.number not in self._done:
             facts = read_part(self.work, part)
             if facts is None or (facts.lost and not self.max_skipped):

@@ -37,8 +37,7 @@ PIECE = 2**22
 @dataclass(frozen=True)
 class ActionRange:
     """The range of each action value: `quantiles`, one row per `QUANTILES`, and the smallest and the largest value. All
-    are () without rows; `low` and `high` also if they are not needed, as the quantiles of all values vary or the values
-    are constant."""
+    are () without rows; `low` and `high` also where the quantiles of every value that varies do (`quantiles_vary`)."""
 
     quantiles: tuple[tuple[float, ...], ...] = ()
     low: tuple[float, ...] = ()
@@ -123,8 +122,8 @@ def _hashes(episodes: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def sampled_episodes(episodes: np.ndarray, steps: np.ndarray, limit: int = ROWS) -> np.ndarray:
-    """Positions in `episodes` (numbers in the dataset, with so many `steps` each) of those that the sample of all their
-    rows has rows of: a hash decides, so that the others need not be read."""
+    """Positions in `episodes` of those with a row in the sample. `episodes` are numbers in the dataset, `steps` the
+    rows of each. Hashes of these alone decide, so no row is read."""
     steps = np.asarray(steps, np.int64)
     hashes, owners = np.zeros(0, np.uint64), np.zeros(0, np.int64)
     pieces = np.flatnonzero(np.diff(np.cumsum(steps) // PIECE)) + 1

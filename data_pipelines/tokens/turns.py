@@ -1,7 +1,7 @@
 """Looks for wrapping angles in the actions that are tokenised, which are read anyway.
 
-No model can predict a value that jumps by a whole turn, and whoever finds it after training has lost the training. Owns
-what is remembered of the actions; what counts as such a jump is `registry.angles`. Changes nothing that is stored.
+No model can predict a value that jumps by a whole turn, and to find this after training costs the training. Owns what
+is remembered of the actions; `registry.angles` says what such a jump is. Changes nothing that is stored.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from hma_jax.config import require
 
 @dataclass(frozen=True)
 class WindowSlicer:
-    """Slices the windows of one dataset. Starts count stored frames (native frame = start x frame_step)."""
+    """Slices the windows of one dataset. A `start` is in stored frames: native frame start x frame_step."""
 
     frames: int  # T
     stride: int  # native frames per model frame

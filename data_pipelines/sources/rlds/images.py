@@ -18,7 +18,6 @@ BY_PILLOW = {"PNG": b"\x89PNG\r\n\x1a\n", "WebP": b"RIFF", "BMP": b"BM"}
 MAX_PIXELS = 2**25
 """Pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can claim billions."""
 
-
 MAX_THREADS = 8
 """Threads that decode frames, unless a user asks for more."""
 
