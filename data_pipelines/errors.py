@@ -56,6 +56,14 @@ class EpisodeError(DataError):
         return self
 
 
+def too_many_skipped(name: str, total: int, limit: int, last: str) -> DataError:
+    """The error for a dataset of which more episodes were skipped than may be; `last`: why the last one was."""
+    return DataError(
+        f"{name}: {total} episodes cannot be used, more than max_skipped={limit}. The last: {without_advice(last)} To use "
+        "the others, raise the limit: --set store.max_skipped=N."
+    )
+
+
 class CorruptRecordError(EpisodeError):
     """Bytes in a shard that are not what was written.
 

@@ -30,7 +30,8 @@ from data_pipelines.simulators.worker import Job, record_path
 from data_pipelines.simulators.write import write_dataset
 from data_pipelines.sources.rlds.schema import read_features
 from data_pipelines.sources.rlds.writer import VERSION
-from hma_jax.config import ConfigError, require
+from hma_jax.config import require
+from hma_jax.runtime.outputs import make_directory
 
 GENERATOR_VERSION = 2
 """Raise it when simulation, behaviour, rendering or encoding change: datasets of older versions are then recognised
@@ -109,12 +110,7 @@ def generate_sim(
     specs, root = select(names), Path(root)
     require_packages(specs)
     made_by_other_versions(root, specs, episodes, size, seed)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot make the directory {root}: {error.strerror}") from error
-    require(os.access(root, os.W_OK), f"cannot write to {root}: no permission; choose another directory")
-
+    make_directory(root)
     fingerprints = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
     with ExitStack() as locks:
         run = _Run(root, fingerprints, episodes, size, seed, progress, locks)

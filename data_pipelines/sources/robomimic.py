@@ -105,7 +105,7 @@ class RobomimicSource:
             images = {}
             for camera in self.cameras:
                 frames = read_rows(demo, f"obs/{camera}{self.ending}", where)
-                if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) != steps:
+                if not holds_images(frames) or len(frames) != steps:
                     raise UnitError(
                         f"{where}/obs/{camera}{self.ending} is {frames.dtype} {list(frames.shape)}; {steps} actions "
                         f"need uint8 images [{steps}, H, W, 3]. {ADVICE}"
@@ -140,7 +140,7 @@ class RobomimicSource:
         ending = "_image" if any(k.endswith("_image") for k in obs) else ""
         available = sorted(k.removesuffix(ending) for k in obs if k.endswith("_image"))
         if not ending:  # as in LIBERO's files, agentview_rgb
-            available = sorted(k for k in obs if obs[k].dtype == np.uint8 and obs[k].ndim == 4 and obs[k].shape[3] == 3)
+            available = sorted(k for k in obs if holds_images(obs[k]))
         if not available:
             raise DataError(
                 f"{where}/obs has no *_image nor other uint8 images (it holds {', '.join(sorted(obs)) or 'nothing'}): it is a "
@@ -204,6 +204,11 @@ def damage_as(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
             raise UnreachableError(f"{where} cannot be read ({error}). Run the same command again.") from error
         advice = ADVICE if kind is UnitError else "Download the file again."
         raise kind(f"{where} is damaged ({error}). {advice}") from error
+
+
+def holds_images(array: Any) -> bool:
+    """Whether it is uint8 [N, H, W, 3]."""
+    return array.dtype == np.uint8 and array.ndim == 4 and array.shape[3] == 3
 
 
 def read_rows(demo: Any, key: str, where: str, rows: slice = slice(None)) -> np.ndarray:

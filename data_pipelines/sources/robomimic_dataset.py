@@ -18,7 +18,7 @@ from data_pipelines.errors import EpisodeError
 from data_pipelines.names import snake_case
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds.schema import field_slice, step_key
-from data_pipelines.sources.robomimic import RobomimicSource, damage_as, hdf5_path, read_rows, succeeded
+from data_pipelines.sources.robomimic import RobomimicSource, damage_as, hdf5_path, holds_images, read_rows, succeeded
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
@@ -158,7 +158,7 @@ class _Frames(Sequence[SourceFrame]):
 
     def __init__(self, demo: Any, key: str, where: str):
         array = demo.get(key)
-        if array is None or array.dtype != np.uint8 or array.ndim != 4 or array.shape[3] != 3:
+        if array is None or not holds_images(array):
             what = "is not there" if array is None else f"is {array.dtype} {list(array.shape)}"
             raise EpisodeError(
                 f"{where}/{key} {what}; uint8 images [N, H, W, 3] were expected. Download the file again."

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from data_pipelines.errors import DataError, EpisodeError, without_advice
+from data_pipelines.errors import EpisodeError, too_many_skipped
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import FlatFeature, check_fields, field_slice
@@ -232,10 +232,7 @@ class EpisodeSource(ABC):
         self.skipped[reason] = self.skipped.get(reason, 0) + episodes
         total = sum(self.skipped.values())
         if total > self.max_skipped:
-            raise DataError(
-                f"{self.name}: {total} episodes cannot be used, more than max_skipped={self.max_skipped}. The last: "
-                f"{without_advice(reason)} To use the others, raise the limit: --set store.max_skipped=N."
-            )
+            raise too_many_skipped(self.name, total, self.max_skipped, reason)
 
 
 def same_rate(hz: float, other: float) -> bool:
@@ -307,25 +304,22 @@ def join_actions(
 
     Raises what `unusable` makes of a reason, for fields of another length and values that are not finite.
     """
+
+    def refuse(what: str) -> EpisodeError:
+        return unusable(f"{what}. Repair the episode, or read with corrupt='skip'.")
+
     columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
     for key in keys:
         field, part = field_slice(key)
         values, size = record.get(field, []), features[field].size
         if not isinstance(values, np.ndarray) or values.size != steps * size or not steps:
-            raise unusable(
-                f"{key!r} has {np.size(values)} values, but {steps} frames of {size} need "
-                f"{steps * size}. Repair the episode, or read with corrupt='skip'."
-            )
+            raise refuse(f"{key!r} has {np.size(values)} values, but {steps} frames of {size} need {steps * size}")
         if values.dtype.kind not in "biuf":
-            what = f"{key!r} contains no numbers, but {values.dtype}"
-            raise unusable(f"{what}. Repair the episode, or read with corrupt='skip'.")
+            raise refuse(f"{key!r} contains no numbers, but {values.dtype}")
         values = values.reshape(steps, size)[:, part].astype(np.float32)
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():
             step = int(np.flatnonzero(~finite)[0])
-            raise unusable(
-                f"{key!r} is not finite at step {step}: {values[step].tolist()}. "
-                "Repair the episode, or read with corrupt='skip'."
-            )
+            raise refuse(f"{key!r} is not finite at step {step}: {values[step].tolist()}")
         columns.append(values)
     return np.concatenate(columns, axis=1)

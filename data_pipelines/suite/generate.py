@@ -22,7 +22,8 @@ from data_pipelines.sources.rlds.writer import VERSION
 from data_pipelines.suite.embodiments import select
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import write_dataset
-from hma_jax.config import ConfigError, require
+from hma_jax.config import require
+from hma_jax.runtime.outputs import make_directory
 from hma_jax.runtime.parent import die_with
 
 GENERATOR_VERSION = 8
@@ -82,13 +83,7 @@ def generate_suite(
     require(fewest >= 1, f"the smallest number of episodes of a dataset must be at least 1, got {fewest}")
     require(workers >= 1, f"suite workers must be at least 1, got {workers}")
     specs, root = select(names), Path(root)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot make the suite's directory {root}: {error.strerror}") from error
-    if not os.access(root, os.W_OK):
-        raise ConfigError(f"cannot write to the suite's directory {root}: no permission; choose another")
-
+    make_directory(root)
     paths = [root / spec.name / VERSION for spec in specs]
     missing, finished = [], 0
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
-from data_pipelines.errors import DataError, without_advice
+from data_pipelines.errors import too_many_skipped
 from data_pipelines.publishing.output_lock import OutputLock, lock_output
 from data_pipelines.tokens.manifest import SPLITS, Manifest, SkippedEpisodes
 from data_pipelines.tokens.part_files import FACTS, Part, PartItem, read_part, write_part
@@ -112,8 +112,4 @@ class PartMaker:
         skipped = [*self.skipped, *chain.from_iterable(self._done.values()), *more]
         total = sum(entry.episodes for entry in skipped)
         if total > self.max_skipped:
-            raise DataError(
-                f"{self.plan.spec.name}: {total} episodes cannot be used, more than max_skipped={self.max_skipped}. "
-                f"The last: {without_advice(skipped[-1].reason)} To use the others, raise the limit: --set "
-                "store.max_skipped=N."
-            )
+            raise too_many_skipped(self.plan.spec.name, total, self.max_skipped, skipped[-1].reason)
