@@ -32,7 +32,7 @@ class Simulator(Protocol):
     def rest(self) -> np.ndarray:
         """float64 [A]: the neutral action, the mean of the random walk."""
 
-    def expert(self, rng: np.random.Generator) -> Expert | None:
+    def expert(self) -> Expert | None:
         """The expert for the episode just started; None where there is none."""
 
     def step(self, action: np.ndarray) -> tuple[float, bool]:
@@ -105,8 +105,7 @@ def record_episode(simulator: Simulator, spec: SimSpec, env: str, seed: int) -> 
     steps = int(rng.integers(spec.steps[0], spec.steps[1] + 1))
     simulator.start(env, seed)
     start = StartState(env, seed, tuple(simulator.physics().tolist()))
-    expert = simulator.expert(np.random.default_rng([seed, 2]))
-    behaviour = Behaviour(spec, simulator.low, simulator.high, simulator.rest(), expert, rng)
+    behaviour = Behaviour(spec, simulator.low, simulator.high, simulator.rest(), simulator.expert(), rng)
     frames, states, actions, rewards, reached = [], [], [], [], False
     for _ in range(steps):
         frames.append(simulator.frame())

@@ -117,7 +117,7 @@ def physics_starts(name: str, count: int, frames: int, *, stride: int, image_siz
         for number in new_seeds(name, count, seed, "starts"):
             world.reset(int(number))
             sim, rng = world.simulator, np.random.default_rng([int(number), 1])
-            behaviour = Behaviour(spec, sim.low, sim.high, sim.rest(), sim.expert(rng), rng)
+            behaviour = Behaviour(spec, sim.low, sim.high, sim.rest(), sim.expert(), rng)
             images, actions, reached = [world.render()], [], False
             for _ in range(frames - 1):
                 for _ in range(stride):

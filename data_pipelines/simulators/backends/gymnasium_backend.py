@@ -32,7 +32,7 @@ class Backend(PhysicsBackend):
         self.observation, reward, _, _, self.info = self.env.step(action)
         return float(reward), _success(self.info)
 
-    def expert(self, rng: np.random.Generator) -> Expert | None:
+    def expert(self) -> Expert | None:
         return EXPERTS[self.spec.expert](self) if self.spec.expert else None
 
     def vector(self) -> np.ndarray:

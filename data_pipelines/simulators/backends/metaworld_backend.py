@@ -31,7 +31,7 @@ class Backend(PhysicsBackend):
         self.observation, reward, _, _, info = self.env.step(part)
         return float(reward), bool(info["success"])
 
-    def expert(self, rng: np.random.Generator) -> Expert:
+    def expert(self) -> Expert:
         policy = ENV_POLICY_MAP[self.made]()
         return lambda: policy.get_action(self.observation.copy())  # some policies write into it
 

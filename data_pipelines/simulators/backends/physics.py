@@ -50,7 +50,7 @@ class PhysicsBackend(ABC):
     def advance(self, action: np.ndarray) -> tuple[float, bool]:
         """One step of the environment: (reward, whether the goal is reached)."""
 
-    def expert(self, rng: np.random.Generator) -> Expert | None:
+    def expert(self) -> Expert | None:
         return None
 
     def rest(self) -> np.ndarray:

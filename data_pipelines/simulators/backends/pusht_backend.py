@@ -24,7 +24,7 @@ class Backend:
     def rest(self) -> np.ndarray:
         return self.first
 
-    def expert(self, rng: np.random.Generator) -> Expert:
+    def expert(self) -> Expert:
         return pusht.expert(self.env)
 
     def step(self, action: np.ndarray) -> tuple[float, bool]:

@@ -79,7 +79,7 @@ class Backend(PhysicsBackend):
         _, reward, _, _ = self.env.step(action)
         return float(reward), bool(self.env._check_success())
 
-    def expert(self, rng: np.random.Generator) -> Expert | None:
+    def expert(self) -> Expert | None:
         return lift.expert(self) if self.spec.expert else None
 
     def rest(self) -> np.ndarray:

@@ -25,7 +25,7 @@ class Backend(PhysicsBackend):
         _, reward, _, _, info = self.env.step(action)
         return float(reward), bool(info["succeed"])
 
-    def expert(self, rng: np.random.Generator) -> Expert:
+    def expert(self) -> Expert:
         controller = PickPlaceController()
 
         def act() -> np.ndarray:

@@ -58,15 +58,7 @@ def _messages(path: Path) -> Iterator[Any]:
             records = _Refusing(file).load()
     except OSError as error:
         raise UnitError(f"{path}: the detections cannot be read ({error.strerror}). {ADVICE}") from error
-    except (
-        pickle.UnpicklingError,
-        EOFError,
-        ValueError,
-        IndexError,
-        TypeError,
-        KeyError,
-        AttributeError,
-    ) as error:
+    except (pickle.UnpicklingError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise UnitError(f"{path}: not a pickled list of bytes ({error}); it was not run. {ADVICE}") from error
     if not isinstance(records, list) or not all(isinstance(r, bytes) for r in records):
         raise UnitError(f"{path}: the pickle contains something other than a list of bytes. {ADVICE}")

@@ -21,6 +21,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -165,5 +166,4 @@ def _stretches(times: np.ndarray, max_gap: float) -> list[tuple[int, int]]:
     if not len(times):
         return []
     breaks = np.flatnonzero(np.diff(times) > max_gap + 1e-6) + 1
-    bounds = [0, *breaks.tolist(), len(times)]
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(pairwise([0, *breaks.tolist(), len(times)]))

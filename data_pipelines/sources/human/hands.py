@@ -10,6 +10,7 @@ a run is a target only. Long runs are cut into equal pieces without losing a ste
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def cut_episodes(
         # of the next.
         steps = stop - 1 - start
         bounds = np.linspace(start, stop - 1, -(-steps // max_steps) + 1).round().astype(int)
-        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+        for first, last in pairwise(bounds):
             rows = positions[first : last + 1]
             yield Episode(
                 origin=origin(int(first)),

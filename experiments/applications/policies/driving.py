@@ -78,7 +78,7 @@ def _drive_physics(
         for i, seed in enumerate(seeds):
             world.reset(int(seed))
             sim, rng = world.simulator, np.random.default_rng([int(seed), 13])
-            expert, half = sim.expert(rng), (sim.high - sim.low) / 2
+            expert, half = sim.expert(), (sim.high - sim.low) / 2
             misses = OrnsteinUhlenbeck(spec.action_dim, spec.tau * spec.hz / stride if play else JITTER, rng)
             for t in range(task.frames):
                 images[i, t], reached[i, t] = world.render(), world.success()

@@ -24,7 +24,7 @@ class Points:
     def rest(self) -> np.ndarray:
         return np.zeros_like(self.low)
 
-    def expert(self, rng: np.random.Generator):
+    def expert(self):
         return lambda: np.where(self.x < OPEN + 0.1, 1.0, 0.0)
 
     def step(self, action: np.ndarray) -> tuple[float, bool]:
