@@ -164,21 +164,7 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
     by_key = {a.key: a for a in facts.actions}
     keys = action_fields(by_key)
     if not keys:
-        parts = [f for f in facts.fields if f.key.partition("/")[0] in ("action", "actions")]
-        kept = ", ".join(f.key for f in parts if f.kind == "bytes")
-        lists = ", ".join(f.key for f in parts if f.kind == "list")
-        others = ", ".join(k for k in by_key if not NO_ACTION.search(k))
-        if kept:
-            why = (
-                f"{kept} is stored as bytes, which cannot be read; write the dataset again with encoding 'none' for it"
-            )
-        elif lists:
-            why = f"{lists} has no fixed length, so it cannot be read; write the dataset again with a fixed length"
-        else:
-            why = "no numeric field `action`"
-        if others:
-            why += f"; give the fields of the action in action_keys, from {others}"
-        return (), (), f"{why}: used as video without actions"
+        return (), (), f"{_why_no_action(facts)}: used as video without actions"
     names, dims, dropped = [], [], []
     for key in keys:
         hints = [d.hint for d in by_key[key].dimensions]
@@ -193,6 +179,20 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
     if others:
         about += f"; there are also {', '.join(others)}"
     return tuple(names), tuple(dims), about
+
+
+def _why_no_action(facts: Facts) -> str:
+    parts = [f for f in facts.fields if f.key.partition("/")[0] in ("action", "actions")]
+    kept = ", ".join(f.key for f in parts if f.kind == "bytes")
+    lists = ", ".join(f.key for f in parts if f.kind == "list")
+    others = ", ".join(a.key for a in facts.actions if not NO_ACTION.search(a.key))
+    if kept:
+        why = f"{kept} is stored as bytes, which cannot be read; write the dataset again with encoding 'none' for it"
+    elif lists:
+        why = f"{lists} has no fixed length, so it cannot be read; write the dataset again with a fixed length"
+    else:
+        why = "no numeric field `action`"
+    return f"{why}; give the fields of the action in action_keys, from {others}" if others else why
 
 
 def _choose_angles(facts: Facts, keys: Sequence[str], dims: Sequence[int]) -> tuple[tuple[int, ...], AngleUnit]:

@@ -69,14 +69,8 @@ def make_frame_loader(
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):
-            reasons[spec.name] = f"it has no {split} episode"
-            if split == "val":
-                h = held_out
-                bound = f"val_fraction={h.val_fraction:g}, min_val={h.min_val} and max_val={h.max_val} set how many are"
-                skipped = f"all {all_held_out.sum():,} held-out episodes of its {len(all_held_out):,} were skipped"
-                where = " in one of its parts" if spec.joins else ""
-                none = f"of {len(mask)} none is held out: this needs at least two{where}"
-                reasons[spec.name] += f": {skipped if all_held_out.any() else none}; {bound}"
+            why = f": {_why_none_held_out(spec, all_held_out, len(mask), held_out)}" if split == "val" else ""
+            reasons[spec.name] = f"it has no {split} episode{why}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)
         streams[spec.name] = _FrameStream(source, spec, episodes, order)
@@ -86,6 +80,17 @@ def make_frame_loader(
     batches = _FrameBatches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)
     threads = decoding_threads() if threads is None else threads
     return FrameLoader(batches, iterate(batches, start_step, threads, ahead=max(threads, PREFETCH_BATCHES)))
+
+
+def _why_none_held_out(spec: DatasetSpec, all_held_out: np.ndarray, readable: int, amount: HeldOut) -> str:
+    """Why none of the `readable` episodes is held out; `all_held_out`: bool of every episode, readable or not."""
+    bound = (
+        f"val_fraction={amount.val_fraction:g}, min_val={amount.min_val} and max_val={amount.max_val} set how many are"
+    )
+    if all_held_out.any():
+        return f"all {all_held_out.sum():,} held-out episodes of its {len(all_held_out):,} were skipped; {bound}"
+    where = " in one of its parts" if spec.joins else ""
+    return f"of {readable} none is held out: this needs at least two{where}; {bound}"
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,9 @@ EPISODE_COLUMNS = ("episodes", "steps")
 """Columns of `SplitFacts` with an entry per episode: up to millions, so no code loops over them."""
 
 ADDED_FIELDS = (
+    ("", "runs", []),
+    ("", "action_quantiles", []),
+    ("", "recipe", 1),
     ("spec", "rate", None),
     ("spec", "angles", []),
     ("spec", "angle_form", "as_recorded"),
@@ -47,8 +50,8 @@ ADDED_FIELDS = (
     ("spec", "joins", []),
     ("settings", "max_val_fraction", 0.5),
 )
-"""Fields that were added to the format, with the value that holds for older stores. A field that has this value is left
-out of the file and of the hash, so that older stores keep their hash."""
+"""Fields that were added to the format ("": to the manifest itself), with the value that holds for older stores. A
+field that has this value is left out of the file and of the hash, so that older stores keep their hash."""
 
 RECIPE_VERSION = 1
 """Raise it when a change to the code alters what `tokenize_job` stores of the same source: tokens of an older version
@@ -235,33 +238,25 @@ class Manifest:
                 f"{self.spec.name}: its tokens were made by an earlier version, which stored no quantiles of actions. "
                 "Remove the dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
-        first, last = action_range.quantiles[0], action_range.quantiles[-1]
-        pairs = zip(
-            first,
-            last,
-            action_range.low or first,
-            action_range.high or last,
+        first, last, vary = (
+            action_range.quantiles[0],
+            action_range.quantiles[-1],
             quantiles_vary(action_range.quantiles),
-            strict=True,
         )
-        chosen = [(a, b) if moving else (least, most) for a, b, least, most, moving in pairs]
-        return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
+        low = np.where(vary, first, action_range.low or first)
+        high = np.where(vary, last, action_range.high or last)
+        return tuple(low.tolist()), tuple(high.tolist())
 
     def hash(self) -> str:
         return stable_hash([self._facts(), list(self._digests().values())])
 
     def _facts(self) -> dict[str, Any]:
-        """All but the episode columns, as plain JSON. Fields that older versions did not write are left out where they
-        have their default: the hash of older stores stays the same."""
+        """All but the episode columns, without ADDED_FIELDS that have the value of older stores, as plain JSON."""
         values = to_dict(self._without_episodes())
-        for name in ("runs", "action_quantiles"):
-            if not values[name]:
-                del values[name]
-        if values["recipe"] == 1:
-            del values["recipe"]
         for group, field, default in ADDED_FIELDS:
-            if values[group][field] == default:
-                del values[group][field]
+            owner = values[group] if group else values
+            if owner[field] == default:
+                del owner[field]
         return values
 
     def _columns(self) -> dict[str, Column]:

@@ -33,7 +33,9 @@ class Moments:
 
     @classmethod
     def of(cls, rows: np.ndarray) -> Moments:
-        """The moments of `rows` [N, A], at least one."""
+        """The moments of `rows` [N, A]."""
+        if not len(rows):
+            return cls.none(rows.shape[1])
         rows = rows.astype(np.float64)
         mean = rows.mean(axis=0)
         square = ((rows - mean) ** 2).sum(axis=0)
@@ -60,6 +62,11 @@ class Moments:
         """Standard deviations over all rows."""
         return tuple(np.sqrt(np.asarray(self.square) / max(self.count, 1)).tolist())
 
+    @property
+    def row(self) -> np.ndarray:
+        """float64 [1 + 2 A]: count, means and squares, as `read_moments` gives them of one episode."""
+        return np.asarray([self.count, *self.mean, *self.square], np.float64)
+
 
 def merge_all(pieces: Iterable[Moments], dim: int) -> Moments:
     """The moments of all rows together, merged piece by piece."""
@@ -70,12 +77,6 @@ def merge_all(pieces: Iterable[Moments], dim: int) -> Moments:
 
 
 # --- Moments per episode, so that those of any subset of episodes can be computed ----------------
-
-
-def moments_row(actions: np.ndarray) -> np.ndarray:
-    """float64 [1 + 2 A]: count, means and squares of one episode's `actions` [N, A]."""
-    one = Moments.of(actions) if len(actions) else Moments.none(actions.shape[1])
-    return np.asarray([one.count, *one.mean, *one.square], np.float64)
 
 
 MOMENTS = "moments"

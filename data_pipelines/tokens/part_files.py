@@ -28,7 +28,7 @@ from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.beside import read_beside, write_beside
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, SkippedEpisodes, part_name
-from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, moments_row, read_moments
+from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, read_moments
 from data_pipelines.tokens.row_sample import RowSample, RowSampler, rows_of_part
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
@@ -90,24 +90,22 @@ def write_part(
         for split in SPLITS
     }
     skipped: list[SkippedEpisodes] = []
-    moments, rows, sampler = [], [], RowSampler(rows_of_part(part.count))
+    moments, sampler = [], RowSampler(rows_of_part(part.count))
     actions: dict[str, list[np.ndarray]] = {}
     for item in items:
         if isinstance(item, SkippedEpisodes):
             skipped.append(item)
             continue
         split, episode = item
-        if split == "train" and len(episode.actions):
+        if split == "train":
             moments.append(Moments.of(episode.actions))
             sampler.add(episode.actions, episode.episode)
-        if split == "train":
-            rows.append(moments_row(episode.actions))
         if split in keep_frames:
             actions.setdefault(split, []).append(np.asarray(episode.actions, np.float32))
         writers[split].add(episode)
     paths = {split: directory / part_name(split, part.number, part.count) for split in SPLITS}
-    if rows:
-        write_beside(paths["train"], MOMENTS, np.stack(rows), scratch)
+    if moments:
+        write_beside(paths["train"], MOMENTS, np.stack([one.row for one in moments]), scratch)
     for split, own in actions.items():
         write_beside(paths[split], ACTIONS, np.concatenate(own), scratch)
     splits = [writers[split].close() for split in SPLITS]

@@ -22,7 +22,7 @@ from data_pipelines.sources.rlds.location import read_through, retry
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
-from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
+from data_pipelines.tokens.moments import Moments, merge_exactly, read_moments
 from data_pipelines.tokens.part_files import read_actions
 from data_pipelines.tokens.row_sample import ActionRange, RowSampler, quantiles_vary, sampled_episodes
 from hma_jax.config import ConfigError
@@ -165,7 +165,7 @@ class TokenStore:
             with self._checking_not_replaced(name):
                 kept = read_moments(self._path(name, "train", part), self.manifest(name).train.parts[part])
             if kept is None:
-                rows += [moments_row(self.episode(name, "train", int(i)).actions) for i in own]
+                rows += [Moments.of(self.episode(name, "train", int(i)).actions).row for i in own]
             else:
                 rows.append(kept[own - (ends[part - 1] if part else 0)])
         return merge_exactly(np.concatenate([np.atleast_2d(x) for x in rows]), self.manifest(name).spec.action_dim)

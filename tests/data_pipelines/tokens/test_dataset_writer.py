@@ -19,7 +19,7 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.tokens.beside import beside
 from data_pipelines.tokens.dataset_writer import cut_parts
-from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, moments_row, read_moments
+from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, read_moments
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import write_rlds
@@ -344,7 +344,7 @@ def test_moments_of_pieces_are_those_of_the_whole():
 
 
 def test_moments_of_an_episode_of_one_action_and_of_as_many_episodes_as_asked_for(tmp_path):
-    np.testing.assert_array_equal(moments_row(np.array([[3.0, 4.0]])), [1, 3, 4, 0, 0])
+    np.testing.assert_array_equal(Moments.of(np.array([[3.0, 4.0]])).row, [1, 3, 4, 0, 0])
     np.save(beside(tmp_path / "part.array_record", MOMENTS), np.zeros((3, 5)))
     for episodes in (2, 4):
         with pytest.raises(DataError, match=f"of {episodes} episodes"):
