@@ -59,12 +59,9 @@ def read_groups(file: BinaryIO) -> list[RowGroup]:
     return groups
 
 
-def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
-    """Raises ValueError for a page of `chunks` (default: of all) whose header is damaged, that reaches out of its chunk
-    or the file, or that states an uncompressed size above both MAX_UNCOMPRESSED and MAX_COMPRESSION_RATIO times its
-    compressed size."""
-    if chunks is None:
-        chunks = [chunk for group in read_groups(file) for column in group.columns.values() for chunk in column]
+def check_pages(file: BinaryIO, chunks: Iterable[Chunk]) -> None:
+    """Raises ValueError for a page of `chunks` whose header is damaged, that reaches out of its chunk or the file, or
+    that states an uncompressed size above both MAX_UNCOMPRESSED and MAX_COMPRESSION_RATIO times its compressed size."""
     whole = file.seek(0, 2)
     for start, size in chunks:
         at, end = start, start + size

@@ -39,13 +39,13 @@ SHADOW = 0.06
 class View:
     """World to pixel, for one camera."""
 
-    def __init__(self, camera: Camera, size: int = IMAGE_SIZE):
+    def __init__(self, camera: Camera):
         turn = np.radians(camera.rotate)
         cos, sin = np.cos(turn), np.sin(turn)
-        self.size, self.turn = size, turn
+        self.size, self.turn = IMAGE_SIZE, turn
         self.rotation = np.array([[cos, -sin], [sin, cos]])
         self.centre = np.array(camera.centre)
-        self.scale = camera.zoom * size / 2 * np.array([1.0, camera.tilt])
+        self.scale = camera.zoom * IMAGE_SIZE / 2 * np.array([1.0, camera.tilt])
         """Pixels per world unit, across and down the image."""
 
     def points(self, point: np.ndarray) -> np.ndarray:

@@ -32,7 +32,6 @@ def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, otherwis
     DataError for a damaged file, UnreachableError where the disk fails.
     """
     path = beside(part, kind)
-
     try:
         data = retry(path, path.read_bytes)  # numpy takes a disk that fails in the middle for a file that ends there
     except FileNotFoundError:

@@ -53,8 +53,8 @@ def parse_record(
     payload: bytes | FileView,
     path: Location,
     offset: int,
-    keys: Collection[str] | None = None,
-    lazy: bool = False,
+    keys: Collection[str] | None,
+    lazy: bool,
 ) -> dict[str, Feature]:
     """`parse_example` of the record at byte `offset` of `path`, which a CorruptRecordError names."""
     try:

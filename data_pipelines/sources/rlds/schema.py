@@ -92,7 +92,7 @@ class SplitMetadata:
     shards: list[Location]
     shard_lengths: list[int]
     shard_splits: list[str]
-    file_format: str = "tfrecord"
+    file_format: str
 
 
 def resolve_version(directory: str | Location) -> Location:

@@ -8,7 +8,7 @@ import pytest
 from pyarrow import parquet
 
 from data_pipelines.sources import parquet_pages
-from data_pipelines.sources.parquet_pages import MAX_UNCOMPRESSED, check_pages
+from data_pipelines.sources.parquet_pages import MAX_UNCOMPRESSED, check_pages, read_groups
 
 
 def first_page(path) -> int:
@@ -18,7 +18,8 @@ def first_page(path) -> int:
 
 def check(path):
     with path.open("rb") as file:
-        check_pages(file)
+        columns = [column for group in read_groups(file) for column in group.columns.values()]
+        check_pages(file, [chunk for column in columns for chunk in column])
 
 
 @pytest.fixture(params=[("NONE", "1.0"), ("snappy", "2.0"), ("zstd", "1.0")], ids=lambda p: p[0])
