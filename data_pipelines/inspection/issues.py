@@ -57,23 +57,14 @@ def chosen_actions(facts: Facts, entry: DatasetSpec | None) -> list[ActionFacts]
 
 def _damaged(facts: Facts) -> list[Issue]:
     damaged = list(facts.damaged.items())
-    lost = [
-        Issue("error", "cannot be read", f"{count} of the episodes: {reason}") for reason, count in damaged[:MAX_LISTED]
-    ]
+    texts = [f"{count} of the episodes: {reason}" for reason, count in damaged[:MAX_LISTED]]
     if rest := sum(count for _, count in damaged[MAX_LISTED:]):
-        lost.append(
-            Issue("error", "cannot be read", f"{rest:,} more episodes, for {len(damaged) - MAX_LISTED} more reasons")
-        )
-    short = sum(n < 2 for n in facts.steps)
-    if short:
-        lost.append(
-            Issue(
-                "warning",
-                "single steps",
-                f"{short} of {facts.sampled} episodes have only one step, so they show no motion",
-            )
-        )
-    return lost
+        texts.append(f"{rest:,} more episodes, for {len(damaged) - MAX_LISTED} more reasons")
+    issues = [Issue("error", "cannot be read", text) for text in texts]
+    if short := sum(n < 2 for n in facts.steps):
+        text = f"{short} of {facts.sampled} episodes have only one step, so they show no motion"
+        issues.append(Issue("warning", "single steps", text))
+    return issues
 
 
 def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
@@ -102,19 +93,15 @@ def _rate(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
 
 def _windows(facts: Facts, windows: WindowFacts | None) -> list[Issue]:
     if windows is None:
-        return [
-            Issue(
-                "warning", "rate unknown", "no file contains the rate of the recording in frames per second: give --hz"
-            )
-        ]
+        text = "no file contains the rate of the recording in frames per second: give --hz"
+        return [Issue("warning", "rate unknown", text)]
     short = facts.sampled - windows.long_enough
     if not short:
         return []
     needs = f"the shortest window at stride {windows.stride} needs {windows.needed} steps"
     if not windows.long_enough:
-        return [
-            Issue("error", "no window", f"{needs}; the longest of {facts.sampled} episodes has {facts.lengths.longest}")
-        ]
+        text = f"{needs}; the longest of {facts.sampled} episodes has {facts.lengths.longest}"
+        return [Issue("error", "no window", text)]
     text = f"{needs}; {short} of {facts.sampled} episodes are shorter"
     return [Issue("warning", "short episodes", text)] if short > 0.1 * facts.sampled else []
 
@@ -149,13 +136,9 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Issue]:
     issues = []
     constant = [i for i, d in enumerate(field.dimensions) if d.hint == "constant"]
     if constant:
-        issues.append(
-            Issue(
-                "error" if len(constant) == len(field.dimensions) else "warning",
-                "constant action",
-                f"{_values(field, constant)} never change{'s' if len(constant) == 1 else ''}",
-            )
-        )
+        severity = "error" if len(constant) == len(field.dimensions) else "warning"
+        text = f"{_values(field, constant)} never change{'s' if len(constant) == 1 else ''}"
+        issues.append(Issue(severity, "constant action", text))
     broken = [i for i, d in enumerate(field.dimensions) if d.not_finite]
     if broken:
         count = sum(field.dimensions[i].not_finite for i in broken)
