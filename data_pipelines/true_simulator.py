@@ -75,7 +75,7 @@ class TrueSimulator(ABC, Generic[W]):
         """A world of this robot; it is reset before anything else."""
 
     def close_world(self, world: W) -> None:
-        """It is not used again: another robot's takes its place."""
+        """Ends a world that is not used again."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> TrueSimulator:
         """Itself, as a learned simulator."""
@@ -107,9 +107,8 @@ class TrueSimulator(ABC, Generic[W]):
         for b, start in zip(which, each, strict=True):
             now = self._worlds[b]
             again = now is not None and now[1].name == start.robot
-            if now is not None and not again:
-                self._worlds[b] = None
-                self.close_world(now[0])
+            if not again:
+                self._leave(b)
             world = now[0] if again else self.open_world(start.robot)
             world.reset(start.seed)
             for action in start.actions:
@@ -168,7 +167,13 @@ class TrueSimulator(ABC, Generic[W]):
 
     def close(self) -> None:
         """Ends all episodes, and gives back what draws them."""
-        self._worlds = [None] * len(self)
+        for b in range(len(self)):
+            self._leave(b)
+
+    def _leave(self, b: int) -> None:
+        left, self._worlds[b] = self._worlds[b], None
+        if left is not None:
+            self.close_world(left[0])
 
     def _begun(self, b: int) -> tuple[W, Robot]:
         world = self._worlds[b]

@@ -4,7 +4,6 @@ seed."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from data_pipelines.simulators.episode import Simulator
 from data_pipelines.simulators.packages import can_render, prepare_process, require_packages, why_unavailable
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.true_simulator import TrueSimulator
-from hma_jax.simulator.robots import Outside, Robot
+from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 PHYSICS = {spec.name: spec for spec in EMBODIMENTS if len(spec.envs) == 1}
@@ -81,27 +80,15 @@ class PhysicsWorld:
 class PhysicsSimulator(TrueSimulator[PhysicsWorld]):
     """B episodes, each in an environment of its own; `close` it after use."""
 
-    def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int = 64, outside: Outside = "clip"):
-        super().__init__(robots, episodes=episodes, image_size=image_size, outside=outside)
-        self._opened: list[PhysicsWorld] = []
-
     @staticmethod
     def dims() -> dict[str, int]:
         return {name: spec.action_dim for name, spec in PHYSICS.items()}
 
     def open_world(self, name: str) -> PhysicsWorld:
-        self._opened.append(PhysicsWorld(PHYSICS[name], self.image_size))
-        return self._opened[-1]
+        return PhysicsWorld(PHYSICS[name], self.image_size)
 
     def close_world(self, world: PhysicsWorld) -> None:
-        self._opened.remove(world)
         world.close()
-
-    def close(self) -> None:
-        super().close()
-        for world in self._opened:
-            world.close()
-        self._opened = []
 
 
 def new_seeds(name: str, count: int, seed: int, split: str) -> np.ndarray:
