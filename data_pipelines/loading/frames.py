@@ -108,9 +108,8 @@ class FrameLoader(Iterator[np.ndarray]):
         return self.batches.describe(step)
 
     def episodes(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """(dataset, episode as drawn, by numbers), int64 [B] each, of every frame of batch `step`: frames of one
-        episode are no independent ones. Under 'skip' a damaged episode keeps its number, though another is read for
-        it."""
+        """(dataset, drawn episode), numbers, int64 [B] each, of every frame of batch `step`: frames of one episode are
+        not independent. Under 'skip' a damaged episode keeps its number, though another is read in its place."""
         return self.batches.episodes(step)
 
 

@@ -78,7 +78,7 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
 
 
 def count_trajectories(store: TokenStore, config: LoaderConfig) -> dict[str, int]:
-    """{dataset: trajectories that windows are drawn of}: of a subset, fewer than asked where some were skipped."""
+    """How many trajectories windows are drawn from, by dataset: fewer than the cap where some were skipped."""
     names = config.datasets or store.names
     return {name: len(_windows(store, name, config, config.max_trajectories).episodes) for name in names}
 

@@ -65,8 +65,8 @@ def to_toml(spec: DatasetSpec) -> str:
 
 
 def put_entry(text: str, spec: DatasetSpec, where: str) -> str:
-    """The text of a file of entries with this one at its end, or in place of that of the same name; all else stays, and
-    comments outside of that one too. ConfigError, naming `where`, for a text in which no place is found."""
+    """`text`, a file of entries, with that of `spec` at its end or in place of the one of the same name. All else
+    stays, comments outside that entry too. Raises ConfigError, naming `where`, if no place is found."""
     lines = [f"{line}\n" for line in text.splitlines()]
     headings = {i: m[1] or m[2] or m[3] for i, line in enumerate(lines) if (m := _HEADING.fullmatch(line.rstrip()))}
     begin = next((i for i, name in headings.items() if name == spec.name), len(lines))

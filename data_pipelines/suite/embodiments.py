@@ -1,9 +1,9 @@
 """The fifty robots of the suite, and the order in which a study adds them.
 
 The order matters: scaling over datasets takes the first 5, 10, 20 and 40, and judges on the first
-five. It is a rule, not a choice: in each of five rounds every trained family gives one robot, the
-families in an order drawn by hash, its robots too, but those whose dataset is video alone, which
-come last since no action of theirs can be judged. So every prefix is of many families and sizes.
+five. It follows from a rule: in each of five rounds every trained family gives one robot. A hash draws
+the order of the families in a round and of the robots in a family, except that those whose dataset is
+video alone come last, as their actions cannot be judged. So every prefix has many families and sizes.
 """
 
 from __future__ import annotations

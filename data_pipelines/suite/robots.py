@@ -143,8 +143,8 @@ def claw(fingers: int, phalanges: int, *, length: float, radius: float) -> Body:
 
     def finger(angle: float) -> Body:
         links = [
-            Link(parent=i - 1, joint=i, angle=0.0 if i else angle, length=length * 0.9**i, radius=radius * 0.92**i, paint=2,
-                 touches=True)
+            Link(parent=i - 1, joint=i, angle=0.0 if i else angle, length=length * 0.9**i, radius=radius * 0.92**i,
+                 paint=2, touches=True)
             for i in range(phalanges)
         ]  # fmt: skip
         return Body(tuple(links), (Joint(-0.7, 0.7, 3.5),) * phalanges, (), ())

@@ -47,7 +47,7 @@ class ChoiceSettings:
 
 @dataclass(frozen=True)
 class EvalManifest:
-    """A frozen choice of held-out windows. Datasets are sorted by name. The fields that are compared name it."""
+    """A frozen choice of held-out windows. Datasets are sorted by name. Its hash is over the compared fields."""
 
     frames: int  # T
     seed: int
@@ -135,9 +135,8 @@ def freeze_manifest(
 ) -> EvalManifest:
     """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.
 
-    Windows of short episodes have at least the `prompt` frames and one more; all are whole without a prompt, or where
-    it fills the window, as that of a policy may.
-    Windows are disjoint, so that standard errors do not count the same pixels twice.
+    A window has at least `prompt` + 1 real frames; all `frames` without a prompt, or where it fills the window, as that
+    of a policy may. Windows are disjoint, so that standard errors do not count the same pixels twice.
     DIFFERS: the release evaluates the first windows of each dataset (reference section 6.1).
 
     Raises DataError if no dataset has a window.
