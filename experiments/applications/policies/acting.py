@@ -9,8 +9,9 @@ import jax
 import numpy as np
 
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.network import as_floats, downsample_uint8
+from experiments.applications.policies.network import Params, as_floats, downsample_uint8
 from experiments.applications.policies.policy import Counts
+from hma_jax.config import require
 
 STILL = 1e-4
 """A dimension with a smaller standard deviation in the demonstrations counts as constant."""
@@ -61,16 +62,32 @@ def frames_of(examples: Mapping[str, jax.Array], index: jax.Array) -> jax.Array:
     return as_floats(examples["images"][examples["episode"][index][:, None], examples["seen"][index]])
 
 
-class ChunkPolicy:
-    """A policy that looks at the last frames, plans normalised actions and executes the first of them.
+@dataclass(frozen=True)
+class ChunkConfig:
+    """A policy that sees the last `frames` and plans `chunk` actions, of which it executes the first `execute`."""
 
-    Subclasses implement the network: `plan(frames [n, frames, H, W, 3], seeds, steps)` gives [n, chunk, A].
+    frames: int = 2
+    chunk: int = 1
+    execute: int = 1
+
+    def __post_init__(self):
+        require(self.frames >= 1, f"a policy must see at least 1 frame, got {self.frames}")
+        require(
+            1 <= self.execute <= self.chunk,
+            f"execute must lie in 1..{self.chunk}, the actions of a chunk, got {self.execute}",
+        )
+
+
+class ChunkPolicy:
+    """A trained network that plans normalised actions, acting.
+
+    Subclasses implement the network: `plan(frames [n, frames, H, W, 3], seeds, steps)` gives [n, chunk * A].
     """
 
     kind = ""
 
-    def __init__(self, frames: int, execute: int, scale: Scale):
-        self.frames, self.execute, self.scale = frames, execute, scale
+    def __init__(self, config: ChunkConfig, params: Params, scale: Scale):
+        self.config, self.params, self.scale = config, params, scale
         self._counts = Counts()
         self._seen: np.ndarray | None = None  # [B, frames, H, W, 3]
         self._fresh: np.ndarray | None = None  # bool [B]: the next image is the first
@@ -87,17 +104,18 @@ class ChunkPolicy:
 
     def act(self, images: np.ndarray) -> np.ndarray:
         if self._seen is None or len(self._seen) != len(images):
-            self._seen = np.repeat(images[:, None], self.frames, 1)
+            self._seen = np.repeat(images[:, None], self.config.frames, 1)
             self._fresh, self._left = np.ones(len(images), bool), [[] for _ in images]
         self._seen = np.concatenate([self._seen[:, 1:], images[:, None]], 1)
         self._seen[self._fresh] = images[self._fresh, None]
         self._fresh[:] = False
         counted = [self._counts.next(b) for b in range(len(images))]
         if not all(self._left):  # one call for all: programs are compiled for one size
-            planned = self.scale.raw(self.plan(self._seen, [s for s, _ in counted], [n for _, n in counted]))
+            planned = self.plan(self._seen, [s for s, _ in counted], [n for _, n in counted])
+            planned = self.scale.raw(planned.reshape(len(images), self.config.chunk, -1))
             for b, left in enumerate(self._left):
                 if not left:
-                    left.extend(planned[b, : self.execute])
+                    left.extend(planned[b, : self.config.execute])
         return np.stack([left.pop(0) for left in self._left])
 
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:

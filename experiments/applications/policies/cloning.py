@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.applications.policies.acting import ChunkPolicy, Scale, frames_of, make_examples, scale_of
+from experiments.applications.policies.acting import ChunkConfig, ChunkPolicy, frames_of, make_examples, scale_of
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.learning import FitConfig, Report, fit
 from experiments.applications.policies.network import (
@@ -28,27 +28,16 @@ from experiments.applications.policies.network import (
     mlp,
     stack_frames,
 )
-from hma_jax.config import require
 from hma_jax.kernels.random import key_of
 
 
 @dataclass(frozen=True)
-class BcConfig:
+class BcConfig(ChunkConfig):
     """A policy and its training."""
 
-    frames: int = 2
-    chunk: int = 1
-    execute: int = 1
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     light: float = 0.03  # standard deviation by which the light of a training example differs, in [-1, 1]
-
-    def __post_init__(self):
-        require(self.frames >= 1, f"a policy must see at least 1 frame, got {self.frames}")
-        require(
-            1 <= self.execute <= self.chunk,
-            f"execute must lie in 1..{self.chunk}, the actions of a chunk, got {self.execute}",
-        )
 
 
 def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
@@ -93,13 +82,8 @@ class ClonedPolicy(ChunkPolicy):
 
     kind = "cloned"
 
-    def __init__(self, config: BcConfig, params: Params, scale: Scale):
-        super().__init__(config.frames, config.execute, scale)
-        self.config, self.params = config, params
-
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
-        out = np.asarray(_act(self.params, self.config, frames))
-        return out.reshape(len(frames), self.config.chunk, -1)
+        return np.asarray(_act(self.params, self.config, frames))
 
 
 def clone(demos: Demonstrations, config: BcConfig, seed: int, report: Report) -> ClonedPolicy:

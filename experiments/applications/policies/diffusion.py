@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.applications.policies.acting import ChunkPolicy, Scale, frames_of, make_examples, scale_of
+from experiments.applications.policies.acting import ChunkConfig, ChunkPolicy, Scale, frames_of, make_examples, scale_of
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.learning import FitConfig, Report, fit
 from experiments.applications.policies.network import (
@@ -52,10 +52,9 @@ the action of a gripper that is closed in few frames."""
 
 
 @dataclass(frozen=True)
-class DiffusionConfig:
+class DiffusionConfig(ChunkConfig):
     """A policy and its training."""
 
-    frames: int = 2
     chunk: int = 4
     execute: int = 2
     levels: int = 100
@@ -68,10 +67,7 @@ class DiffusionConfig:
     light: float = 0.03
 
     def __post_init__(self):
-        require(
-            1 <= self.execute <= self.chunk,
-            f"execute must lie in 1..{self.chunk}, the actions of a chunk, got {self.execute}",
-        )
+        super().__post_init__()
         require(
             1 <= self.samples <= self.levels,
             f"the number of denoising steps must lie in 1..{self.levels}, the noise levels, got {self.samples}",
@@ -172,13 +168,8 @@ class DiffusionPolicy(ChunkPolicy):
 
     kind = "diffusion"
 
-    def __init__(self, config: DiffusionConfig, params: Params, scale: Scale):
-        super().__init__(config.frames, config.execute, scale)
-        self.config, self.params = config, params
-
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
         size = self.config.chunk * len(self.scale.mean)
         start = [np.random.default_rng([s, n, 14]).standard_normal(size) for s, n in zip(seeds, steps, strict=True)]
         limits = bounds(self.config, self.scale)
-        out = np.asarray(_act(self.params, self.config, frames, np.asarray(start, np.float32), limits))
-        return out.reshape(len(frames), self.config.chunk, -1)
+        return np.asarray(_act(self.params, self.config, frames, np.asarray(start, np.float32), limits))
