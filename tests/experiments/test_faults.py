@@ -24,7 +24,6 @@ from experiments.running import trial_main
 from experiments.running.attempts import AttemptEnd, State, outcome
 from experiments.running.shared_runs import SharedTraining
 from experiments.running.workspace import Workspace
-from hma_jax.evaluation import evaluate as evaluation
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
 from hma_jax.training.log import RunLog
@@ -36,24 +35,6 @@ from tests.experiments.test_cli_errors import ARM, LENGTHS, SMOKE, idle_training
 from tests.full_disk import full_disk
 
 STEPS = ("--set", "tokenizer_train.steps=4", "--set", "train.steps=4")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def shared_evaluators():
-    """Every command reads the tokenizer anew, whose decoder is then another function, of which the whole evaluation was
-    traced again."""
-    made, make = {}, evaluation.make_evaluator
-
-    def shared(*settings):
-        *others, decode, piece = settings
-        key = (*others, decode.__self__.identity, piece)
-        if key not in made:
-            made[key] = make(*settings)
-        return made[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "make_evaluator", shared)
-        yield
 
 
 @pytest.fixture(scope="module")
