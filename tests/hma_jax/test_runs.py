@@ -42,7 +42,7 @@ OLD_LOSSES = [
 ]  # fmt: skip
 """Of six steps by that version."""
 
-AVERAGED = train_config(steps=2, batch=4, ema_decay=0.75)
+AVERAGED = train_config(steps=2, batch=4, ema_decay=0.2)
 
 
 @pytest.fixture

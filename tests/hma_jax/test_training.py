@@ -206,8 +206,8 @@ def test_every_step_counts_robots_that_were_present(tmp_path: Path):
         for batch in usual(start):
             yield batch | {"embodiment": np.zeros_like(batch["embodiment"])}
 
-    state = train(tmp_path, make=only_pusher, config=dataclasses.replace(train_config(), steps=3)).state
-    assert state.opt_state.count_E["always"].tolist() == [3, 0, 0]
+    state = train(tmp_path, make=only_pusher).state
+    assert state.opt_state.count_E["always"].tolist() == [6, 0, 0]
 
 
 def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):

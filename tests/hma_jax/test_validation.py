@@ -37,7 +37,7 @@ def held_out():
 
 def run(run_dir: Path, validation: Validation | None):
     return train_model(
-        MODEL, TABLE, train_config(batch=4, ema_decay=0.75), batches(MODEL, 4), run_dir=run_dir, provenance={},
+        MODEL, TABLE, train_config(batch=4, ema_decay=0.2), batches(MODEL, 4), run_dir=run_dir, provenance={},
         options=LoopOptions(log_every=1), validation=validation,
     )  # fmt: skip
 
