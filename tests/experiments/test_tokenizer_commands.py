@@ -35,6 +35,12 @@ def arm(tmp_path_factory) -> str:
     return str(write_rlds(tmp_path_factory.mktemp("rlds"), ARM, LENGTHS))
 
 
+@pytest.fixture(autouse=True)
+def few_frames(monkeypatch):
+    """Of which a tokenizer's quality is measured."""
+    monkeypatch.setattr("experiments.preparing.tokenizer.QUALITY_FRAMES", 8)
+
+
 def hma(*arguments: object) -> int:
     return main([str(a) for a in arguments])
 
