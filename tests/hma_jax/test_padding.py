@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +46,7 @@ def spoilt(batch: dict, other: int) -> dict:
     return batch | changed | {"real": REAL}
 
 
+@cache
 def step_of(model, masking):
     declared, params = lively_params(model)
     config = train_config(batch=len(LENGTHS), masking=masking)

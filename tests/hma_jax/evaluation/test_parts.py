@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_jax.config import DecodeConfig, EvalConfig
 from hma_jax.evaluation import evaluate as evaluation
 from hma_jax.evaluation.evaluate import Evaluation, evaluate
 from hma_jax.evaluation.parts import Parts
-from tests.hma_jax.evaluation.fakes import GreyTokenizer, make_batches
-from tests.tiny import TABLE, lively_params, model_config
-
-CONFIG = model_config()
-PROTOCOL = EvalConfig(prompt_frames=2, decode=DecodeConfig(2, temperature=0.5))
+from tests.hma_jax.evaluation.fakes import make_batches
+from tests.hma_jax.evaluation.test_evaluate import CONFIG, EVAL, TOKENIZER
+from tests.tiny import TABLE, lively_params
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +34,7 @@ def run(params, parts: Parts | None, stop_after: int = 100) -> Evaluation:
             raise KeyboardInterrupt
 
     return evaluate(
-        params, CONFIG, TABLE, GreyTokenizer(), make_batches(CONFIG, each=6), PROTOCOL, progress=progress, parts=parts
+        params, CONFIG, TABLE, TOKENIZER, make_batches(CONFIG, each=6), EVAL, progress=progress, parts=parts
     )
 
 
