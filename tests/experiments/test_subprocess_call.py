@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
-from data_pipelines.registry import find_spec, register
+from data_pipelines.registry import find_spec, get_spec, register
 from data_pipelines.registry import table as registry_table
 from data_pipelines.sources.convertible import UnitError
 from experiments import run_study
@@ -28,7 +28,7 @@ from hma_jax.training.checkpoints import SaveError
 from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted
 from hma_jax.training.reading import CheckpointError
-from tests.data_pipelines.fakes import make_spec
+from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.called_in_subprocess import end_by, fail, work_until_asked
 
 
@@ -116,8 +116,9 @@ main(sys.argv[1:])
 @pytest.mark.beside
 def test_a_study_has_given_back_its_accelerators_when_its_trials_begin(tmp_path):
     arguments = [
-        "sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path), "--set", "trajectory_counts=4",
-        "--set", "tokenizer_train.steps=2", "--set", "suite.scale=0.02",
+        "sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path / "out"),
+        "--data", str(write_rlds(tmp_path, get_spec("berkeley_gnm_cory_hall"), [12] * 6)),
+        "--set", "trajectory_counts=4", "--set", "tokenizer_train.steps=2",
     ]  # fmt: skip
     environment = {name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"}
     done = subprocess.run(

@@ -13,6 +13,7 @@ import pytest
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.training.reading import find_damage, list_steps
+from tests.integration.train_slowly import train
 
 pytestmark = pytest.mark.exact
 
@@ -56,6 +57,7 @@ def test_a_killed_run_continued_is_byte_equal_to_one_never_killed(tmp_path: Path
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """In this process, which compiles as those do."""
     directory = tmp_path_factory.mktemp("whole")
-    finish(directory)
+    train(directory)
     return directory

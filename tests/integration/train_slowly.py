@@ -14,15 +14,19 @@ def announce(step: int, steps: int, metrics: dict) -> None:
     time.sleep(0.05)
 
 
-if __name__ == "__main__":
+def train(run_dir: Path) -> None:
     model = model_config(**SMALLER)
     train_model(
         model,
         TABLE,
         train_config(steps=12),
         batches(model),
-        run_dir=Path(sys.argv[1]),
+        run_dir=run_dir,
         provenance={},
         options=LoopOptions(checkpoint_every=3, log_every=1),
         progress=announce,
     )
+
+
+if __name__ == "__main__":
+    train(Path(sys.argv[1]))
