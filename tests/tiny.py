@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, MupConfig, OptimizerConfig, TrainConfig
@@ -104,6 +103,6 @@ def lively_params(config: ModelConfig, table=TABLE, scale: float = 0.2):
     rng = np.random.default_rng(2)  # not jax.random, which compiles a program for every shape
 
     def moved(x: jax.Array) -> jax.Array:
-        return jnp.asarray(np.asarray(x) + scale * rng.standard_normal(x.shape, dtype=np.float32))
+        return jax.device_put(np.asarray(x) + scale * rng.standard_normal(x.shape, dtype=np.float32))
 
     return declared, jax.tree.map(moved, params)
