@@ -73,7 +73,7 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
 def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(monkeypatch):
     """Where the likeliest ids are taken, the first r frames of r rounds each are what the model says after its own."""
     monkeypatch.setattr(own_past, "choose_sampled", lambda *_: choose_likeliest)
-    config = shallow_config(action_heads=False)
+    config = shallow_config(action_heads=False, frames=4)
     declared, params = lively_params(config, scale=0.5)
     model, rows = declared.merge(params), 8
     batch = random_batch(0, config, rows)
