@@ -116,9 +116,7 @@ def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: i
 
 def plot_memory(timings: Sequence[LoadTiming], path: Path) -> None:
     """Resident memory over what was drawn, a panel per stage."""
-    import matplotlib.pyplot as plt
-
-    from experiments.report.plot_style import COLOURS, STYLE, save
+    from experiments.report.plot_style import COLOURS, STYLE, plt, save
 
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(

@@ -119,9 +119,7 @@ def judge(
 
 def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
     """PSNR and delta PSNR over the time per frame, every point named."""
-    import matplotlib.pyplot as plt
-
-    from experiments.report.plot_style import COLOURS, DEFAULT, STYLE, plain_log, save
+    from experiments.report.plot_style import COLOURS, DEFAULT, STYLE, plain_log, plt, save
 
     cost = "milliseconds_per_frame"
     with plt.rc_context(STYLE):

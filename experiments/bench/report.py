@@ -36,9 +36,7 @@ def _row(stage: Stage, record: BenchRecord) -> str:
 
 def plot_records(records: Sequence[BenchRecord], path: Path) -> None:
     """A panel per record: the median of every stage as a bar, up to its p90 as a line."""
-    import matplotlib.pyplot as plt
-
-    from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, save
+    from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, plt, save
 
     heights = [0.9 + 0.3 * len(record.stages) for record in records]
     with plt.rc_context(STYLE | {"axes.grid": False}):

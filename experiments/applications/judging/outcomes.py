@@ -6,6 +6,7 @@ import csv
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,9 @@ class Outcome:
     success: bool
 
 
+COLUMNS = [f.name for f in dataclasses.fields(Outcome)]
+
+
 def judge_rollout(
     rollout: Rollout,
     head: Head,
@@ -63,8 +67,7 @@ def successes(outcomes: Iterable[Outcome], policies: Sequence[str], world: str, 
 
 
 def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
-    names = [f.name for f in dataclasses.fields(Outcome)]
-    write_table(path, names, ([*dataclasses.astuple(o)[:-1], int(o.success)] for o in outcomes))
+    write_table(path, COLUMNS, ([*dataclasses.astuple(o)[:-1], int(o.success)] for o in outcomes))
 
 
 def read_outcomes(path: Path) -> list[Outcome]:
@@ -72,16 +75,10 @@ def read_outcomes(path: Path) -> list[Outcome]:
     try:
         with open(path, newline="") as file:
             return [
-                Outcome(
-                    r["policy"],
-                    int(r["start"]),
-                    int(r["number"]),
-                    int(r["seed"]),
-                    r["world"],
-                    r["judge"],
-                    r["success"] == "1",
+                Outcome(policy, int(start), int(number), int(seed), world, judge, success == "1")
+                for policy, start, number, seed, world, judge, success in map(
+                    itemgetter(*COLUMNS), csv.DictReader(file)
                 )
-                for r in csv.DictReader(file)
             ]
     except (OSError, ValueError, KeyError, TypeError) as error:  # TypeError: a row that was cut short
         raise ConfigError(f"{path} cannot be read as outcomes ({error}); run `hma judge` again") from error

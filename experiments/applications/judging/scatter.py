@@ -72,14 +72,11 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
                 x, y = rates[across], rates[column]
                 if x["mean"] is None:  # not counted on the real robot
                     continue
-                spread = (
-                    [[x["mean"] - x["low"]], [x["high"] - x["mean"]]],
-                    [[y["mean"] - y["low"]], [y["high"] - y["mean"]]],
+                across_error, up_error = (
+                    np.maximum([[r["mean"] - r["low"]], [r["high"] - r["mean"]]], 0) for r in (x, y)
                 )
-                panel.errorbar(
-                    x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
-                    color=COLOURS[kinds[name]][1], elinewidth=0.8, markersize=5,
-                )  # fmt: skip
+                look = {"fmt": "o", "color": COLOURS[kinds[name]][1], "elinewidth": 0.8, "markersize": 5}
+                panel.errorbar(x["mean"], y["mean"], xerr=across_error, yerr=up_error, **look)
                 points[name] = x["mean"], y["mean"]
             panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), title=titles[column], xlabel=AXES[across])
             named.append(name_points(panel, points, summary["own"]))
