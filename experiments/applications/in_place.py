@@ -33,7 +33,7 @@ from experiments.applications.detector import (
     suite_robots,
 )  # fmt: skip
 from experiments.applications.endurance.tables import Row, over_robots
-from experiments.applications.policies.tasks import stack
+from experiments.applications.policies.tasks import join
 from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
@@ -88,7 +88,7 @@ def measure_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list
 
 def _points(true: TrueSimulator, robot: Robot, episodes: int) -> Points:
     """The points of the true state of the first `episodes`."""
-    state = stack([true.state(b) for b in range(episodes)])
+    state = join([true.state(b) for b in range(episodes)])
     return points_of(SPECS[robot.name], state.seeds, state.q, state.objects)
 
 

@@ -66,15 +66,11 @@ from experiments.applications.generating.survey import survey
 from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories, require_layout
 from experiments.applications.policies.acting import STILL, Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
-from experiments.applications.policies.demonstrations import (
-    Demonstrations,
-    join,
-    load_demonstrations,
-    save_demonstrations,
-)
+from experiments.applications.policies.demonstrations import Demonstrations, load_demonstrations, save_demonstrations
 from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
+from experiments.applications.policies.tasks import join
 from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import make_once, write_table

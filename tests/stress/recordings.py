@@ -32,8 +32,8 @@ from data_pipelines.sources.rlds.writer import (
 )
 from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.outcomes import STATE, TRUE, read_outcomes
-from experiments.applications.policies.demonstrations import Demonstrations, join, record
-from experiments.applications.policies.tasks import Task, find_task
+from experiments.applications.policies.demonstrations import Demonstrations, record
+from experiments.applications.policies.tasks import Task, find_task, join
 
 SEED = 77
 """Of the recordings: none that a judgement makes for itself."""

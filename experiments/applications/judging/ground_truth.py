@@ -14,8 +14,8 @@ from experiments.applications.judging.config import JudgeConfig, OpenProgress
 from experiments.applications.judging.head import Head, SuccessHead, measure_head, train_head
 from experiments.applications.judging.outcomes import WORLDS
 from experiments.applications.judging.rollouts import make_starts
-from experiments.applications.policies.demonstrations import Demonstrations, join, record
-from experiments.applications.policies.tasks import OWN, Task
+from experiments.applications.policies.demonstrations import Demonstrations, record
+from experiments.applications.policies.tasks import OWN, Task, join
 from experiments.applications.simulators import has_truth, true_simulator
 from experiments.terminal.progress import say
 from hma_jax.config import require

@@ -14,7 +14,7 @@ from data_pipelines.suite.simulator import SuiteSimulator
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.policies.learning import Report
 from experiments.applications.policies.policy import Policy
-from experiments.applications.policies.tasks import AnyTask, Task, world_of
+from experiments.applications.policies.tasks import AnyTask, Task, join, world_of
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
@@ -78,8 +78,7 @@ def run(
         part = slice(first, first + batch)
         parts.append(_run(simulator, policy, starts[part], seeds[part], task, shuffled))
         report(first + batch, len(starts), "")
-    whole = [np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Rollout)]
-    return Rollout(*whole)
+    return join(parts)
 
 
 def _run(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.applications.policies.driving import ExpertRollouts, drive, new_episodes
-from experiments.applications.policies.tasks import Task, held
+from experiments.applications.policies.tasks import Task, held, join
 from hma_jax.config import require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 
@@ -94,13 +94,6 @@ def record(
             f"{task.robot}: the scripted expert with noise {level:g} succeeds too rarely to record {wanted} episodes",
         )
     return join(parts)
-
-
-def join(parts: Sequence[Demonstrations]) -> Demonstrations:
-    """All episodes of several recordings of one robot and length."""
-    return Demonstrations(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Demonstrations)}
-    )
 
 
 def _finished(task: Task, driven: ExpertRollouts, seeds: np.ndarray, after: int | None) -> Demonstrations:

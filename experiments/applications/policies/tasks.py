@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -16,6 +17,8 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.tasks import Push, Reach, Scene
 from data_pipelines.suite.world import State, World
 from hma_jax.config import require
+
+Arrays = TypeVar("Arrays")
 
 OWN, REACH, HOVER = "own", "reach", "hover"
 TASKS = (OWN, REACH, HOVER)
@@ -155,14 +158,15 @@ def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int 
     return Task(robot, name, usual_frames if frames is None else frames, usual_hold if hold is None else hold)
 
 
-def stack(states: Sequence[State]) -> State:
-    """States of one robot as one of all their episodes."""
-    return State(**{f.name: np.concatenate([getattr(s, f.name) for s in states]) for f in fields(State)})
+def join(parts: Sequence[Arrays]) -> Arrays:
+    """Several dataclasses of arrays, each with a row for every episode, as one of all their episodes."""
+    names = [f.name for f in fields(parts[0])]
+    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def world_of(spec: EmbodimentSpec, states: Sequence[State]) -> World:
     """A world that goes on from these states."""
-    state = stack(states)
+    state = join(states)
     world = World(spec, state.seeds)
     world.state = state
     return world
