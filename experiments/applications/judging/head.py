@@ -133,9 +133,8 @@ def train_head(
     `reconstruct` gives uint8 [n, H, W, 3] as the model's tokenizer shows them: every `RECONSTRUCTED`-th is learnt so.
     Raises ConfigError where all frames have one label.
     """
-    steps = demos.steps()
-    images, first = demos.images[steps[:, 0], steps[:, 1]], demos.images[steps[:, 0], 0]
-    labels = demos.reached[steps[:, 0], steps[:, 1]]
+    episode, frame = demos.steps()
+    images, first, labels = demos.images[episode, frame], demos.images[episode, 0], demos.reached[episode, frame]
     for frames in (images, first):
         frames[::RECONSTRUCTED] = reconstruct(frames[::RECONSTRUCTED])
     pairs = np.stack([downsample_uint8(x, config.encoder.size) for x in (first, images)], 1)
@@ -172,9 +171,8 @@ def measure_head(head: Head, demos: Demonstrations, task: Task) -> dict[str, flo
     """On recorded true frames: accuracy and AUROC of frames, and accuracy of whole episodes."""
     steps = demos.steps()
     score = head.probabilities(demos.images, demos.images[:, :1])
-    frames, labels = score[steps[:, 0], steps[:, 1]], demos.reached[steps[:, 0], steps[:, 1]]
     by_head = held(score > head.threshold, task.hold).any(1)
-    return worth_of(head, frames, labels, by_head, demos.successes)
+    return worth_of(head, score[steps], demos.reached[steps], by_head, demos.successes)
 
 
 def worth_of(

@@ -36,8 +36,7 @@ class Scale:
 
 
 def scale_of(demos: Demonstrations) -> Scale:
-    steps = demos.steps()
-    actions = demos.actions[steps[:, 0], steps[:, 1]].astype(np.float64)
+    actions = demos.actions[demos.steps()].astype(np.float64)
     std = np.maximum(actions.std(0), STILL)
     return Scale(*(tuple(x.tolist()) for x in (actions.mean(0), std, actions.min(0), actions.max(0))))
 
@@ -46,14 +45,14 @@ def make_examples(demos: Demonstrations, frames: int, chunk: int, size: int) -> 
     """What a network is trained on: the `images` of all episodes, averaged down to `size`, and of each of the n frames
     that count its `episode` [n], the frames `seen` by then [n, frames] and the `chunk` [n, chunk * A] of normalised
     actions from there on; the first frame is repeated before the beginning, the last action past the end."""
-    steps = demos.steps()
-    at = np.minimum(steps[:, 1:] + np.arange(chunk), demos.lengths[steps[:, 0]][:, None] - 1)
-    actions = scale_of(demos).normalise(demos.actions[steps[:, :1], at])
+    episode, frame = demos.steps()
+    at = np.minimum(frame[:, None] + np.arange(chunk), demos.lengths[episode][:, None] - 1)
+    actions = scale_of(demos).normalise(demos.actions[episode[:, None], at])
     return {
         "images": downsample_uint8(demos.images, size),
-        "episode": steps[:, 0],
-        "seen": np.maximum(steps[:, 1:] - np.arange(frames)[::-1], 0),
-        "chunk": actions.reshape(len(steps), -1),
+        "episode": episode,
+        "seen": np.maximum(frame[:, None] - np.arange(frames)[::-1], 0),
+        "chunk": actions.reshape(len(episode), -1),
     }
 
 

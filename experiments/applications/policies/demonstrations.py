@@ -50,9 +50,9 @@ class Demonstrations:
         """Some of the episodes."""
         return Demonstrations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
-    def steps(self) -> np.ndarray:
-        """int [n, 2]: (episode, frame) of all frames that count."""
-        return np.argwhere(np.arange(self.images.shape[1]) < self.lengths[:, None])
+    def steps(self) -> tuple[np.ndarray, np.ndarray]:
+        """(episodes, frames) of all n frames that count, int [n] each."""
+        return np.nonzero(np.arange(self.images.shape[1]) < self.lengths[:, None])
 
 
 def record(
