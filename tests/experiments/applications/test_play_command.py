@@ -32,6 +32,12 @@ def every_address_is_free(monkeypatch):
     monkeypatch.setattr(server, "require_free", free)
 
 
+@pytest.fixture
+def not_warmed_up(monkeypatch):
+    """Nobody drives: nothing need be compiled."""
+    monkeypatch.setattr("hma_jax.simulator.warm_up.warm_up", lambda *_, **__: None)
+
+
 def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
     from experiments.applications import simulators
 
@@ -52,20 +58,22 @@ def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp
     from experiments.applications import simulators
     from experiments.cli.play import play
 
-    first = []
+    first, compiled = [], []
 
     async def serve(app, host, port, ready):
         async with TestServer(app):
-            first.append(app[server.SESSIONS].max_acting)
+            first.append((app[server.SESSIONS].max_acting, list(compiled)))
             ready(port)
             await until(lambda: app[server.SESSIONS].max_acting == 2)
 
+    monkeypatch.setattr(Simulator, "compile", lambda _, together: compiled.append(together))
     monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
     monkeypatch.setattr(server, "serve", serve)
     play(tmp_path, visitors=2)
-    assert first == [1]
+    assert first == [(1, [1])] and compiled == [1, 2]
 
 
+@pytest.mark.usefixtures("not_warmed_up")
 def test_the_command_answers_at_its_host_and_at_the_public_names_that_it_is_given(monkeypatch, tmp_path, capsys):
     from experiments.applications import simulators
 
@@ -118,6 +126,7 @@ def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(
         assert deaf == known[0]["deaf"] == (setting == "passive")
 
 
+@pytest.mark.usefixtures("not_warmed_up")
 @pytest.mark.parametrize(
     ("host", "said"),
     [
@@ -140,6 +149,7 @@ def test_the_address_that_it_prints_can_be_opened(host, said, monkeypatch, tmp_p
     assert f"drive it at http://{said}" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.usefixtures("not_warmed_up")
 def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monkeypatch, tmp_path, capsys):
     """An unknown host was told to choose another port."""
     from experiments.applications import simulators
@@ -167,6 +177,7 @@ def test_a_taken_port_is_said_before_anything_is_loaded(monkeypatch, tmp_path, c
     assert f"cannot listen on 127.0.0.1:{port}: " in said and "choose another --host or --port" in said
 
 
+@pytest.mark.usefixtures("not_warmed_up")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
 def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, monkeypatch, tmp_path, capsys):
     from experiments.applications import simulators
