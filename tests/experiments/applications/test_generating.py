@@ -362,7 +362,7 @@ def test_how_many_of_the_episodes_a_study_trains_on_is_said(recorded, tmp_path, 
     assert f"trains on {trained} of {trained + held_out} episodes" in note(str(recorded), "train+val")
     assert note("pusher_sand", "val") == "" and f"{trained} of {trained} " in note("pusher_sand", "train")
     capsys.readouterr()
-    asked = ["--actions", "pusher_sand", "--episodes", "1", "--clips", "0"]
+    asked = ["--actions", "pusher_sand", "--episodes", "1", "--clips", "0", "--batch", "2"]
     assert main(["generate", str(own), *asked, "--out", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "trains on 1 of 1 episode" in said and "`--actions pusher_sand --split val`" in said
