@@ -47,14 +47,14 @@ ACTING = {e.name for e in TRAINED if not e.video_only}
 
 @functools.cache
 def robots_at(
-    study: str, axis: str, role: str = POINT, seed: int | None = None
+    study: str, axis: str, role: str = POINT, seed: int | None = None, at: float | None = None
 ) -> dict[float, tuple[list[Robot], int]]:
     """{x: (every robot, from every window's numbers, trials)} of the points of `role` of an axis of a study, of one
-    `seed` or all."""
+    `seed` or all, `at` one x or all."""
     workspace = Workspace(RESULTS / study)
     record = load_record(workspace)
     (sweep,) = plan_sweeps(record.study, (axis,))
-    own = (p for p in sweep.points if p.role == role and seed in (None, p.trial.train.seed))
+    own = (p for p in sweep.points if p.role == role and seed in (None, p.trial.train.seed) and at in (None, p.x))
     points = tuple(replace(p, role=POINT) for p in own)
     found = {}
     for x in sorted({p.x for p in points}):

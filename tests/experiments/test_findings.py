@@ -84,7 +84,7 @@ def test_the_axis_horizon_is_as_findings_say():
     )
     assert follow == "36" and said in readme(), said
     assert f"PSNR, copying {copying} dB" in page
-    alone = [counts(robots_at("cpu-full", "horizon", seed=seed)[16_000][0])[2] for seed in (0, 1, 2)]
+    alone = [counts(robots_at("cpu-full", "horizon", seed=seed, at=16_000)[16_000][0])[2] for seed in (0, 1, 2)]
     said = "Counted so, the single seeds of 16,000 steps have ΔPSNR beyond 2 on {}, {} and {} robots."
     assert said.format(*alone) in " ".join(page.split())
 
