@@ -3,6 +3,9 @@
 Sums over many equal terms are where bfloat16 fails: with eight bits a running sum stops growing at a few hundred.
 """
 
+from collections.abc import Callable
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +22,18 @@ LATENTS = DiffusionConfig(channels=2, patch=1, width=32, depth=2, steps=20)
 
 def gradients(dtype: str, diffusion: DiffusionConfig | None, rounded: bool = False) -> dict[str, np.ndarray]:
     """`rounded`: of parameters in bfloat16, whatever computes."""
-    config = model_config(diffusion=diffusion)
-    declared = declare_model(config, TABLE, ExecutionConfig(dtype))
+    config, gradient = model_config(diffusion=diffusion), gradient_in(dtype, diffusion)
     _, params = lively_params(config, scale=0.05)
     if rounded:
         params = jax.tree.map(lambda x: x.astype(jnp.bfloat16).astype(x.dtype), params)
+    names = declare_model(config, TABLE).leaves()
+    return {name: np.asarray(g) for name, g in zip(names, jax.tree.leaves(gradient(params)), strict=True)}
+
+
+@cache
+def gradient_in(dtype: str, diffusion: DiffusionConfig | None) -> Callable:
+    config = model_config(diffusion=diffusion)
+    declared = declare_model(config, TABLE, ExecutionConfig(dtype))
     batch = random_batch(0, config, ROWS)
     if diffusion is None:
         rare = np.random.default_rng(1).random(batch["tokens"].shape) < 0.03
@@ -44,7 +54,7 @@ def gradients(dtype: str, diffusion: DiffusionConfig | None, rounded: bool = Fal
 
         return jax.grad(loss)(params)
 
-    return {spec: np.asarray(g) for spec, g in zip(declared.leaves(), jax.tree.leaves(gradient(params)), strict=True)}
+    return gradient
 
 
 @pytest.mark.parametrize("diffusion", [None, pytest.param(LATENTS, marks=pytest.mark.slow)], ids=["ids", "latents"])

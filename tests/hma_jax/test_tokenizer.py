@@ -328,6 +328,7 @@ def test_same_seed_same_tokenizer_also_after_a_crash(trained, tmp_path):
     assert train(tmp_path, config=config, options=options).identity == trained[0].identity
 
 
+@pytest.mark.parametrize("trained", [CONFIG], ids=["lfq"], indirect=True)
 def test_another_seed_is_another_tokenizer(trained, tmp_path):
     other = train(tmp_path, config=trained[0].config, settings=replace(TRAIN, seed=1))
     assert other.identity != trained[0].identity
