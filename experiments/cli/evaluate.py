@@ -15,7 +15,7 @@ from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, r
 from experiments.running.attempts import EVALUATING, JOB
 from experiments.running.result_file import SAMPLES
 from experiments.study_setup import UNSET, StudySetup, make_setup, require_local, under_another_name
-from experiments.terminal.progress import TidyTable, console, short, step, tidy_table, wrote
+from experiments.terminal.progress import TidyTable, console, say, short, step, tidy_table, wrote
 from experiments.terminal.words import few, plus_minus
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict, to_dict, to_strict_json
@@ -98,27 +98,23 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     frozen, untrained = set(prepared.manifest.names), _not_trained_on(trained, prepared)
     masking = trained.train.masking
     if not masking.predicts_frames:
-        console.print(
+        say(
             f"note: the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames, "
-            "so only its actions are evaluated",
-            soft_wrap=True,
+            "so only its actions are evaluated"
         )
     empty = prepared.manifest.empty
     if absent := [name for name in trained.table.names if name not in frozen and name not in empty]:
-        console.print(f"note: not evaluated, because the study does not have them: {', '.join(absent)}", soft_wrap=True)
+        say(f"note: not evaluated, because the study does not have them: {', '.join(absent)}")
     for name in [name for name in trained.table.names if name in empty]:
-        console.print(f"note: {name} is not evaluated: {empty[name]}", soft_wrap=True)
+        say(f"note: {name} is not evaluated: {empty[name]}")
     if unseen := [name for name in untrained if name in frozen]:
-        console.print(
-            f"note: not evaluated, because the model was not trained on them: {', '.join(unseen)}", soft_wrap=True
-        )
+        say(f"note: not evaluated, because the model was not trained on them: {', '.join(unseen)}")
     names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
     besides = [name for name in names if setup.data and name not in setup.study.dataset_names()]
     if besides:
-        console.print(
+        say(
             f"note: all windows that are frozen in {short(setup.workspace.root)} are evaluated, also those of "
-            f"{few(besides)}, which --data does not name",
-            soft_wrap=True,
+            f"{few(besides)}, which --data does not name"
         )
     _note_other_data(setup, prepared)
     note_possible_leakage(trained, names, prepared.store)
@@ -177,10 +173,9 @@ def _note_other_data(setup: StudySetup, prepared: PreparedData) -> None:
     from experiments.preparing.store import data_differences
 
     if lines := data_differences(setup.study, setup.workspace, setup.data, prepared.tokenizer):
-        console.print(
+        say(
             f"note: the windows that are frozen in {short(setup.workspace.root)} are evaluated, whose tokens were made "
-            f"from other data than --data and the registry give (there -> given): {'; '.join(lines)}",
-            soft_wrap=True,
+            f"from other data than --data and the registry give (there -> given): {'; '.join(lines)}"
         )
 
 
@@ -200,11 +195,10 @@ def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:
 def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore) -> None:
     """Prints a note where a model may have been trained on episodes that are held out in `store` (data leakage)."""
     if elsewhere := trained_on_other_tokens(trained, names, store):
-        console.print(
+        say(
             f"note: {few(elsewhere)}: the model was trained on other tokens than those of this study, so it may have "
             "been trained on episodes that are held out here; in the --out that it was trained in, held-out episodes "
-            "are new to it",
-            soft_wrap=True,
+            "are new to it"
         )
 
 
@@ -263,10 +257,9 @@ def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
     if why := tokenizer_mismatch(trained, tokenizer):
         raise ConfigError(why + advice)
     if _converted(trained):
-        console.print(
+        say(
             "note: the model was read in the official release's format, which does not say on which tokens it was "
-            f"trained; it is assumed that they are those of the tokenizer here, {tokenizer.identity}",
-            soft_wrap=True,
+            f"trained; it is assumed that they are those of the tokenizer here, {tokenizer.identity}"
         )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments.study_setup import UNSET, command, require_local, use_entries
-from experiments.terminal.progress import Eta, console, say, step, wrote
+from experiments.terminal.progress import Eta, say, step, wrote
 from experiments.terminal.words import counted
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.config.base import require_seed
@@ -150,8 +150,7 @@ def _print_comparison(comparison: Comparison, episodes: int) -> None:
     if episodes > 1:
         of_generated = f" ({generated.low:.2f} to {generated.high:.2f}, 95 % over episodes)"
         of_still = f" ({still.low:.2f} to {still.high:.2f})"
-    console.print(
+    say(
         f"{counted(episodes, 'episode')}. PSNR against the recording {generated.mean:.2f} dB{of_generated}; a still picture "
-        f"{still.mean:.2f}{of_still}",
-        soft_wrap=True,
+        f"{still.mean:.2f}{of_still}"
     )

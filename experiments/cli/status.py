@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.table import Table
-from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments.study_setup import UNSET
-from experiments.terminal.progress import console, short
+from experiments.terminal.progress import console, say, short
 from experiments.terminal.words import counted
 from hma_jax.config import ConfigError, require
 
@@ -65,9 +64,9 @@ def status(
     console.print(", ".join([f"{counts[FINISHED]:,} of {counted(len(names), 'trial')} finished", *others]))
     for id, state in states.items():
         if state.message:
-            console.print(Text(f"{names[id]}: {state.message}"), soft_wrap=True)
+            say(f"{names[id]}: {state.message}")
     if counts[FINISHED] + counts[DIVERGED] < len(names) and running is None:
-        console.print(Text(f"no command runs it; to go on: {command_at(study, record)}"), soft_wrap=True)
+        say(f"no command runs it; to go on: {command_at(study, record)}")
 
 
 def _place(directory: Path, state: State) -> tuple[str, str]:

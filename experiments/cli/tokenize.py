@@ -17,7 +17,7 @@ from experiments.preparing.made_from import Step
 from experiments.running.workspace import Busy, Workspace
 from experiments.study_setup import StudySetup, make_setup
 from experiments.sweeps.sweep import reference_trial
-from experiments.terminal.progress import console, short, tidy_table, wrote
+from experiments.terminal.progress import console, say, short, tidy_table, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -69,7 +69,8 @@ def prepare_together(
                 setup.study, setup.workspace, setup.data, setup.tokenizer,
                 replace=replace, batch=batch, threads=threads,
             )  # fmt: skip
-    _finish(setup)
+    show_store(setup.workspace, setup.study.rate)
+    wrote(setup.workspace.store, setup.workspace.manifest, then=setup.command("train"))
 
 
 def _take_part(setup: StudySetup, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
@@ -95,7 +96,7 @@ def _take_part(setup: StudySetup, busy: Busy, batch: int | None, threads: int | 
         sources = find_suite(study, workspace, advice)
     require_same_asked(study, workspace, sources, setup.tokenizer, busy)
     require_same_tokenizer(setup.tokenizer, study, workspace, sources)
-    console.print(f"sharing the work with {busy.who}, which prepares {short(workspace.root)}", soft_wrap=True)
+    say(f"sharing the work with {busy.who}, which prepares {short(workspace.root)}")
     make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)
     _freeze(setup, sources)
 
@@ -118,16 +119,9 @@ def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
             if windows_are_frozen(study, workspace):
                 return
             if not announced:
-                waiting = f"all tokens are made; waiting until {busy.who} has frozen the windows or ends"
-                console.print(waiting, soft_wrap=True)
+                say(f"all tokens are made; waiting until {busy.who} has frozen the windows or ends")
                 announced = True
         time.sleep(pause)
-
-
-def _finish(setup: StudySetup) -> None:
-    workspace = setup.workspace
-    show_store(workspace, setup.study.rate)
-    wrote(workspace.store, workspace.manifest, then=setup.command("train"))
 
 
 def show_store(workspace: Workspace, rate: float | None) -> None:

@@ -157,10 +157,7 @@ def _write(tokenizer: BaseTokenizer, out: Path) -> None:
     else:
         what = f"ids of {counted(tokenizer.factors, 'factor')} with {tokenizer.factor_vocab:,} entries"
     side = tokenizer.image_size
-    console.print(
-        f"{tokenizer.kind} {tokenizer.identity}: {side} x {side} pixels to {tokenizer.tokens} tokens, {what}",
-        soft_wrap=True,
-    )
+    say(f"{tokenizer.kind} {tokenizer.identity}: {side} x {side} pixels to {tokenizer.tokens} tokens, {what}")
     preset = "cpu-continuous" if tokenizer.channels else "cpu"
     wrote(out, then=command("tokenize", "--preset", preset, "--tokenizer", out))
     console.print("this command uses the simulated suite; add --data DIR for your own data, --preset for another study")

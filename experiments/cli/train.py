@@ -148,7 +148,7 @@ def train_model(
     if initial is not None:
         kept = [name for name in initial.table.names if name not in known_datasets(initial, setup)]
         if kept:
-            console.print(f"note: unchanged, because the study has no data of them: {', '.join(kept)}", soft_wrap=True)
+            say(f"note: unchanged, because the study has no data of them: {', '.join(kept)}")
         start = {"table": initial.table, "initial": initial.params, "origin": origin}
     _train(setup, _single_trial(setup, trajectories), run, options, **start)
 
@@ -412,11 +412,10 @@ def say_data(trial: Trial, prepared: PreparedData) -> None:
     windows = sum(map(len, used))
     passes = trial.train.steps * trial.train.batch / max(windows, 1)
     limit = "" if trial.max_trajectories is None else f" (at most {trial.max_trajectories:,} of each robot)"
-    console.print(
+    say(
         f"training on {len(used)} of {counted(len(trial.datasets), 'robot')}: {sum(len(s.episodes) for s in used):,} of "
         f"{episodes:,} trajectories{limit}, {windows:,} windows of {trial.model.frames} frames, each "
-        f"seen {passes:,.{0 if passes >= 10 else 1}f} times on average",
-        soft_wrap=True,
+        f"seen {passes:,.{0 if passes >= 10 else 1}f} times on average"
     )
     for name, reason in chosen.mixture.dropped.items():
         say(f"note: not trained on {name}: {reason}")

@@ -10,7 +10,7 @@ from experiments.preparing.made_from import Step, dataset_differences, require_s
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
-from experiments.terminal.progress import console, say
+from experiments.terminal.progress import say
 from experiments.terminal.words import few
 from hma_jax.config import require
 from hma_jax.config.json import diff
@@ -61,10 +61,9 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
     say_alone(summary)
     without = [name for name, facts in summary.items() if not facts["windows"]]
     if without:
-        console.print(
+        say(
             f"{len(names) - len(without)} of {len(names)} datasets can be trained on; {few(without)} "
-            f"{'has' if len(without) == 1 else 'have'} no training window",
-            soft_wrap=True,
+            f"{'has' if len(without) == 1 else 'have'} no training window"
         )
     (identity,) = {store.manifest(name).tokenizer.identity for name in names}
     return Provenance(store.hash(names), manifest.hash(), identity)

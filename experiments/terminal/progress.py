@@ -28,8 +28,8 @@ class _Output(Console):
         raise
 
 
-console = _Output(highlight=False, width=None if sys.stdout.isatty() else 110)
-errors = Console(stderr=True, highlight=False)
+console = _Output(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 110)
+errors = Console(stderr=True, highlight=False, emoji=False)
 
 FOLDED = 16
 """The least width of a table's column whose words may be broken."""
@@ -59,7 +59,7 @@ def wrote(*paths: Path, then: str = "", about: str = "") -> None:
     for path in paths:
         console.print("wrote", Text(short(path), "bold"), soft_wrap=True)
     if then:
-        console.print(Text(f"next: {then}"), soft_wrap=True)
+        say(f"next: {then}")
     if about:
         say(f"note: {about}")
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from experiments.running.attempts import State
 from experiments.running.runner import Job
 from experiments.terminal import progress
-from experiments.terminal.progress import SweepMonitor, tidy_table
+from experiments.terminal.progress import SweepMonitor, say, tidy_table
 
 METRICS = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval")
 
@@ -65,3 +65,9 @@ def test_brackets_in_the_title_of_a_trial_are_words(monkeypatch):
             monitor.launched(job, resumed=False)
             monitor.ended(job, State("failed", "[/x] y"), 1.0, again=False)
         assert f"{title} (1.0 s): [/x] y" in console.file.getvalue()
+
+
+def test_a_message_is_printed_as_it_is(capsys):
+    message = "note: /data/:key:/[bold]arms[/] " + 30 * "and further ones "
+    say(message)
+    assert capsys.readouterr().out == f"{message}\n"

@@ -7,13 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.text import Text
-
 from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.running.workspace import Workspace
 from experiments.study_setup import Preset, StudyArguments, command
 from experiments.terminal.program import PROGRAM
-from experiments.terminal.progress import console
+from experiments.terminal.progress import say
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts
@@ -34,7 +32,7 @@ def say_next(
     default = StudyArguments.preset
     for preset, when in ((default, "next"), (ON_ACCELERATORS[default], "or, on a GPU or TPU")):
         words = tokenize_command(preset, datasets, frames, registry, longest, rate)
-        console.print(Text(f"{when}: {words}"), soft_wrap=True)
+        say(f"{when}: {words}")
 
 
 def tokenize_command(
@@ -87,7 +85,7 @@ def _another_out(default: Path, names: Sequence[str]) -> Path | None:
 def print_next(words: str, name: str = "") -> None:
     """Prints the command that comes next, for the dataset `name` of several; advice that is none as a note."""
     label = "next" if words.startswith(f"{PROGRAM} ") else "note"
-    console.print(Text(f"{label}{name and f' for {name}'}: {words}"), soft_wrap=True)
+    say(f"{label}{name and f' for {name}'}: {words}")
 
 
 def single_episode(directories: Sequence[Facts]) -> str | None:

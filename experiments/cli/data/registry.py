@@ -292,12 +292,11 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
         if fits:
             return
     for reason in suggestion.reasons:
-        console.print(f"  {escape(reason)}", soft_wrap=True)
+        say(f"  {reason}")
     say(suggestion.python())
-    console.print(
+    say(
         "Copy it into data_pipelines/registry/own.py, or write it with --entry FILE.toml and give that file "
-        "to other commands with --registry.",
-        soft_wrap=True,
+        "to other commands with --registry."
     )
 
 

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, print_next, say_next
 from experiments.study_setup import UNSET, command, say_unmatched, use_entries
-from experiments.terminal.progress import console, step, wrote
+from experiments.terminal.progress import console, say, step, wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
@@ -137,10 +137,9 @@ def _say_issues(viewed: DatasetView, episodes: int) -> None:
         console.print(f"[bold]{name}[/]: {title}: {escape(issue.text)}", soft_wrap=True)
     f = viewed.facts
     if f.stopped or episodes < f.episodes:  # of others all that can be read were
-        console.print(
-            f"note: {name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); duplicate recordings are "
-            "searched only among these",
-            soft_wrap=True,
+        say(
+            f"note: {f.name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); duplicate recordings are "
+            "searched only among these"
         )
 
 
