@@ -70,7 +70,7 @@ def run_study(
     trial, if one that is finished was changed, or if trials ran other sources than today's and `accept_code` is not
     given.
     """
-    from experiments.dry_run.notes import say_average, say_points, say_prepared_here, say_scale, say_unused
+    from experiments.dry_run.notes import say_notes
     from experiments.dry_run.trainable import require_trainable
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
@@ -82,12 +82,7 @@ def run_study(
     sweeps = plan_asked(study, axes, workspace.root)
     sources = trial_closure()  # a later change is refused by the trials
     require_trainable(study, sweeps, launcher_options)
-    if setup.data:
-        say_scale(setup, [point.trial for sweep in sweeps for point in sweep.points])
-        say_unused(study)
-        say_points(setup, sweeps)
-    say_average(point.trial.train for sweep in sweeps for point in sweep.points)
-    say_prepared_here(setup, launcher_options)
+    say_notes(setup, sweeps, launcher_options)
     await_lease(workspace)
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
@@ -99,10 +94,7 @@ def run_study(
         provenance = prepare_apart(setup, replace)
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
-            what = (
-                f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again"
-            )
-            say(what)
+            say(f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again")
         shown = unique_trials(planned, provenance)
         trials = unique_trials(sweeps, provenance)
         require_agreement(workspace, shown, trials, sources, accept_code)

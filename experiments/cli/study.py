@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningArguments, StudyOptions
+from experiments.preparing.made_from import Step
 from experiments.running.launchers.registry import LauncherOptions
-from experiments.study_setup import StudyArguments, make_setup
+from experiments.study_setup import StudyArguments, StudySetup, make_setup
 from experiments.sweeps.registry import AXES, is_file, plan_asked
 from experiments.terminal.progress import console, say
 from hma_jax.config import ConfigError, require
@@ -82,33 +84,7 @@ def _run(
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launcher_options = LauncherOptions(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
-        from experiments.dry_run.done import find_done
-        from experiments.dry_run.notes import say_average, say_points, say_prepared_here, say_scale, say_unused
-        from experiments.dry_run.plan_table import Devices, plan_table
-        from experiments.dry_run.trainable import check_launched
-        from experiments.preparing.sources import check_entries
-        from experiments.run_study import find_earlier
-
-        sweeps = plan_asked(setup.study, axes, setup.workspace.root)
-        given, trained = bool(setup.data), setup.tokenizer is None
-        if given:
-            check_entries(setup.study, setup.data)
-        each = check_launched(setup.study, sweeps, launcher_options)
-        if not setup.study.for_accelerators:
-            each *= launcher_options.cores_each()
-        devices = Devices(each, launcher_options.at_once)
-        done = find_done(setup, sweeps, running.retry_failed, running.accept_code)
-        console.print(plan_table(setup.study, sweeps, devices, given=given, trained=trained, done=done))
-        if given:
-            say_scale(setup, [point.trial for sweep in sweeps for point in sweep.points])
-            say_unused(setup.study)
-            say_points(setup, sweeps)
-        say_average(point.trial.train for sweep in sweeps for point in sweep.points)
-        say_prepared_here(setup, launcher_options)
-        try:
-            find_earlier(setup.workspace, setup.study, sweeps, replacement.replace)
-        except ConfigError as error:
-            say(f"note: without --dry-run this command would be refused: {error}")
+        _dry_run(setup, axes, running, launcher_options, replacement.replace)
         return
     from experiments.run_study import run_study
 
@@ -121,3 +97,35 @@ def _run(
         accept_code=running.accept_code,
         replace=replacement.replace,
     )
+
+
+def _dry_run(
+    setup: StudySetup,
+    axes: Sequence[str],
+    running: RunningArguments,
+    launcher_options: LauncherOptions,
+    replace: Step | None,
+) -> None:
+    """The dry run: the table of trials, the notes on them, and whether the command would be refused for what is there."""
+    from experiments.dry_run.done import find_done
+    from experiments.dry_run.notes import say_notes
+    from experiments.dry_run.plan_table import Devices, plan_table
+    from experiments.dry_run.trainable import check_launched
+    from experiments.preparing.sources import check_entries
+    from experiments.run_study import find_earlier
+
+    study, given = setup.study, bool(setup.data)
+    sweeps = plan_asked(study, axes, setup.workspace.root)
+    if given:
+        check_entries(study, setup.data)
+    each = check_launched(study, sweeps, launcher_options)
+    if not study.for_accelerators:
+        each *= launcher_options.cores_each()
+    devices = Devices(each, launcher_options.at_once)
+    done = find_done(setup, sweeps, running.retry_failed, running.accept_code)
+    console.print(plan_table(study, sweeps, devices, given=given, trained=setup.tokenizer is None, done=done))
+    say_notes(setup, sweeps, launcher_options)
+    try:
+        find_earlier(setup.workspace, study, sweeps, replace)
+    except ConfigError as error:
+        say(f"note: without --dry-run this command would be refused: {error}")

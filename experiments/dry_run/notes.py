@@ -18,6 +18,17 @@ from experiments.terminal.words import counted, few, in_thousands
 from hma_jax.config import TrainConfig
 
 
+def say_notes(setup: StudySetup, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> None:
+    """All of them, before a study runs and in its dry run."""
+    trials = [point.trial for sweep in sweeps for point in sweep.points]
+    if setup.data:
+        say_scale(setup, trials)
+        _say_unused(setup.study)
+        _say_points(setup, sweeps)
+    say_average(trial.train for trial in trials)
+    _say_prepared_here(setup, launcher_options)
+
+
 def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
     """One line on the largest model of `trials`, and another preset where this one is made for a processor."""
     height, width = setup.study.tokenizer.image_shape
@@ -56,7 +67,7 @@ def say_average(configs: Iterable[TrainConfig]) -> None:
         )
 
 
-def say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> None:
+def _say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> None:
     """A line where a study for accelerators trains its tokenizer on this machine without one, while its trials run on
     others."""
     elsewhere = launcher_options.name != "local" and setup.study.for_accelerators
@@ -68,7 +79,7 @@ def say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> N
         )
 
 
-def say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
+def _say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
     """A line on the axis trajectories where it has fewer points on the user's datasets than in the preset, and on the
     axis datasets where it has only one; none where the user chose them."""
     study, planned = setup.study, {sweep.name for sweep in sweeps}
@@ -100,7 +111,7 @@ def _listed(numbers: Sequence[int]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def say_unused(study: Study) -> None:
+def _say_unused(study: Study) -> None:
     """A line on datasets that have more trajectories to train on than a trial takes, as far as the registry says how
     many."""
     from data_pipelines.registry import get_spec
