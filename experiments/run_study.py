@@ -93,7 +93,7 @@ def run_study(
         say_unplanned(workspace, planned)
         provenance = prepare_apart(setup, replace)
         require_judged(study, workspace, all_judged(sweeps))
-        if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
+        if earlier and (changes := diff(earlier.provenance, provenance)):
             say(f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again")
         shown = unique_trials(planned, provenance)
         trials = unique_trials(sweeps, provenance)
@@ -103,7 +103,7 @@ def run_study(
             write_file(workspace.registry, setup.arguments.registry.read_bytes())
         else:  # there may be that of a study that this one replaces
             workspace.registry.unlink(missing_ok=True)
-        record = Record(study, setup.data, kept, whole_command(setup, kept), provenance)
+        record = Record(study, setup.data, kept, whole_command(setup, kept), provenance=provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
         former = find_trained(workspace.trials, trials, provenance, None if accept_code else sources)

@@ -69,8 +69,6 @@ def read_side(path: Path) -> Side:
     workspace = Workspace(path)
     if workspace.record.exists():
         record = load_record(workspace)
-        if record.provenance is None:
-            raise ConfigError(f"the study in {path} has not run yet; run `{record.command}`")
         ids = {s: trial_id(reference_trial(record.study, s), record.provenance) for s in record.study.seeds}
         found = read_trials(workspace.trials, ids.values()) if workspace.trials.is_dir() else {}
         seeds = {seed: found[id].windows for seed, id in ids.items() if id in found}

@@ -104,7 +104,6 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
 
     workspace = Workspace(root.absolute())
     record = load_record(workspace)
-    require(record.provenance is not None, f"the study in {root} has not run yet; run `{record.command}`")
     name, _, text = target.rpartition("=")
     try:
         x = float(text)

@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, say, short
 from experiments.terminal.words import counted
-from hma_jax.config import ConfigError, require
+from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
     from experiments.running.attempts import State
@@ -43,10 +43,6 @@ def status(
     if running and not workspace.record.exists():
         raise ConfigError(f"the study in {short(study)} has no trial yet: {running.who} prepares its data")
     record = load_record(workspace)
-    require(
-        record.provenance is not None,
-        f"the study in {short(study)} has no trial yet: its data are not prepared; run `{record.command}`",
-    )
     names = titles(plan_sweeps(record.study, record.axes, workspace.root), record.provenance)
     states = read_states(list(names), workspace.trials, Ledger(workspace.ledger))
     counts = Counter(state.event for state in states.values())

@@ -62,7 +62,7 @@ def find_done(
     except ConfigError:  # it cannot be read, of which the study's own command speaks
         return NOTHING
     done = find_prepared(setup)
-    if record is None or record.provenance is None:
+    if record is None:
         return done
     provenance = dataclasses.replace(record.provenance, results=RESULTS_VERSION)
     trials = unique_trials(sweeps, provenance)

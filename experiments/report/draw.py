@@ -15,7 +15,6 @@ from experiments.sweeps.registry import AXES, KEPT, plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
 from experiments.terminal.progress import console, say, short, wrote
 from experiments.terminal.words import few
-from hma_jax.config import ConfigError
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
@@ -49,8 +48,6 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.validity import check_numbers
 
     provenance = record.provenance
-    if provenance is None:
-        raise ConfigError(f"the study in {workspace.root} has not run yet; run `{record.command}`")
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
     written = read_rows(workspace) if workspace.results.exists() else []

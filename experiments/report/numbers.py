@@ -17,7 +17,6 @@ from experiments.running.trial import Trial, trajectories_of, trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
-from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import FILE, WindowTable
 
@@ -87,6 +86,5 @@ def find_other_x(
 def read_numbers(workspace: Workspace, draws: int = DRAWS) -> Numbers:
     """The numbers of the study in `workspace`. Raises ConfigError if there is no study."""
     record = load_record(workspace)
-    require(record.provenance is not None, f"the study in {workspace.root} has not run yet; run `{record.command}`")
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     return compute_numbers(workspace, sweeps, record.provenance, draws)

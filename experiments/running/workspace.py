@@ -6,7 +6,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.running.migration import migrate
@@ -188,7 +188,7 @@ class Record:
     data: tuple[str, ...] = ()  # RLDS directories of the user; () for the suite
     axes: tuple[str, ...] = ()  # sweeps run so far
     command: str = ""
-    provenance: Provenance | None = None  # of the trials that the report shows; None: not prepared yet
+    provenance: Provenance = field(kw_only=True)  # of the trials that the report shows
 
 
 def save_record(workspace: Workspace, record: Record) -> None:
@@ -220,8 +220,7 @@ def find_record(workspace: Workspace) -> Record | None:
         values = json.loads(path.read_text())
         study, execution = migrate(values["study"])
         values["study"] = study | {"execution": study.get("execution", {}) | execution}
-        if values.get("provenance"):
-            values["provenance"] = to_dict(inputs_of(values["provenance"]))
+        values["provenance"] = to_dict(inputs_of(values["provenance"]))
         return from_dict(Record, values)
     except (FileNotFoundError, NotADirectoryError):
         return None

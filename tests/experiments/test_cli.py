@@ -1,6 +1,7 @@
 """The command line: one message and the right exit code for every mistake, fast and full help."""
 
 import errno
+import json
 import os
 import shlex
 import subprocess
@@ -182,6 +183,16 @@ def test_a_report_that_cannot_be_written_names_no_option_that_there_is_not(why, 
     monkeypatch.setattr(outputs.tempfile, "TemporaryFile", refuse)
     assert main(["report", str(tmp_path)]) == 2
     assert f"nothing can be written in {tmp_path} ({os.strerror(why)}); {do}" in capsys.readouterr().err
+
+
+def test_a_record_that_does_not_say_what_its_trials_depend_on_is_damaged(tmp_path, capsys):
+    workspace = Workspace(tmp_path)
+    save_record(workspace, record_of())
+    values = json.loads(workspace.record.read_text())
+    for record in (values | {"provenance": None}, {name: x for name, x in values.items() if name != "provenance"}):
+        workspace.record.write_text(json.dumps(record))
+        assert main(["status", str(tmp_path)]) == 2
+        assert "damaged or of another version" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["report", "fit"])

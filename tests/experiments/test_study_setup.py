@@ -17,6 +17,7 @@ from experiments.cli.main import main
 from experiments.running.workspace import Record, save_record
 from experiments.study_setup import StudyArguments, StudySetup, make_setup
 from tests.data_pipelines.fakes import make_spec, write_rlds
+from tests.experiments.fakes import PROVENANCE
 from tests.experiments.test_cli_errors import idle_training  # noqa: F401
 
 ARM = get_spec("berkeley_gnm_cory_hall")
@@ -139,7 +140,8 @@ def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkey
     setup = make_setup(where)
     caps = setup.study.trajectory_counts
     for earlier, counts in (((10, 30, 100, 1000), (10, 30, 100, 1000)), ((10, 20, 30, 1000), caps), ((10, 30), caps)):
-        save_record(setup.workspace, Record(dataclasses.replace(setup.study, trajectory_counts=earlier)))
+        study = dataclasses.replace(setup.study, trajectory_counts=earlier)
+        save_record(setup.workspace, Record(study, provenance=PROVENANCE))
         assert make_setup(where).study.trajectory_counts == counts
     setup.workspace.record.write_text("damaged")
     assert make_setup(where).study.trajectory_counts == caps == (10, 30, 1000)
