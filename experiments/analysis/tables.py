@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import Any
 from experiments.analysis.compare import Side
 from experiments.preparing.evaluation_stamp import STAMP
 from experiments.preparing.made_from import read_stamp
-from experiments.running.attempts import JOB, RESULT
-from experiments.running.job import read_job
-from experiments.running.provenance import Provenance, inputs_of
+from experiments.running.attempts import RESULT
+from experiments.running.job import trial_in
+from experiments.running.provenance import Provenance
 from experiments.running.result_file import read_result
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Workspace, load_record
@@ -43,15 +42,7 @@ def read_trial(directory: Path) -> FinishedTrial:
         raise ConfigError(f"{directory}: not a finished trial (it has no {RESULT})")
     read_result(directory)  # that its files are those it was sealed with
     windows = WindowTable.load(directory / FILE)
-    try:
-        job = json.loads((directory / JOB).read_text())
-        trial, provenance = read_job(job)[0], inputs_of(job["provenance"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(
-            f"{directory}: the description of the finished trial cannot be read ({error}); copy the trial again from "
-            "where it ran"
-        ) from error
-    return FinishedTrial(directory.name, trial, provenance, windows)
+    return FinishedTrial(directory.name, *trial_in(directory), windows)
 
 
 def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, FinishedTrial]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
+from experiments.running.attempts import JOB
 from experiments.running.migration import migrate
+from experiments.running.provenance import Provenance, inputs_of
 from experiments.running.shared_runs import SharedTraining
 from experiments.running.trial import Trial
 from hma_jax.config import ConfigError, ExecutionConfig
@@ -24,3 +28,16 @@ def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, SharedTrai
         raise ConfigError(f"job.json: not a job of this project ({error!r}); run its study again") from error
     shared = from_dict(SharedTraining, record.get("shared", {}))
     return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | former_execution), shared
+
+
+def trial_in(directory: Path) -> tuple[Trial, Provenance]:
+    """A finished trial and what it depends on, by the job.json in its directory. Raises ConfigError where that cannot be
+    read."""
+    try:
+        job = json.loads((directory / JOB).read_text())
+        return read_job(job)[0], inputs_of(job["provenance"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{directory}: the description of the finished trial cannot be read ({error}); copy the trial again from "
+            "where it ran, or remove the directory to run it again"
+        ) from error

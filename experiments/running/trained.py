@@ -6,16 +6,16 @@ has trials of other names with the same training.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-from experiments.running.attempts import JOB, RESULT, RUN
+from experiments.running.attempts import RESULT, RUN
 from experiments.running.closure import Closure, changed
-from experiments.running.job import read_job
-from experiments.running.provenance import Provenance, inputs_of, read_record
+from experiments.running.job import trial_in
+from experiments.running.provenance import Provenance, read_record
 from experiments.running.trial import Trial, trial_id
+from hma_jax.config import ConfigError
 from hma_jax.training.run_lock import CHECKPOINTS
 
 
@@ -32,10 +32,8 @@ def find_trained(
         if not (directory / RUN / CHECKPOINTS).is_dir():
             continue
         try:
-            job = json.loads((directory / JOB).read_text())
-            trial, inputs = read_job(job)[0], inputs_of(job["provenance"])
-            ran = read_record(directory)
-        except (OSError, ValueError, KeyError, TypeError):  # ConfigError is a ValueError
+            (trial, inputs), ran = trial_in(directory), read_record(directory)
+        except (OSError, ConfigError):
             continue
         alike = replace(inputs, manifest=provenance.manifest) == provenance  # the manifest is what it is judged on
         same = sources is None or (ran is not None and not any(changed(c, sources) for c in ran.sources().values()))

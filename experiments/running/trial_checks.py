@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.running.attempts import JOB, RESULT, RUN
 from experiments.running.closure import Closure, changed, closure_hash
-from experiments.running.job import read_job
-from experiments.running.provenance import CodeChanged, inputs_of, read_record
+from experiments.running.job import trial_in
+from experiments.running.provenance import CodeChanged, read_record
 from experiments.running.result_file import read_result
 from experiments.running.trial import trial_id
 from experiments.terminal.words import few
-from hma_jax.config import ConfigError, require
+from hma_jax.config import require
 from hma_jax.training.run_lock import CHECKPOINTS
 
 
@@ -37,14 +36,7 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
         directory = trials / id
         if (directory / RESULT).exists():
             read_result(directory)
-            try:
-                job = json.loads((directory / JOB).read_text())
-                actual_id = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
-            except (OSError, ValueError, KeyError, TypeError) as error:
-                raise ConfigError(
-                    f"{directory}: the description of the finished trial cannot be read ({error}). Copy the trial "
-                    "again from where it ran, or remove the directory to run it again"
-                ) from error
+            actual_id = trial_id(*trial_in(directory))
             require(
                 actual_id == id,
                 f"{directory}: its {JOB} describes trial {actual_id}: it was renamed or edited. Remove the directory "
