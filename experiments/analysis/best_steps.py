@@ -100,8 +100,7 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
 
     Raises NotComparable unless all tables are of the same windows, of at least two episodes.
     """
-    first = next(iter(tables.values()))
-    first = first.among(robots)
+    first = next(iter(tables.values())).among(robots)
     matched = {}
     for steps, table in tables.items():
         own = table.among(robots)

@@ -9,7 +9,8 @@ over seeds. Of a metric that a model lacks where it should have it there is no d
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,10 +51,11 @@ def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mappi
     NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.fittable):
-        for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
-            ends = _ends(sweep, series, provenance, windows)
-            if ends is not None:
-                found += [c for metric in METRICS if (c := _change(sweep, series, ends, metric)) is not None]
+        points = [p for p in sweep.points if p.role == POINT]
+        for series in dict.fromkeys(p.series for p in points):
+            trials = finished_by_x((p for p in points if p.series == series), provenance, windows)
+            if len(trials) > 1:
+                found += _changes(sweep, series, {x: trials[x] for x in (min(trials), max(trials))}, METRICS)
     return found
 
 
@@ -64,34 +66,31 @@ def find_differences(
     NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.labels):
-        trials = _finished(sweep, "", provenance, windows)
+        own = [p for p in sweep.points if p.role == POINT and not p.series]
+        trials = finished_by_x(own, provenance, windows)
         for x in sorted(trials.keys() - {sweep.reference_x}):
-            ends = {at: trials.get(at, {}) for at in (sweep.reference_x, x)}
-            if set.intersection(*(set(side) for side in ends.values())):
-                found += [c for metric in OF_VARIANTS if (c := _change(sweep, "", ends, metric)) is not None]
+            found += _changes(sweep, "", {at: trials.get(at, {}) for at in (sweep.reference_x, x)}, OF_VARIANTS)
     return found
 
 
 Ends = Mapping[float, Mapping[int, tuple[Point, WindowTable]]]
 
 
-def _finished(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends:
-    """{x: {seed: its trial}} of one curve."""
-    trials: dict[float, dict[int, tuple[Point, WindowTable]]] = {}
-    for point in sweep.points:
-        table = windows.get(trial_id(point.trial, provenance))
-        if point.role == POINT and point.series == series and table is not None:
-            trials.setdefault(point.x, {})[point.trial.train.seed] = point, table
-    return trials
+def finished_by_x(points: Iterable[Point], provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends:
+    """{x: {seed: (the point, its windows)}} of the `points` of one curve whose trials are finished."""
+    trials: dict[float, dict[int, tuple[Point, WindowTable]]] = defaultdict(dict)
+    for point in points:
+        if (table := windows.get(trial_id(point.trial, provenance))) is not None:
+            trials[point.x][point.trial.train.seed] = point, table
+    return dict(trials)
 
 
-def _ends(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends | None:
-    """The trials at the first and at the last x; None unless these share a seed."""
-    trials = _finished(sweep, series, provenance, windows)
-    if len(trials) < 2:
-        return None
-    ends = {x: trials[x] for x in (min(trials), max(trials))}
-    return ends if set.intersection(*(set(side) for side in ends.values())) else None
+def _changes(sweep: Sweep, series: str, ends: Ends, metrics: Sequence[str]) -> list[Change]:
+    """The change of each of `metrics` between two ends, first the one that the others are compared with; none unless
+    these share a seed."""
+    if not set.intersection(*map(set, ends.values())):
+        return []
+    return [c for metric in metrics if (c := _change(sweep, series, ends, metric)) is not None]
 
 
 def _change(sweep: Sweep, series: str, ends: Ends, metric: str) -> Change | None:

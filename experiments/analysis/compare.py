@@ -100,7 +100,9 @@ def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> 
     pairs = _pairs(a, b)
     if not all(metric in table.metrics for pair in pairs for table in pair):
         return None
-    return next(iter(_of_metric(metric, *_panels((a, b), pairs, metric, robots), by_robot=False)), None)
+    of_a, of_b = _panels((a, b), pairs, metric, robots)
+    known = of_a.known & of_b.known
+    return _difference(OVERALL, metric, of_a.rows(known), of_b.rows(known)) if known.any() else None
 
 
 def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
@@ -144,16 +146,12 @@ def lacks_numbers(metric: str, values: np.ndarray) -> np.ndarray:
     return none & ~none.all(0) if metric in OPTIONAL_METRICS else none
 
 
-def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[Difference]:
-    """Over the windows that have it, of which there may be none."""
+def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
+    """Of each robot, and overall where there are several, over the windows that have it, of which there may be none."""
     known = a.known & b.known
-    robots = list(dict.fromkeys(a.robot[known].tolist()))
-    chosen = [(robot, known & (a.robot == robot)) for robot in robots]
-    if not robots:
-        return []
-    rows = [(OVERALL, known), *chosen] if len(robots) > 1 else chosen
-    if not by_robot:
-        rows = [(OVERALL, known)]
+    rows = [(robot, known & (a.robot == robot)) for robot in dict.fromkeys(a.robot[known].tolist())]
+    if len(rows) > 1:
+        rows.insert(0, (OVERALL, known))
     return [_difference(scope, metric, a.rows(index), b.rows(index)) for scope, index in rows]
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from experiments.analysis.changes import METRICS
+from experiments.analysis.changes import METRICS, finished_by_x
 from experiments.analysis.compare import Side, overall_difference
 from experiments.analysis.paired import NoNumbers
 from experiments.running.provenance import Provenance
@@ -81,17 +81,13 @@ def _along(
     windows: Mapping[str, WindowTable],
     used: Mapping[Trial, Mapping[str, int]],
 ) -> list[Growth]:
-    trials: dict[float, dict[int, tuple[Trial, WindowTable]]] = {}
-    for p in points:
-        if (table := windows.get(trial_id(p.trial, provenance))) is not None:
-            trials.setdefault(p.x, {})[p.trial.train.seed] = p.trial, table
-    found = []
+    trials, found = finished_by_x(points, provenance, windows), []
     for first, last in pairwise(sorted(trials)):
         seeds = trials[first].keys() & trials[last].keys()
         if not seeds:
             continue
         # Subsets of one seed are nested, so a sum over seeds is larger where any seed has more.
-        before, after = (sum((Counter(used[trials[x][s][0]]) for s in seeds), Counter()) for x in (first, last))
+        before, after = (sum((Counter(used[trials[x][s][0].trial]) for s in seeds), Counter()) for x in (first, last))
         known = [name for name in sweep.scope if name in before and name in after]
         groups = {
             GROWS: [name for name in known if after[name] > before[name]],
