@@ -75,16 +75,12 @@ def _count_parameters(model: ModelConfig, table: EmbodimentTable) -> int:
     return declare_model(model, table).count()
 
 
-def declared_table(names: Sequence[str], rate: float | None) -> EmbodimentTable:
+@functools.cache
+def declared_table(names: tuple[str, ...], rate: float | None) -> EmbodimentTable:
     """Embodiments with the right action sizes and no statistics.
 
     Raises ConfigError for a name that the registry does not know.
     """
-    return _declare(tuple(names), rate)
-
-
-@functools.cache
-def _declare(names: tuple[str, ...], rate: float | None) -> EmbodimentTable:
     from data_pipelines.registry import get_spec
 
     def entry(spec: DatasetSpec) -> Embodiment:

@@ -18,7 +18,7 @@ from experiments.running.trial import trial_id
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial
 from experiments.terminal.progress import tidy_table
-from experiments.terminal.words import counted, in_thousands
+from experiments.terminal.words import counted, duration, in_thousands
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def plan_table(
     if left:
         table.caption += _caption(study, left, devices, before, evaluated)
     elif before.seconds or before.unknown:  # it is made before trials are looked at
-        table.caption += f"About {_duration(before.seconds)} to prepare: {describe(before, _duration)}."
+        table.caption += f"About {duration(before.seconds)} to prepare: {describe(before)}."
     seeds = {p.trial.train.seed for p in plans.values()}
     shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
     axes, places = _axes(sweeps, done.provenance), _places(sweeps, done.provenance)
@@ -83,7 +83,7 @@ def plan_table(
             in_thousands(cost.parameters),
             in_thousands(cost.parameters_one_robot),
             "" if over else _flops(plan.flops).removesuffix("FLOP"),
-            over or _duration(plan.seconds),
+            over or duration(plan.seconds),
         )
     return table
 
@@ -112,17 +112,17 @@ def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before:
     if len(plans) == 1:
         what = "to train" if not evaluated else "for the trial"
     elif devices.at_once is None:
-        what = f"for the trials, one after the other; {_duration(alone)} if the cluster runs all at the same time"
+        what = f"for the trials, one after the other; {duration(alone)} if the cluster runs all at the same time"
     else:
         what = f"for the trials, {'one after the other' if workers == 1 else f'{workers} at a time'}"
     if not before.seconds and not before.unknown:
-        whole = f"About {_duration(spent)} {what}"
+        whole = f"About {duration(spent)} {what}"
     elif before.unknown:
-        whole = f"About {_duration(spent)} {what}, and the preparation: {describe(before, _duration)}"
+        whole = f"About {duration(spent)} {what}, and the preparation: {describe(before)}"
     else:
         whole = (
-            f"About {_duration(before.seconds + spent)} in all: {_duration(before.seconds)} to prepare "
-            f"({describe(before, _duration)}) and {_duration(spent)} {what}"
+            f"About {duration(before.seconds + spent)} in all: {duration(before.seconds)} to prepare "
+            f"({describe(before)}) and {duration(spent)} {what}"
         )
     number = devices.each * workers
     each = f", {devices.each:g} for each trial," if workers > 1 else ""
@@ -170,10 +170,3 @@ def _flops(value: float) -> str:
         if value >= size:
             return f"{value / size:,.1f} {unit}FLOP"
     return f"{value / 1e6:,.1f} MFLOP"
-
-
-def _duration(seconds: float) -> str:
-    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:,.1f} {unit}"
-    return f"{seconds:.0f} s"

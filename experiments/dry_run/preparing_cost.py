@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from experiments.preparing.tokenizer import QUALITY_FRAMES
 from experiments.study import Study
+from experiments.terminal.words import duration
 from hma_jax.config import AnyTokenizerConfig, TokenizerConfig
 
 SIMULATED = 3000.0
@@ -34,7 +34,7 @@ class PreparingCost:
     simulating: float = 0.0
     tokenizer: float = 0.0
     tokens: float = 0.0
-    unknown: tuple[str, ...] = field(default=())  # datasets whose number of frames the registry does not have
+    unknown: tuple[str, ...] = ()  # datasets whose number of frames the registry does not have
     datasets: int = 0  # those too
 
     @property
@@ -122,8 +122,8 @@ def tokenizer_flops(config: AnyTokenizerConfig) -> tuple[float, float]:
     return total_flops(count_products(encode, shapes, image)), total_flops(count_products(train, shapes, image, key))
 
 
-def describe(cost: PreparingCost, duration: Callable[[float], str]) -> str:
-    """In words; `duration` writes seconds."""
+def describe(cost: PreparingCost) -> str:
+    """In words."""
     parts = {"simulating": cost.simulating, "the tokenizer": cost.tokenizer, "tokens": cost.tokens}
     text = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds)
     if not cost.unknown:

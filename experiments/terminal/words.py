@@ -21,6 +21,14 @@ def in_thousands(n: int) -> str:
     return f"{n / 1e6:,.1f} M" if n >= 1e6 else f"{n / 1e3:,.1f} k"
 
 
+def duration(seconds: float) -> str:
+    """'119 s', '2.0 min', '2.5 h', '3.0 days'."""
+    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:,.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
 def number(value: float, error: float, sign: str = "") -> str:
     """`value` to two digits of its standard error, and four after the point at most; what rounds to zero has no minus.
     `sign`: "+" for one before every value."""

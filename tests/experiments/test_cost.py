@@ -23,6 +23,7 @@ from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import Accelerators
 from experiments.sweeps.registry import find_axis, plan_sweeps
 from experiments.sweeps.sweep import POINT, reference_trial
+from experiments.terminal.words import duration
 from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MaskingConfig, MeshConfig
 from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model
@@ -267,10 +268,10 @@ def test_robots_without_actions_that_are_to_be_trained_alone_are_refused_before_
 
 def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     before = estimate_preparing(PAPER)
-    words = describe(before, lambda seconds: f"{seconds:.0f} s")
+    words = describe(before)
     assert words.startswith("unknown for 38 of 40 datasets")
-    assert f"{before.seconds:.0f} s with the other 2 alone" in words
-    assert describe(replace(before, unknown=("a", "b"), datasets=2), str) == (
+    assert f"{duration(before.seconds)} with the other 2 alone" in words
+    assert describe(replace(before, unknown=("a", "b"), datasets=2)) == (
         "unknown for 2 of 2 datasets, because the registry does not have their number of frames"
     )
     assert main(["sweep", "width", "--preset", "paper", "--dry-run"]) == 0

@@ -227,8 +227,8 @@ def test_paper_preset_has_the_papers_sizes():
 
 
 def test_declared_table_knows_what_the_registry_knows():
-    table = declared_table(["bc_z", "bridge_dataset"], rate=2.0)
+    table = declared_table(("bc_z", "bridge_dataset"), rate=2.0)
     assert [(e.action_dim, e.stride) for e in table.entries] == [(7, 5), (7, 3)]
     assert ONE_ROBOT.action_width == 2
     with pytest.raises(ConfigError, match="unknown dataset"):
-        declared_table(["bridge_datase"], rate=2.0)
+        declared_table(("bridge_datase",), rate=2.0)
