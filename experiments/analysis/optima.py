@@ -23,6 +23,7 @@ from experiments.analysis.rows import (
     CurvePoint,
     Row,
     all_series,
+    by_seed,
     curve,
     difference,
     of_sweep,
@@ -131,7 +132,7 @@ def _optimum(
         if base.x in lost:
             penalties = [math.inf]
         elif transferred_point:
-            penalties = cross_validated_penalties(points, of_base) or _by_seed(transferred_point, best) or [math.nan]
+            penalties = cross_validated_penalties(points, of_base) or by_seed(transferred_point, best) or [math.nan]
     return Optimum(
         sweep, metric, role, series, best.x, edge,
         loss=best.mean, seed_sem=best.seed_sem, near_low=low, near_high=high, moved=moved, transferred_x=transferred,
@@ -159,7 +160,7 @@ def told_worse(points: Iterable[CurvePoint], best: CurvePoint) -> set[float]:
     Of a point that scatters more than the curve's median one, the median error counts: where training is about to
     diverge, seeds scatter so much that no loss could be told from the best. It takes two seeds in common.
     """
-    beside = {p.x: (*difference(p, best), len(_by_seed(p, best))) for p in points if p.x != best.x}
+    beside = {p.x: (*difference(p, best), len(by_seed(p, best))) for p in points if p.x != best.x}
     known = {x: of_seeds for x, of_seeds in beside.items() if math.isfinite(of_seeds[1])}
     usual = statistics.median([error for _, error, _ in known.values()] or [math.nan])
     return {x for x, (mean, error, seeds) in known.items() if mean > -stdtrit(seeds - 1, 0.05) * min(error, usual)}
@@ -179,11 +180,6 @@ def cross_validated_penalties(points: Sequence[CurvePoint], of_base: Sequence[Cu
         best, transferred = (min(c, key=lambda x, c=c: add_up(c[x][s] for s in others)) for c in (own, base))
         penalties.append(own[transferred][seed] - own[best][seed])
     return penalties
-
-
-def _by_seed(a: CurvePoint, b: CurvePoint) -> list[float]:
-    """a minus b of every seed that both have."""
-    return [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
 
 
 def _of(rows: Iterable[Row], sweep: str, role: str, series: str) -> list[Row]:

@@ -137,28 +137,27 @@ def training_loss(result: dict[str, Any]) -> Stat:
 def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
     """results.csv and robots.parquet, each whole or not at all."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
+
+    from hma_jax.evaluation.windows import write_arrow
 
     rows = list(rows)
     write_csv(workspace.results, Row, (r for r in rows if not r.of_robot))
     of_robots = [r for r in rows if r.of_robot]
     columns = {f.name: [getattr(r, f.name) for r in of_robots] for f in dataclasses.fields(Row)}
-    content = io.BytesIO()
-    pq.write_table(pa.table(columns), content, compression="zstd", write_page_checksum=True)
-    write_file(workspace.robots, content.getvalue())
+    write_arrow(workspace.robots, pa.table(columns))
 
 
 def read_rows(workspace: Workspace) -> list[Row]:
     """What `write_rows` wrote; earlier versions wrote all into results.csv. Raises ConfigError for a damaged table."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
+
+    from hma_jax.evaluation.windows import read_arrow
 
     rows = read_csv(workspace.results)
     if not workspace.robots.exists():
         return rows
     try:
-        of_robots = pq.read_table(workspace.robots, page_checksum_verification=True).to_pylist()
-        return rows + [Row(**record) for record in of_robots]
+        return rows + [Row(**record) for record in read_arrow(workspace.robots).to_pylist()]
     except (pa.ArrowException, OSError, TypeError) as error:
         raise ConfigError(
             f"{workspace.robots}: not a table of rows ({error}); restore the file, or remove it and draw it again from "
@@ -266,12 +265,17 @@ def curve(
     return points
 
 
+def by_seed(a: CurvePoint, b: CurvePoint) -> list[float]:
+    """a minus b of every seed that both have."""
+    return [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
+
+
 def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
     """a minus b over the seeds that both have, and its standard error over seeds (nan for one).
 
     Paired: a seed draws the same windows and, where parameters agree, the same initial values.
     """
-    pairs = [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
+    pairs = by_seed(a, b)
     if not pairs:
         return math.nan, math.nan
     mean = add_up(pairs) / len(pairs)

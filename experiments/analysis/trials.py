@@ -18,7 +18,6 @@ trial without one are null.
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -28,7 +27,6 @@ from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.summary import Summary
-from hma_jax.runtime.files import write_file
 
 
 def trial_row(
@@ -63,14 +61,12 @@ def trial_row(
 def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     """Writes the rows, which need not have the same columns; whole or not at all."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
+
+    from hma_jax.evaluation.windows import write_arrow
 
     rows = list(rows)
     columns = dict.fromkeys(name for row in rows for name in row)
-    table = pa.table({name: [row.get(name) for row in rows] for name in columns})
-    content = io.BytesIO()
-    pq.write_table(table, content, compression="zstd", write_page_checksum=True)
-    write_file(path, content.getvalue())
+    write_arrow(path, pa.table({name: [row.get(name) for row in rows] for name in columns}))
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:

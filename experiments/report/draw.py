@@ -60,12 +60,10 @@ def _draw(workspace: Workspace, record: Record) -> None:
     available = count_usable(workspace.data_summary)
     if fewer := find_fewer(unique_trials(sweeps, provenance), numbers.results, available):
         say(
-            f"note: trained on fewer trajectories than were asked for, since damaged ones are not replaced: {few(list(fewer))}"
+            f"note: trained on fewer trajectories than were asked for, since damaged ones are not replaced: {few(fewer)}"
         )
     if other := find_other_x(sweeps, provenance, numbers.results, available):
-        say(
-            f"note: x of the axis episodes is by the registry's entries, not by what was trained on: {few(list(other))}"
-        )
+        say(f"note: x of the axis episodes is by the registry's entries, not by what was trained on: {few(other)}")
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
     others = write_tables(workspace, record, sweeps, states, provenance, numbers.results)

@@ -58,29 +58,27 @@ def compute_numbers(
     return Numbers(results, windows, fit_study(sweeps, provenance, windows, draws), isoflop, outcomes)
 
 
-def find_fewer(
-    trials: Mapping[str, Trial], results: Mapping[str, Any], available: Mapping[str, int]
-) -> dict[str, None]:
+def find_fewer(trials: Mapping[str, Trial], results: Mapping[str, Any], available: Mapping[str, int]) -> list[str]:
     """Subsets of which finished trials found only a part, since the others were skipped when tokenising, in words."""
-    found: dict[str, None] = {}
+    found = []
     for id, trial in trials.items():
         asked, used = trajectories_of(trial, available), trajectories_of(trial, available, results.get(id))
         short = [name for name in asked if used.get(name, asked[name]) < asked[name]]
-        found |= {f"{used[name]} of {asked[name]} of {name} (seed {trial.train.seed})": None for name in short}
-    return found
+        found += [f"{used[name]} of {asked[name]} of {name} (seed {trial.train.seed})" for name in short]
+    return list(dict.fromkeys(found))
 
 
 def find_other_x(
     sweeps: Sequence[Sweep], provenance: Provenance, results: Mapping[str, Any], available: Mapping[str, int]
-) -> dict[str, None]:
+) -> list[str]:
     """Points of the axis `episodes` whose finished trials were trained on another number of trajectories, in words."""
-    found: dict[str, None] = {}
+    found = []
     for p in (p for sweep in sweeps if sweep.name == "episodes" for p in sweep.points):
         result = results.get(trial_id(p.trial, provenance), {})
         used = sum(trajectories_of(p.trial, available, result).values())
         if "trajectories" in result and used != p.x:
-            found[f"{used} at x = {p.x:g} (seed {p.trial.train.seed})"] = None
-    return found
+            found.append(f"{used} at x = {p.x:g} (seed {p.trial.train.seed})")
+    return list(dict.fromkeys(found))
 
 
 def read_numbers(workspace: Workspace, draws: int = DRAWS) -> Numbers:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -175,11 +175,8 @@ def _close(a: float, b: float) -> bool:
 
 
 def _trials(states: Mapping[str, State]) -> Check:
-    without: dict[str, int] = {}
-    for state in states.values():
-        if state.event != FINISHED:
-            without[state.event] = without.get(state.event, 0) + 1
-    done = len(states) - sum(without.values())
+    without = Counter(state.event for state in states.values() if state.event != FINISHED)
+    done = len(states) - without.total()
     rest = "".join(f", {n} {event}" for event, n in sorted(without.items()))
     text = f"{done} of {len(states)} finished{rest}."
     return Check("Every planned trial is finished.", "bad" if without else "good", text)
@@ -261,10 +258,6 @@ def _copying(robots: Sequence[Robot], whose: str) -> Check:
     return Check(name, "bad" if behind else "good", text + (f". Not on {behind}." if behind else "."))
 
 
-def _held_out(optima: Sequence[Optimum]) -> bool:
-    return any(o.metric == HELD_OUT_LOSS for o in optima)
-
-
 def _optima(optima: Sequence[Optimum], rows: Sequence[Row]) -> list[Check]:
     """Checks of the optimal learning rate of muP's curves, on held-out data where there is a likelihood.
 
@@ -272,7 +265,8 @@ def _optima(optima: Sequence[Optimum], rows: Sequence[Row]) -> list[Check]:
     either side a rate is significantly worse. It is open where the seeds do not tell it from an end of the grid: more
     seeds may.
     """
-    mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT_LOSS if _held_out(optima) else TRAINING_LOSS)]
+    judged_by = HELD_OUT_LOSS if any(o.metric == HELD_OUT_LOSS for o in optima) else TRAINING_LOSS
+    mup = [o for o in optima if (o.role, o.metric) == (POINT, judged_by)]
     if not mup:
         return []
     at_end = [o.series for o in mup if o.x in ends(rows, o.sweep, o.role, o.series)]

@@ -155,11 +155,7 @@ class WindowTable:
 
     def save(self, path: str | Path, trial: str) -> None:
         """Writes the Parquet file; whole or not at all, and the same bytes for the same numbers."""
-        import pyarrow.parquet as pq
-
-        content = io.BytesIO()
-        pq.write_table(self.to_arrow(trial), content, compression="zstd", write_page_checksum=True)
-        write_file(Path(path), content.getvalue())
+        write_arrow(Path(path), self.to_arrow(trial))
 
     @classmethod
     def load(cls, path: str | Path) -> WindowTable:
@@ -174,8 +170,17 @@ class WindowTable:
             raise ConfigError(f"{path}: the table of windows cannot be read ({reason}). Evaluate again.") from error
 
 
+def write_arrow(path: Path, table: pa.Table) -> None:
+    """Writes a table as Parquet, with checksums; whole or not at all."""
+    import pyarrow.parquet as pq
+
+    content = io.BytesIO()
+    pq.write_table(table, content, compression="zstd", write_page_checksum=True)
+    write_file(path, content.getvalue())
+
+
 def read_arrow(path: str | Path) -> pa.Table:
-    """The long form from a file. Raises OSError or pyarrow's exceptions."""
+    """What `write_arrow` wrote. Raises OSError or pyarrow's exceptions."""
     import pyarrow.parquet as pq
 
     with open(path, "rb") as file:  # its own error for a file that is not there

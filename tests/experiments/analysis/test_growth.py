@@ -65,8 +65,8 @@ def test_what_trials_were_trained_on_is_told_where_it_is_not_what_was_asked_for(
     assert not find_other_x([total], PROVENANCE, {}, THERE) and not find_other_x([total], PROVENANCE, results, THERE)
     id = next(id for id, trial in trials.items() if trial.max_trajectories == 8 and trial.train.seed == 0)
     results[id] = {"trajectories": {"pusher_sand": 3, "arm_sand": 5, "rover_road": 8}}
-    assert list(find_fewer(trials, results, THERE)) == ["5 of 8 of arm_sand (seed 0)"]
-    assert list(find_other_x([total], PROVENANCE, results, THERE)) == ["16 at x = 19 (seed 0)"]
+    assert find_fewer(trials, results, THERE) == ["5 of 8 of arm_sand (seed 0)"]
+    assert find_other_x([total], PROVENANCE, results, THERE) == ["16 at x = 19 (seed 0)"]
 
 
 def test_no_growth_is_told_where_robots_shares_of_the_windows_change():
