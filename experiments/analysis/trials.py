@@ -25,7 +25,7 @@ from typing import Any
 
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import leaves, to_dict
 from hma_jax.evaluation.summary import Summary
 
 
@@ -42,7 +42,8 @@ def trial_row(
     """One row; `result` is that of result.json (None: there is none), `loss` its training loss, `available` the
     training trajectories with windows that each robot has."""
     row = {"trial": id, "title": title, "status": status}
-    row |= {f"config.{path}": value for path, value in _flat(to_dict(trial))}
+    for path, value in leaves(to_dict(trial)).items():
+        row[f"config.{path}"] = json.dumps(value) if isinstance(value, list) else value
     row |= dataclasses.asdict(provenance)
     used = trajectories_of(trial, available, result)
     row["windows_drawn"] = trial.train.steps * trial.train.batch
@@ -67,12 +68,3 @@ def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     rows = list(rows)
     columns = dict.fromkeys(name for row in rows for name in row)
     write_arrow(path, pa.table({name: [row.get(name) for row in rows] for name in columns}))
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    """(dotted path, value) of everything that is no group of settings."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, json.dumps(value) if isinstance(value, list | tuple) else value

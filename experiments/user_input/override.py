@@ -16,7 +16,7 @@ from typing import Any, Literal
 from experiments.study import Study
 from experiments.user_input.settings_help import describe_settings, show_settings
 from hma_jax.config import ConfigError, ModelConfig, require
-from hma_jax.config.json import from_dict, to_dict
+from hma_jax.config.json import from_dict, leaves, to_dict
 
 ABBREVIATED = {"lr": "learning_rate", "batch_size": "batch", "num_steps": "steps"}
 """Names of other projects for the same."""
@@ -34,7 +34,7 @@ def override(study: Study, settings: Sequence[str], model: ModelConfig | None = 
     the ones before change them, and end the program as --help does.
     """
     values = to_dict(study) | ({} if model is None else {"model": to_dict(model)})
-    before = _leaves(values)
+    before = leaves(values)
     for setting in settings:
         path, separator, text = setting.partition("=")
         if not separator and path.split(".")[-1] == "help":
@@ -54,14 +54,14 @@ def _show(values: dict[str, Any], group: str) -> None:
         if one.path != OF_A_TRIAL and (not group or one.path == group or one.path.startswith(f"{group}."))
     ]
     if not found:
-        raise ConfigError(f"--set {group}.help: {_instead(values, group, _leaves(values))}")
+        raise ConfigError(f"--set {group}.help: {_instead(values, group, leaves(values))}")
     show_settings(found, f"Settings of preset {values['name']}; --set PATH=VALUE changes one")
 
 
 def _assign(values: dict[str, Any], before: Mapping[str, Any], path: str, text: str) -> None:
     """Puts the parsed `text` at `path`, in place, of the kind that stood there `before` any override: an earlier one of
     the same path may have left a whole number in the place of a fraction."""
-    known = _leaves(values)
+    known = leaves(values)
     if path not in known:
         raise ConfigError(f"--set {path}: {_instead(values, path, known)}")
     node = values
@@ -94,7 +94,7 @@ def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Collect
     """Settings probably meant by the rest of a path below `group`, by the first rule that finds any."""
     last = ABBREVIATED.get(rest[-1], rest[-1])
     known = [k for k in known if k != OF_A_TRIAL]
-    leaves = {k.split(".")[-1] for k in known}
+    last_parts = {k.split(".")[-1] for k in known}
 
     def in_group(cutoff: float) -> list[str]:
         near = difflib.get_close_matches(last, node, n=3, cutoff=cutoff) if len(rest) == 1 else []
@@ -111,7 +111,7 @@ def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Collect
         or list(dict.fromkeys(in_group(0.85) + by_leaf(last)))  # a typing error, or the right name in the wrong place
         or (in_group(0.6) if group else [])
         or difflib.get_close_matches(whole, known, n=3, cutoff=0.8)
-        or [k for leaf in difflib.get_close_matches(last, leaves, n=1, cutoff=0.8) for k in by_leaf(leaf)]
+        or [k for leaf in difflib.get_close_matches(last, last_parts, n=1, cutoff=0.8) for k in by_leaf(leaf)]
     )
 
 
@@ -155,11 +155,3 @@ def _json(path: str, text: str, expected: str) -> Any:
         if text == "None":
             return None
         raise ConfigError(f"--set {path}={text}: expected {expected}") from None
-
-
-def _leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Everything that is not a nested config, by its dotted path."""
-    found = {}
-    for key, value in values.items():
-        found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return found

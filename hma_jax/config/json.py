@@ -102,6 +102,14 @@ def _by_kind(options: list[Any], value: Any, where: str) -> Any:
     return kinds[value["kind"]]
 
 
+def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every value of `to_dict`'s output that is no nested config, by its dotted path."""
+    found = {}
+    for name, value in values.items():
+        found |= leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
+
+
 def to_json(config: Any) -> str:
     return json.dumps(to_dict(config), indent=2, sort_keys=True)
 
