@@ -63,9 +63,7 @@ def evaluate(
     evaluate_model(make_setup(arguments), run, weights, to, replace)
 
 
-def evaluate_model(
-    setup: StudySetup, run: Path, weights: Weights, to: Path | None = None, replace: bool = False
-) -> None:
+def evaluate_model(setup: StudySetup, run: Path, weights: Weights, to: Path | None, replace: bool) -> None:
     """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may
     be replaced."""
     from hma_jax.runtime.processes import is_writer

@@ -46,9 +46,7 @@ def tokenize(
     prepare_together(make_setup(arguments), batch, threads, replacement.replace)
 
 
-def prepare_together(
-    setup: StudySetup, batch: int | None = None, threads: int | None = None, replace: Step | None = None
-) -> None:
+def prepare_together(setup: StudySetup, batch: int | None, threads: int | None, replace: Step | None) -> None:
     """Everything up to training. If another command prepares the same directory, takes part in its tokenising."""
     from experiments.preparing.pipeline import prepare
 

@@ -26,7 +26,7 @@ from experiments.preparing.made_from import Step, may_replace
 from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
 from experiments.running.workspace import Workspace
-from experiments.study_setup import UNSET, StudyArguments, StudySetup, make_setup
+from experiments.study_setup import UNSET, StudySetup, make_setup
 from experiments.sweeps.sweep import reference_trial
 from experiments.terminal.progress import console, say, short, step, wrote
 from experiments.terminal.words import counted, few
@@ -116,59 +116,12 @@ def adapt(
         hosts: Several processes that train together, on one host or on many.
         everything: Train the whole model, not only the new robots' own parameters.
     """
-    hosts.join()
-    adapt_model(
-        arguments,
-        source,
-        model.directory(),
-        options,
-        everything=everything,
-        trajectories=model.trajectories,
-        replace=replacement.replace,
-    )
-
-
-def train_model(
-    setup: StudySetup,
-    run: Path,
-    options: RunOptions,
-    *,
-    trajectories: int | None = None,
-    replace: Step | None = None,
-    initial: Run | None = None,
-) -> None:
-    """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
-    the run `initial` on where one is given, which knows its robots."""
-    origin = _check(setup, run, trajectories, options, initial)
-    _require_devices(setup)
-    if initial is None:
-        _say_scale(setup, trajectories)
-    _prepare(setup, replace)
-    start = {}
-    if initial is not None:
-        kept = [name for name in initial.table.names if name not in known_datasets(initial, setup)]
-        if kept:
-            say(f"note: unchanged, because the study has no data of them: {', '.join(kept)}")
-        start = {"table": initial.table, "initial": initial.params, "origin": origin}
-    _train(setup, _single_trial(setup, trajectories), run, options, **start)
-
-
-def adapt_model(
-    arguments: StudyArguments,
-    source: Path,
-    run: Path | None,
-    options: RunOptions,
-    *,
-    everything: bool = False,
-    trajectories: int | None = None,
-    replace: Step | None = None,
-) -> None:
-    """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.dry_run.trainable import require_only
     from experiments.running.initial_model import add_robots
     from experiments.running.run_trial import open_prepared_data
 
-    run = run or arguments.anywhere().out / "model"
+    hosts.join()
+    run = model.directory() or arguments.anywhere().out / "model"
     trained, gone = load_initial(source, run), not source.exists()
     setup = setup_of(source, trained, arguments)
     study = setup.study
@@ -185,12 +138,12 @@ def adapt_model(
     )
     _say_average(setup)
     require_other_directory(source, run)
-    origin = _check(setup, run, trajectories, options, trained)
+    origin = _check(setup, run, model.trajectories, options, trained)
     train = dataclasses.replace(study.train, seed=study.seeds[0], only=() if everything else tuple(new))
     require_only(train, new, study.rate)
     _require_devices(setup)
-    _prepare(setup, replace)
-    trial = dataclasses.replace(_single_trial(setup, trajectories), train=train)
+    _prepare(setup, replacement.replace)
+    trial = dataclasses.replace(_single_trial(setup, model.trajectories), train=train)
     if gone:
         beginning = {"table": trained.table, "initial": trained.params, "origin": origin}
     else:
@@ -198,6 +151,31 @@ def adapt_model(
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
     _train(setup, trial, run, options, **beginning)
+
+
+def train_model(
+    setup: StudySetup,
+    run: Path,
+    options: RunOptions,
+    *,
+    trajectories: int | None,
+    replace: Step | None,
+    initial: Run | None,
+) -> None:
+    """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
+    the run `initial` on where one is given, which knows its robots."""
+    origin = _check(setup, run, trajectories, options, initial)
+    _require_devices(setup)
+    if initial is None:
+        _say_scale(setup, trajectories)
+    _prepare(setup, replace)
+    start = {}
+    if initial is not None:
+        kept = [name for name in initial.table.names if name not in known_datasets(initial, setup)]
+        if kept:
+            say(f"note: unchanged, because the study has no data of them: {', '.join(kept)}")
+        start = {"table": initial.table, "initial": initial.params, "origin": origin}
+    _train(setup, _single_trial(setup, trajectories), run, options, **start)
 
 
 def _check(
