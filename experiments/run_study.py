@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from data_pipelines.registry import DatasetSpec, find_spec, register
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.report.draw import draw
@@ -16,7 +17,7 @@ from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import DIVERGED, FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
-from experiments.running.provenance import Provenance
+from experiments.running.provenance import Provenance, trial_closure
 from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import latest_common, share_runs
 from experiments.running.slots import find_accelerators
@@ -36,10 +37,6 @@ from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import EXPIRES, Lock, find_held, machine
-
-if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
-
 
 POLL_SECONDS = 1.0
 """Seconds between two checks whether a lease is over."""
@@ -74,7 +71,6 @@ def run_study(
     from experiments.dry_run.trainable import require_trainable
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
-    from experiments.running.provenance import trial_closure
 
     study, workspace = setup.study, setup.workspace
     if not setup.data:
@@ -148,7 +144,6 @@ def prepare_apart(setup: StudySetup, replace: Step | None) -> Provenance:
     accelerators = find_accelerators()
     if accelerators is None:
         return _prepare(setup, replace)
-    from data_pipelines.registry import find_spec
 
     specs = [find_spec(name) for name in setup.study.all_names()]
     own = [spec for spec in specs if spec is not None]
@@ -160,7 +155,6 @@ def _prepare(
 ) -> Provenance:
     """`specs`: registry entries, of which a new process lacks the user's own; `accelerator`: the kind that is here."""
     require_accelerator(accelerator)
-    from data_pipelines.registry import register
     from experiments.preparing.pipeline import prepare
 
     register(specs)

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from data_pipelines.registry import DatasetSpec, find_spec
 from data_pipelines.sampling.splits import HeldOut
 from hma_jax.config import (
     AnyTokenizerConfig,
@@ -28,9 +29,6 @@ from hma_jax.config import (
     require,
 )
 from hma_jax.config.base import require_seed
-
-if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
 
 SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
@@ -299,7 +297,6 @@ def without_equal_caps(study: Study) -> Study:
 def most_trajectories(study: Study) -> int | None:
     """Training trajectories of the largest dataset, as the registry says; where it does not say how many are held out,
     with those. None where it does not say it of all."""
-    from data_pipelines.registry import find_spec
 
     specs = [find_spec(name) for name in study.dataset_names()]
     counts = [count_trained_on(spec, study.store) or spec.episodes if spec else 0 for spec in specs]

@@ -16,6 +16,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
+from data_pipelines.registry import all_specs, find_spec, register
+from data_pipelines.registry.mixtures import get_mixture
 from experiments.presets import get_preset
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace, find_record
@@ -158,8 +160,6 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
         )
     use_entries(arguments.registry)
     if arguments.mixture is not None:
-        from data_pipelines.registry.mixtures import get_mixture
-
         names = get_mixture(arguments.mixture)
         study = on_user_data(study, names)
         data = find_directories(names, data) if data else ()
@@ -196,7 +196,6 @@ def _with_earlier_caps(study: Study, workspace: Workspace) -> Study:
 def use_entries(registry: Path | None) -> None:
     """Adds the entries of a TOML file to the registry, for the rest of this process."""
     if registry is not None:
-        from data_pipelines.registry import register
         from data_pipelines.registry.toml_file import load_entries
 
         register(load_entries(registry))
@@ -207,7 +206,6 @@ def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
     unused ones: the heading of such a one may be misspelt, which reads as an entry of another dataset."""
     if registry is None:
         return
-    from data_pipelines.registry import all_specs, find_spec
     from data_pipelines.registry.toml_file import load_entries
 
     joining = {part: spec.name for spec in all_specs() for part in spec.joins}
@@ -231,7 +229,6 @@ def under_another_name(names: Sequence[str]) -> str:
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:
     """`<root>/<name>` for every name, or those that its entry joins, in the first root that has it. ConfigError for
     those missing."""
-    from data_pipelines.registry import find_spec
     from data_pipelines.sources.rlds.location import locate
 
     entries = {name: find_spec(name) for name in names}

@@ -15,7 +15,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from experiments.analysis.intervals import OVERALL
 from experiments.running.attempts import State
@@ -26,11 +26,10 @@ from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.sweep import CONTROL, POINT, Point, Sweep
 from hma_jax.config import ConfigError
+from hma_jax.evaluation.statistics import Stat
 from hma_jax.evaluation.sums import add_up
+from hma_jax.evaluation.windows import read_arrow, write_arrow
 from hma_jax.runtime.files import write_file
-
-if TYPE_CHECKING:
-    from hma_jax.evaluation.statistics import Stat
 
 UNTRAINED = "untrained"
 """The role of the reference trial before its first step."""
@@ -99,7 +98,6 @@ def collect(
 def _rows(
     sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, origin: dict[str, Any]
 ) -> list[Row]:
-    from hma_jax.evaluation.statistics import Stat
     from hma_jax.evaluation.summary import Summary
 
     def row(role: str, scope: str, metric: str, stat: Stat) -> Row:
@@ -129,7 +127,6 @@ def _rows(
 
 def training_loss(result: dict[str, Any]) -> Stat:
     """The mean of a run's last steps. Results of earlier versions hold the loss of every step instead."""
-    from hma_jax.evaluation.statistics import Stat
 
     return Stat(**(result.get("training_loss") or last_loss(result["losses"])))
 
@@ -137,8 +134,6 @@ def training_loss(result: dict[str, Any]) -> Stat:
 def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
     """results.csv and robots.parquet, each whole or not at all."""
     import pyarrow as pa
-
-    from hma_jax.evaluation.windows import write_arrow
 
     rows = list(rows)
     write_csv(workspace.results, Row, (r for r in rows if not r.of_robot))
@@ -150,8 +145,6 @@ def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
 def read_rows(workspace: Workspace) -> list[Row]:
     """What `write_rows` wrote; earlier versions wrote all into results.csv. Raises ConfigError for a damaged table."""
     import pyarrow as pa
-
-    from hma_jax.evaluation.windows import read_arrow
 
     rows = read_csv(workspace.results)
     if not workspace.robots.exists():

@@ -27,6 +27,7 @@ from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of
 from hma_jax.config.json import leaves, to_dict
 from hma_jax.evaluation.summary import Summary
+from hma_jax.evaluation.windows import write_arrow
 
 
 def trial_row(
@@ -62,8 +63,6 @@ def trial_row(
 def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     """Writes the rows, which need not have the same columns; whole or not at all."""
     import pyarrow as pa
-
-    from hma_jax.evaluation.windows import write_arrow
 
     rows = list(rows)
     columns = dict.fromkeys(name for row in rows for name in row)

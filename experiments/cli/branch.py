@@ -9,6 +9,8 @@ from tyro.conf import Positional, arg
 
 from experiments.study_setup import UNSET
 from experiments.terminal.progress import say, short, wrote
+from hma_jax.config import require
+from hma_jax.training.run_lock import require_plain
 
 
 def branch(
@@ -28,10 +30,8 @@ def branch(
         run: Directory of the new run; it must not exist. Its tokenizer is found if it lies beside RUN.
         step: Step of the checkpoint; the newest without this option. `hma train --keep-every` keeps earlier ones.
     """
-    from hma_jax.config import require
     from hma_jax.training.branch import FILE
     from hma_jax.training.branch import branch as branch_run
-    from hma_jax.training.run_lock import require_plain
 
     require_plain(source)
     require_plain(run)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from data_pipelines.registry import find_spec
 from experiments.cli.command_line import Commands
 from experiments.presets import get_preset
 from experiments.terminal.progress import say, wrote
@@ -212,7 +213,6 @@ def _decode(run: Path, temperature: float | None, unmask_steps: int | None, late
 def _rates(run: Run) -> tuple[str, list[str]]:
     """Registry entries of the run's robots, at the rates that give their strides; notes on robots that have none, or
     need more than a rate."""
-    from data_pipelines.registry import find_spec
     from data_pipelines.registry.toml_file import to_toml
 
     entries, unknown, other, thinned = [], [], [], []

@@ -13,14 +13,16 @@ from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
 from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
 from experiments.running.attempts import EVALUATING, JOB
+from experiments.running.provenance import closure_hash, trial_closure
 from experiments.running.result_file import SAMPLES
 from experiments.study_setup import UNSET, StudySetup, make_setup, require_local, under_another_name
 from experiments.terminal.progress import TidyTable, console, say, short, step, tidy_table, wrote
 from experiments.terminal.words import few, plus_minus
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict, to_dict, to_strict_json
+from hma_jax.evaluation.windows import FILE
 from hma_jax.runtime.files import write_file
-from hma_jax.training.run_lock import CHECKPOINTS
+from hma_jax.training.run_lock import CHECKPOINTS, EVALUATION, locked_run
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
@@ -67,7 +69,6 @@ def evaluate_model(setup: StudySetup, run: Path, weights: Weights, to: Path | No
     """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may
     be replaced."""
     from hma_jax.runtime.processes import is_writer
-    from hma_jax.training.run_lock import EVALUATION, locked_run
     from hma_jax.training.runs import load_run
 
     require_local("--to", to)
@@ -82,10 +83,8 @@ def evaluate_model(setup: StudySetup, run: Path, weights: Weights, to: Path | No
 
 
 def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: bool) -> None:
-    from experiments.running.provenance import closure_hash, trial_closure
     from experiments.running.run_trial import evaluate_on, open_prepared_data, write_evaluation
     from hma_jax.evaluation.parts import Parts
-    from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
     from hma_jax.training.hashes import read_list
 

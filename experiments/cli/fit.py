@@ -10,15 +10,18 @@ from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
+from experiments.running.attempts import read_states
+from experiments.running.ledger import MISSING, Ledger
+from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace, command_at, load_record
 from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, say, short, wrote
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
     from experiments.analysis.measured import Position
     from experiments.analysis.scaling import Curve, CurveFit
-    from experiments.running.provenance import Provenance
     from experiments.sweeps.sweep import Sweep
 
 
@@ -96,11 +99,8 @@ def _words(fitted: CurveFit) -> tuple[str, str, str]:
 def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...]) -> None:
     from experiments.analysis.predictions import predict, save_prediction
     from experiments.report.numbers import read_results, result_hashes
-    from experiments.running.attempts import read_states
-    from experiments.running.ledger import MISSING, Ledger
     from experiments.sweeps.registry import is_file, plan_sweeps
     from experiments.sweeps.sweep import unique_trials
-    from experiments.user_input.override import override
 
     workspace = Workspace(root.absolute())
     record = load_record(workspace)

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from data_pipelines.errors import DataError, EpisodeError, without_advice
+from data_pipelines.names import made_name
+from experiments.running.workspace import Workspace
 from experiments.study_setup import UNSET, command, require_local, use_entries
 from experiments.terminal.progress import Eta, say, step, wrote
 from experiments.terminal.words import counted
@@ -65,8 +68,6 @@ def generate(
         registry: TOML file with your own registry entries.
     """
     from data_pipelines.convert.write import convert
-    from data_pipelines.errors import DataError, EpisodeError, without_advice
-    from data_pipelines.names import made_name
     from data_pipelines.sources.convertible import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
@@ -78,7 +79,6 @@ def generate(
         open_trajectories,
     )
     from experiments.applications.simulators import DEAF, load_simulator
-    from experiments.running.workspace import Workspace
     from hma_jax.simulator.folder import change_decode, find_decode
 
     require_local("--out", out)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments.study_setup import UNSET
+from experiments.terminal.progress import console
 
 if TYPE_CHECKING:
     from hma_jax.runtime.processes import Processes
@@ -51,7 +52,6 @@ class Hosts:
         if not settings.several:
             return
         start(settings)
-        from experiments.terminal.progress import console
         from hma_jax.runtime.processes import is_writer
 
         console.quiet = not is_writer()

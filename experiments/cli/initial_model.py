@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data_pipelines.registry import get_spec
 from experiments.cli.evaluate import check_tokenizer, tokenizer_mismatch
 from experiments.running.workspace import Workspace
 from experiments.study_setup import StudyArguments, StudySetup, make_setup
@@ -27,7 +28,6 @@ def setup_of(source: Path, trained: Run, arguments: StudyArguments) -> StudySetu
 
     Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
     """
-    from data_pipelines.registry import get_spec
 
     arguments = arguments.anywhere()
     arguments = dataclasses.replace(arguments, tokenizer=_find_tokenizer(source, trained, arguments))

@@ -5,18 +5,19 @@ from __future__ import annotations
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from experiments.running.attempts import PROGRESS, State, read_progress, read_start, read_states
+from experiments.running.ledger import DIVERGED, FINISHED, MISSING, RUNNING, Ledger
+from experiments.running.workspace import LOCK, Workspace, command_at, load_record
 from experiments.study_setup import UNSET
 from experiments.terminal.progress import console, say, short
 from experiments.terminal.words import counted
 from hma_jax.config import ConfigError
-
-if TYPE_CHECKING:
-    from experiments.running.attempts import State
+from hma_jax.runtime.locks import find_held
 
 
 def status(
@@ -31,12 +32,8 @@ def status(
         study: Directory of a study.
         everything: List finished trials, and those that have not begun, too.
     """
-    from experiments.running.attempts import read_states
-    from experiments.running.ledger import DIVERGED, FINISHED, MISSING, RUNNING, Ledger
-    from experiments.running.workspace import LOCK, Workspace, command_at, load_record
     from experiments.sweeps.registry import plan_sweeps
     from experiments.sweeps.sweep import titles
-    from hma_jax.runtime.locks import find_held
 
     workspace = Workspace(study)
     running = find_held(workspace.root / LOCK) if workspace.root.is_dir() else None
@@ -67,8 +64,6 @@ def status(
 
 def _place(directory: Path, state: State) -> tuple[str, str]:
     """(how far a trial is, where it runs and when it last said so)."""
-    from experiments.running.attempts import PROGRESS, read_progress, read_start
-    from experiments.running.ledger import RUNNING
 
     progress, start = read_progress(directory), read_start(directory)
     done = f"{progress['phase']} {progress['done']:,} of {progress['total']:,}" if progress else ""

@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 from rich.markup import escape
 from tyro.conf import arg
 
-from data_pipelines.errors import MAX_LISTED
+from data_pipelines.errors import MAX_LISTED, without_advice
+from data_pipelines.publishing.output_lock import backoff
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.running.workspace import Busy, Workspace
@@ -101,7 +103,6 @@ def _take_part(setup: StudySetup, busy: Busy, batch: int | None, threads: int | 
 
 def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
     """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
-    from data_pipelines.publishing.output_lock import backoff
     from experiments.preparing.given_tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
@@ -124,9 +125,7 @@ def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
 
 def show_store(workspace: Workspace, rate: float | None) -> None:
     """What the token store holds, per dataset, and the stride of a study at `rate` Hz (None: native)."""
-    import numpy as np
 
-    from data_pipelines.errors import without_advice
     from data_pipelines.tokens.manifest import FILE
     from data_pipelines.tokens.store import TokenStore
 

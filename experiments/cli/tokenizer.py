@@ -13,7 +13,7 @@ from experiments.preparing.made_from import Step
 from experiments.study_setup import StudySetup, command, make_setup
 from experiments.terminal.progress import console, say, short, step, wrote
 from experiments.terminal.words import counted
-from hma_jax.config import require
+from hma_jax.config import PixelsConfig, require
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.shared import BaseTokenizer
@@ -81,7 +81,6 @@ def pixels(
         image_size: Side of the square images in pixels.
         patch: Side of a token in pixels.
     """
-    from hma_jax.config import PixelsConfig
     from hma_jax.convert import require_free
     from hma_jax.tokenizers.pixels import PixelTokenizer
 

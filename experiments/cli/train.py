@@ -23,11 +23,13 @@ from experiments.cli.initial_model import (
     setup_of,
 )
 from experiments.preparing.made_from import Step, may_replace
-from experiments.running.attempts import JOB, RUN
+from experiments.running.attempts import JOB, RUN, newest_step
+from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.run_options import RunOptions
+from experiments.running.trial import Trial, loader_of, trial_id
 from experiments.running.workspace import Workspace
 from experiments.study_setup import UNSET, StudySetup, make_setup
-from experiments.sweeps.sweep import reference_trial
+from experiments.sweeps.sweep import Point, Sweep, reference_trial
 from experiments.terminal.progress import console, say, short, step, wrote
 from experiments.terminal.words import counted, few
 from hma_jax.config import require
@@ -35,7 +37,6 @@ from hma_jax.training.run_lock import require_plain
 
 if TYPE_CHECKING:
     from experiments.running.run_trial import PreparedData
-    from experiments.running.trial import Trial
     from hma_jax.training.runs import Run
 
 
@@ -301,10 +302,6 @@ def _print_cost(setup: StudySetup, trial: Trial, run: Path, processes: int) -> N
     from experiments.dry_run.done import UNKNOWN, find_prepared
     from experiments.dry_run.plan_table import Devices, plan_table
     from experiments.dry_run.trainable import check_trials
-    from experiments.running.attempts import newest_step
-    from experiments.running.launchers.registry import LauncherOptions
-    from experiments.running.trial import trial_id
-    from experiments.sweeps.sweep import Point, Sweep
 
     mesh, own = setup.study.execution.mesh, LauncherOptions().share()
     share = own * processes if own else float(max(processes, mesh.min_devices))
@@ -318,7 +315,6 @@ def _print_cost(setup: StudySetup, trial: Trial, run: Path, processes: int) -> N
 
 
 def _train(setup: StudySetup, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
-    from experiments.running.attempts import newest_step
     from experiments.running.run_trial import open_prepared_data, train_trial
     from experiments.running.shared_runs import common_steps
     from hma_jax.runtime.processes import is_writer
@@ -382,7 +378,6 @@ def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:
 def say_data(trial: Trial, prepared: PreparedData) -> None:
     """What a model is trained on. Raises DataError if it is nothing."""
     from data_pipelines.loading.selection import select_windows
-    from experiments.running.trial import loader_of
 
     chosen = select_windows(prepared.store, loader_of(trial))
     used = [chosen.sets[name] for name in chosen.mixture.names]

@@ -11,8 +11,8 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from data_pipelines.registry import DatasetSpec, get_spec
 from experiments.dry_run.done import NOTHING, Done
 from experiments.running.run_options import UNWATCHED
 from experiments.running.shared_runs import share_runs
@@ -21,9 +21,6 @@ from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ModelConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
-
-if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,6 @@ def declared_table(names: tuple[str, ...], rate: float | None) -> EmbodimentTabl
 
     Raises ConfigError for a name that the registry does not know.
     """
-    from data_pipelines.registry import get_spec
 
     def entry(spec: DatasetSpec) -> Embodiment:
         dim = spec.action_dim

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from data_pipelines.errors import DataError
 from experiments.preparing.made_from import read_stamp
 from experiments.running.attempts import RUN, newest_step, read_states
 from experiments.running.ledger import DIVERGED, FAILED, FINISHED, Ledger
@@ -115,7 +116,6 @@ def _tokenizer(setup: StudySetup) -> bool:
 
 
 def _tokens(study: Study, workspace: Workspace) -> bool:
-    from data_pipelines.errors import DataError
     from experiments.preparing.windows import require_same_windows, windows_are_frozen
 
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from data_pipelines.registry import get_spec
 from experiments.dry_run.cost import count_parameters
 from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.running.launchers.registry import LauncherOptions
@@ -114,7 +115,6 @@ def _listed(numbers: Sequence[int]) -> str:
 def _say_unused(study: Study) -> None:
     """A line on datasets that have more trajectories to train on than a trial takes, as far as the registry says how
     many."""
-    from data_pipelines.registry import get_spec
 
     counts, specs = study.trajectory_counts, [get_spec(name) for name in study.dataset_names()]
     larger = {

@@ -10,6 +10,7 @@ import functools
 import math
 from dataclasses import dataclass
 
+from data_pipelines.registry import get_spec
 from experiments.preparing.tokenizer import QUALITY_FRAMES
 from experiments.study import Study
 from experiments.terminal.words import duration
@@ -75,7 +76,6 @@ def estimate_preparing(
 def count_frames(study: Study, name: str) -> Frames | None:
     """Number of frames of all episodes of a dataset, held-out ones included; None where the registry does not say
     it."""
-    from data_pipelines.registry import get_spec
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from data_pipelines.errors import DataError
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.terminal.progress import step
@@ -24,7 +25,6 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
     Robots whose dataset does not say their actions have none. Raises DataError if the simulator does not give back
     what was recorded, under the recorded actions.
     """
-    from data_pipelines.errors import DataError
     from data_pipelines.suite.embodiments import select
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.counterfactual import CounterfactualFrames
@@ -64,7 +64,6 @@ def _of_robot(
 ) -> np.ndarray:
     """uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros. Of a window that no other episode's
     actions cover, as one of the longest episode, they are the recorded frames, which nobody reads."""
-    from data_pipelines.errors import DataError
     from data_pipelines.suite.counterfactual import frames_under
 
     name, size = spec.name, study.tokenizer.image_size

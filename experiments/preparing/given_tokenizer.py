@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_pipelines.publishing.files import publish
+from data_pipelines.registry import DatasetSpec
 from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, differences, read_stamp, require_same
 from experiments.preparing.sources import Source, open_source
 from experiments.preparing.tokenizer import (
@@ -32,7 +33,6 @@ from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 
 if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
     from hma_jax.tokenizers.base import Tokenizer
 
 GIVEN = "given with --tokenizer, identity"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from data_pipelines.registry import DatasetSpec, find_reader, get_spec
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
 from experiments.terminal.progress import say
@@ -13,7 +14,6 @@ from experiments.terminal.words import few
 from hma_jax.config import require
 
 if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.rlds.location import Location
     from data_pipelines.sources.source import EpisodeSource
@@ -26,7 +26,6 @@ def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
     """The datasets at these locations, by name: of each the locations of its parts, which are several where an entry
     joins them, by the names in their own files. Raises DataError for a location that is none, ConfigError for two of
     one name."""
-    from data_pipelines.registry import find_reader
     from data_pipelines.sources.open import source_name
 
     places: dict[str, str] = {}
@@ -61,7 +60,6 @@ def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
 def source_of(name: str, places: Mapping[str, str]) -> Source:
     """A dataset with its registry entry, which joins those of its parts that are given; says which are not. Raises
     ConfigError for an unknown name."""
-    from data_pipelines.registry import get_spec
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.rlds.location import locate
 
@@ -79,7 +77,6 @@ def source_of(name: str, places: Mapping[str, str]) -> Source:
 
 def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
     """The simulated datasets, which must be there. Raises ConfigError with `advice` otherwise."""
-    from data_pipelines.registry import get_spec
 
     sources = [(get_spec(name), workspace.suite / name) for name in study.all_names()]
     missing = [spec.name for spec, path in sources if not path.is_dir()]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from data_pipelines.errors import DataError, UnreachableError
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import (
     Source,
@@ -70,7 +71,6 @@ def make_store(
 def data_differences(study: Study, workspace: Workspace, data: Sequence[str], tokenizer: Tokenizer) -> list[str]:
     """How the recordings at `data`, and the registry's entries of them, differ from those that the tokens here were
     made from; settings of the store are not compared, nor what cannot be opened."""
-    from data_pipelines.errors import DataError
 
     try:
         sources = [source_of(name, places) for name, places in group_by_dataset(data).items()]
@@ -96,7 +96,6 @@ def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:
     """How the datasets that are in the store were made otherwise; a line that holds for several is said once."""
-    from data_pipelines.errors import DataError, UnreachableError
     from data_pipelines.tokens.dataset_writer import differences, recorded_source
     from data_pipelines.tokens.tokenize_job import plan_dataset
 

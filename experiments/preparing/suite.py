@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from data_pipelines.registry import get_spec
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source
 from experiments.running.workspace import Workspace
@@ -36,7 +37,6 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     Raises ConfigError where some are there with another seed or size, unless `replace` allows it. Those made by
     an earlier version of the simulator stay in use, with a note.
     """
-    from data_pipelines.registry import get_spec
     from data_pipelines.sources.rlds.writer import VERSION
     from data_pipelines.suite.generate import generate_suite
 

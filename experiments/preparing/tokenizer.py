@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from data_pipelines.publishing.files import publish
+from data_pipelines.sampling.order import ORDER_VERSION
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -79,7 +80,6 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
 def frames_made_from(study: Study, sources: Sequence[Source], existing: MadeFrom | None) -> dict[str, Any]:
     """Which frames there are to train a tokenizer on and to judge it by; as inputs of a stamp, of which an `existing`
     one may name recordings as earlier versions did."""
-    from data_pipelines.sampling.order import ORDER_VERSION
 
     settings = study.store
     known = existing.inputs.get("data", {}) if existing else {}

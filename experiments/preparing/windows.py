@@ -6,6 +6,8 @@ import json
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
+from data_pipelines.errors import DataError
+from data_pipelines.registry import get_spec
 from experiments.preparing.made_from import Step, dataset_differences, require_same
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
@@ -109,7 +111,6 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
 
 def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
     """The windows that are there. ConfigError if they cannot be read, unless they may be replaced."""
-    from data_pipelines.errors import DataError
     from data_pipelines.windows.evalset import EvalManifest
 
     if not workspace.manifest.exists():
@@ -168,7 +169,6 @@ def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float 
 
 def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> None:
     """Names the datasets that lose many episodes to evaluation because they have few."""
-    from data_pipelines.registry import get_spec
 
     many = []
     for name, facts in summary.items():
@@ -198,7 +198,6 @@ def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> No
 
 def say_alone(summary: dict[str, dict[str, int]]) -> None:
     """Names the robots of one training episode: of no other one can a control take their actions."""
-    from data_pipelines.registry import get_spec
 
     alone = [
         name

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from experiments.analysis.controllability import Controllability, controllability
+from experiments.analysis.rows import training_loss, write_csv
 from experiments.report.robots import count_usable
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
+from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, control_of, reference_trial, titles, unique_trials
-
-if TYPE_CHECKING:
-    from experiments.running.provenance import Provenance
+from hma_jax.evaluation.windows import FILE
 
 
 def write_tables(
@@ -27,11 +28,8 @@ def write_tables(
 ) -> list[Path]:
     """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
     and of their controls."""
-    from experiments.analysis.controllability import Controllability, controllability
-    from experiments.analysis.rows import training_loss, write_csv
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
-    from hma_jax.evaluation.windows import FILE
 
     names, rows = titles(sweeps, provenance), []
     available = count_usable(workspace.data_summary)

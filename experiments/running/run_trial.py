@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING, Any
 from experiments.running.attempts import EVALUATING, RUN
 from experiments.running.machine import describe_machine
 from experiments.running.provenance import read_record, record_end
-from experiments.running.result_file import SAMPLES
+from experiments.running.result_file import SAMPLES, write_result
 from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.evaluation.windows import FILE
 from hma_jax.training.run_lock import CHECKPOINTS
 
 if TYPE_CHECKING:
@@ -94,7 +95,6 @@ def train_trial(
     """
     from data_pipelines.loading.loader import describe_batch, make_loader
     from data_pipelines.loading.selection import LoaderConfig, training_table
-    from hma_jax.config.json import from_dict
     from hma_jax.runtime.rows import own_rows
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
@@ -244,7 +244,6 @@ def run_trial(
     import jax
 
     from data_pipelines.loading.selection import count_trajectories, training_table
-    from experiments.running.result_file import write_result
     from hma_jax.evaluation.parts import Parts
     from hma_jax.model.flops import train_flops_per_step
     from hma_jax.model.hma import declare_model
@@ -324,7 +323,6 @@ def last_loss(losses: Sequence[float]) -> dict[str, Any]:
 
 def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
     """Writes windows.parquet and, where there are samples, samples.npz into `directory`, in place of others."""
-    from hma_jax.evaluation.windows import FILE
 
     evaluation.windows.save(directory / FILE, directory.name)
     if evaluation.samples:

@@ -18,7 +18,10 @@ from pathlib import Path
 
 from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, RUN, attempt
 from experiments.running.children import NoAccelerator, enter_child, require_accelerator
+from experiments.running.ledger import DIVERGED, FAILED, LOST, REFUSED
+from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_pending_stop, sigterm_as_interrupt
+from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
 
 POLL_SECONDS = 30.0
@@ -68,14 +71,11 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from data_pipelines.errors import DataError, UnreachableError
     from experiments.running.initial_model import initial_from_trial
     from experiments.running.job import read_job
-    from experiments.running.ledger import DIVERGED, FAILED, LOST
     from experiments.running.provenance import inputs_of, record_start
     from experiments.running.run_trial import run_trial
     from experiments.running.shared_runs import begin_shared
     from experiments.running.trial import trial_id
     from experiments.running.workspace import Workspace
-    from hma_jax.config import ConfigError
-    from hma_jax.runtime.files import write_file
     from hma_jax.training.divergence import DivergedError
     from hma_jax.training.loop import Interrupted
 
@@ -127,9 +127,7 @@ class TakenOver(Exception):
 
 def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, str] | None:
     """The closure of what is run, imported; None if it is not what was given, of which failure.json is left."""
-    from experiments.running.ledger import REFUSED
     from experiments.running.provenance import CodeChanged, load_sources
-    from hma_jax.runtime.files import write_file
 
     try:
         return load_sources(given)

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from data_pipelines.registry import register
 from experiments.running.migration import migrate
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
@@ -252,7 +253,6 @@ def load_record(workspace: Workspace) -> Record:
         f"{workspace.record}: axes is empty; restore the axes that the study had, or run `{record.command}`",
     )
     if workspace.registry.exists():
-        from data_pipelines.registry import register
         from data_pipelines.registry.toml_file import load_entries
 
         register(load_entries(workspace.registry))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from data_pipelines.registry import get_spec
 from experiments.study import Study, count_trained_on
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
 from experiments.terminal.program import run_sweep
@@ -59,7 +60,6 @@ def plan(study: Study) -> Sweep:
 def count_episodes(study: Study, cap: int | None) -> int:
     """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly, of others as
     `count_trained_on` says. Raises ConfigError where it says nothing."""
-    from data_pipelines.registry import get_spec
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 

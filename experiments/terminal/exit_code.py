@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
+from data_pipelines.errors import DataError, EpisodeError
 from experiments.run_study import TrialsFailed
 from experiments.running.children import silence_background
 from experiments.terminal.progress import errors
@@ -120,7 +121,6 @@ def _end_together(error: BaseException | None = None, code: int = Exit.DONE, sho
 
 def _exit_code(error: Exception) -> Exit | None:
     """None for what is not the user's business: a bug, shown with its traceback."""
-    from data_pipelines.errors import DataError
 
     if isinstance(error, ConfigError):
         return Exit.REFUSED
@@ -153,7 +153,6 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 def _words(error: Exception, skipping: str) -> str:
     """The message of an error, and what it cannot know: how its advice is followed from here."""
-    from data_pipelines.errors import EpisodeError
 
     if isinstance(error, EpisodeError) and skipping:
         return f"{error} (Here: {skipping}.)"

@@ -173,7 +173,7 @@ def test_trajectories_that_nobody_counted_are_not_counted_as_none(monkeypatch):
     """All of them stood at 0, before 4 of each; the change along the axis then had the wrong sign."""
     counts, split = {"mine": 300, "yours": 40}, {"mine": "", "yours": ""}
     monkeypatch.setattr(
-        "data_pipelines.registry.get_spec",
+        "experiments.sweeps.episodes.get_spec",
         lambda name: SimpleNamespace(name=name, episodes=counts[name], val_split=split[name]),
     )
     study = replace(CPU_FULL, datasets=tuple(counts), dataset_counts=(1, 2), unseen=(), trajectory_counts=(4, 200))

@@ -112,7 +112,7 @@ def test_user_data_cuts_the_counts():
 def test_caps_that_would_train_on_the_same_data_are_no_points_of_their_own(monkeypatch):
     """The last one stays what it is: every trial is trained with it, and an entry's count may be too small."""
     sizes = {"bridge_dataset": 105, "droid_sample": 7}  # 100 and 5 to train on
-    monkeypatch.setattr("data_pipelines.registry.find_spec", lambda n: replace(make_spec(n), episodes=sizes.get(n, 0)))
+    monkeypatch.setattr("experiments.study.find_spec", lambda n: replace(make_spec(n), episodes=sizes.get(n, 0)))
 
     def caps(*names: str, **store: int) -> tuple[int, ...]:
         study = on_user_data(replace(ACCELERATOR, store=replace(ACCELERATOR.store, **store)), names)

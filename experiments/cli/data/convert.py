@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
+from data_pipelines.errors import DataError, without_advice
+from data_pipelines.names import made_name
+from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.settings import (
     Ego4dSettings,
     EgoExo4dSettings,
@@ -21,7 +24,6 @@ from experiments.terminal.progress import say, step, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
     from data_pipelines.sources.convertible import ConvertibleSource
 
 
@@ -135,8 +137,6 @@ def _convert(
     source: ConvertibleSource, destination: Destination, default_name: str, unsupported_images: Collection[str] = ()
 ) -> None:
     from data_pipelines.convert.write import convert
-    from data_pipelines.errors import DataError, without_advice
-    from data_pipelines.names import made_name
     from data_pipelines.sources.convertible import UnitError, unsupported_images_text
 
     name = destination.name or made_name(default_name)

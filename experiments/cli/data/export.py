@@ -9,6 +9,8 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from data_pipelines.errors import DataError, EpisodeError, without_advice
+from data_pipelines.registry import find_reader
 from experiments.study_setup import UNSET, command, require_local, use_entries
 from experiments.terminal.progress import say, step, wrote
 from experiments.terminal.words import counted
@@ -41,10 +43,8 @@ def data_export(
         skip_damaged: Leave out damaged episodes and count them, instead of stopping.
         registry: TOML file with your own registry entries.
     """
-    from data_pipelines.errors import DataError, EpisodeError, without_advice
     from data_pipelines.export.fields import choose_fields
     from data_pipelines.export.lerobot import export_lerobot
-    from data_pipelines.registry import find_reader
     from data_pipelines.sources.open import open_source
 
     require_local("--out", out)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from data_pipelines.registry import find_reader
 from experiments.presets import ON_ACCELERATORS, get_preset
 from experiments.running.workspace import Workspace
 from experiments.study_setup import Preset, StudyArguments, command
@@ -74,7 +75,6 @@ def tokenize_command(
 def _another_out(default: Path, names: Sequence[str]) -> Path | None:
     """Where to tokenise datasets if the `default` directory has tokens of others, which a command there would be
     refused for; None if it has none."""
-    from data_pipelines.registry import find_reader
     from data_pipelines.tokens.manifest import FILE
 
     asked = {name if (known := find_reader(name)) is None else known.name for name in names}
@@ -113,7 +113,6 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
 def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | None:
     """What to run first where a known dataset was looked at with another native rate than its entry's, which is the
     one that a study takes; None where they agree."""
-    from data_pipelines.registry import find_reader
     from data_pipelines.sources.source import same_rate
 
     known = find_reader(facts.name)

@@ -15,6 +15,10 @@ from rich.padding import Padding
 from tyro.conf import Positional, arg
 
 from data_pipelines.errors import MAX_LISTED
+from data_pipelines.publishing.output_lock import lock_output
+from data_pipelines.registry import MIXTURES, DatasetSpec, all_specs, get_mixture, known_groups
+from data_pipelines.registry.spec import FRAME_RATE, stride_of
+from data_pipelines.registry.table import find_reader
 from experiments.cli.data.next_command import no_window, other_rate, print_next, say_next
 from experiments.study_setup import UNSET, say_unmatched, use_entries
 from experiments.terminal.progress import console, say, step, tidy_table, wrote
@@ -27,7 +31,6 @@ from hma_jax.runtime.outputs import make_directory
 if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts, Sample
     from data_pipelines.inspection.suggest import Suggestion, WindowFacts
-    from data_pipelines.registry import DatasetSpec
 
 SHEET = "contact_sheet.png"
 
@@ -47,7 +50,6 @@ def data_list(
         mixture: List only the datasets of this mixture: dataset5, 10, 20, 30, 40, dataset40_published or dataset30_vae.
         registry: TOML file with your own registry entries.
     """
-    from data_pipelines.registry import MIXTURES, get_mixture, known_groups
 
     use_entries(registry)
     chosen = get_mixture(mixture) if mixture else None
@@ -143,9 +145,6 @@ def data_inspect(
     """
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, require_own_rate, suggest_entry
-    from data_pipelines.registry import all_specs
-    from data_pipelines.registry.spec import FRAME_RATE, stride_of
-    from data_pipelines.registry.table import find_reader
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     stride_of(hz or 1, FRAME_RATE)  # raises before the dataset is read
@@ -192,7 +191,6 @@ def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetS
     """Prints at which stride frames are taken at a native `rate`, and how many windows there are. `hz`: the rate given
     by the user; `taken`: the registry entry by which the dataset will be read."""
     from data_pipelines.inspection.suggest import window_facts
-    from data_pipelines.registry.spec import FRAME_RATE, stride_of
     from data_pipelines.sources.source import same_rate
 
     stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate, FRAME_RATE)
@@ -308,7 +306,6 @@ def _in_words(spec: DatasetSpec) -> str:
 
 def _write_entry(path: Path, suggestion: Suggestion) -> None:
     """Adds the entry to a TOML file, in place of one of the same name. Says what that said otherwise."""
-    from data_pipelines.publishing.output_lock import lock_output
     from data_pipelines.registry.toml_file import load_entries, put_entry
 
     spec = suggestion.spec()

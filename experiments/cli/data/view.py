@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 from rich.markup import escape
 from tyro.conf import Positional, arg
 
+from data_pipelines.errors import DataError
+from data_pipelines.registry.spec import FRAME_RATE, stride_of
+from data_pipelines.registry.table import find_reader
 from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, print_next, say_next
 from experiments.study_setup import UNSET, command, say_unmatched, use_entries
 from experiments.terminal.progress import console, say, step, wrote
@@ -86,8 +89,6 @@ def _view_one(
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.issues import find_issues
     from data_pipelines.inspection.suggest import require_own_rate, suggest_entry, window_facts
-    from data_pipelines.registry.spec import FRAME_RATE, stride_of
-    from data_pipelines.registry.table import find_reader
     from data_pipelines.sources.open import source_name
     from experiments.report.data_page import CLIP_FRAMES, DatasetView
 
@@ -116,7 +117,6 @@ def _view_one(
 
 def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
     """Fingerprints of another split. It need not be readable: the page is about the split that was asked for."""
-    from data_pipelines.errors import DataError
     from data_pipelines.inspection.inspect import inspect_dataset
 
     try:
