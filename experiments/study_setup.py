@@ -164,9 +164,9 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
         study = on_user_data(study, names)
         data = find_directories(names, data) if data else ()
     elif data:
-        from experiments.preparing.sources import name_datasets
+        from experiments.preparing.sources import group_by_dataset
 
-        study = on_user_data(study, name_datasets(data))
+        study = on_user_data(study, tuple(group_by_dataset(data)))
     if arguments.tokenizer is not None:
         from hma_jax.tokenizers.io import load_config
 

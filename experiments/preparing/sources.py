@@ -44,11 +44,6 @@ def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
     return datasets
 
 
-def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
-    """The names of the datasets at these locations. Raises what `group_by_dataset` raises."""
-    return tuple(group_by_dataset(data))
-
-
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     """User directories with their registry entries. Raises ConfigError for unknown names."""
     datasets = group_by_dataset(data)

@@ -82,13 +82,13 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     report = _ProgressFile(directory / PROGRESS, lost)
     try:
         require_accelerator()
-        trial, execution, shared = read_job(job)
-        record_start(directory, inputs_of(job["provenance"]), closure)
+        (trial, execution, shared), inputs = read_job(job), inputs_of(job["provenance"])
+        record_start(directory, inputs, closure)
         if branched_from := begin_shared(directory, shared.before):
             print(f"goes on from step {branched_from[1]} of trial {branched_from[0]}", flush=True)
         begin = None
         if trial.source:
-            source = directory.parent / trial_id(trial.source, inputs_of(job["provenance"])) / RUN
+            source = directory.parent / trial_id(trial.source, inputs) / RUN
             begin = partial(initial_from_trial, trial, source)
         workspace = Workspace(directory.parent.parent)
         run_trial(trial, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report)

@@ -147,7 +147,7 @@ def _convert(
                 destination.out,
                 name,
                 skip_damaged=destination.skip_damaged,
-                progress=lambda units, total, unit: update(units, total, unit),
+                progress=update,
             )
         except UnitError as error:  # whose own advice is for those who tokenise, too
             rest = without_advice(str(error))
