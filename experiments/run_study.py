@@ -111,8 +111,8 @@ def run_study(
 
 
 def await_lease(workspace: Workspace) -> None:
-    """Waits where the directory was in use on another machine, or on this one before it was booted: until the lease is
-    over or is renewed, by a command that still runs. So a study may be started with its machine."""
+    """Waits while another machine, or this one before it was booted, holds the directory: until its lease is over, or
+    is renewed, which shows that its command still runs. So a study may be started when its machine boots."""
     lock, renewed = workspace.root / LOCK, 0.0
     while (holder := workspace.holder) and holder.machine != machine() and find_held(lock):
         time_renewed = lock.stat().st_mtime
@@ -127,7 +127,7 @@ def await_lease(workspace: Workspace) -> None:
 
 
 def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
-    """Names what the user preregistered of points that the study, all of whose sweeps are `planned`, does not have.
+    """Names what the user preregistered of points that are in none of the `planned` sweeps, which are all of the study.
 
     Raises ConfigError, as the page at the end would, for a line that cannot be read.
     """
@@ -153,7 +153,7 @@ def prepare_apart(setup: StudySetup, replace: Step | None) -> Provenance:
 def _prepare(
     setup: StudySetup, replace: Step | None, specs: Sequence[DatasetSpec] = (), accelerator: str = ""
 ) -> Provenance:
-    """`specs`: registry entries, of which a new process lacks the user's own; `accelerator`: the kind that is here."""
+    """`specs`: registry entries, since a new process lacks the user's own; `accelerator`: the kind that is expected."""
     require_accelerator(accelerator)
     from experiments.preparing.pipeline import prepare
 
@@ -168,9 +168,9 @@ def make_jobs(
     common: dict[str, Any],
     former: Mapping[str, Trial] = {},
 ) -> list[Job]:
-    """A job for every trial, the widest and longest first: they take longest, and no worker is left with one at the
-    end. Trials that have the beginning of their training in common wait for the shorter ones of them, and those that go
-    on from another one for it. What `former` ones have in common with them is not trained again."""
+    """A job for every trial, the widest and longest first, so that no worker is left with one of them at the end. A
+    trial waits for the shorter ones that share the beginning of its training, and for its source. What it shares with
+    `former` trials is not trained again."""
     shared = share_runs(trials, former)
     jobs = []
     for id, trial in sorted(trials.items(), key=lambda item: (-item[1].model.width, -item[1].train.steps)):
@@ -218,8 +218,8 @@ def require_agreement(
 
 
 def find_earlier(workspace: Workspace, study: Study, asked: Sequence[Sweep], replace: Step | None) -> Record | None:
-    """What was run here before, if `study` goes on with it: its axes then have the same trials under both. Where it is
-    replaced, those of its axes that have, and those that are `asked` for again.
+    """The record of what was run here before, if `study` goes on with it: its axes then have the same trials under
+    both. Where the study is replaced, the record with those of its axes that still have, or are `asked` for again.
 
     Raises ConfigError for a study of other settings, unless `replace` allows it: its report would be drawn over.
     """

@@ -34,7 +34,7 @@ SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
 
 PROCESSOR = 1e12
-"""FLOP/s of one device that no processor sustains."""
+"""FLOP/s that no processor sustains: a study of at least so many for a device is for accelerators."""
 
 
 @dataclass(frozen=True)
@@ -287,16 +287,16 @@ def on_user_data(study: Study, names: Sequence[str]) -> Study:
 
 
 def without_equal_caps(study: Study) -> Study:
-    """The same study, where of numbers of trajectories that no dataset has to train on only the last is left: with the
-    others a trial would be trained on the same."""
+    """The same study without those of its `trajectory_counts`, but for the last, that no dataset exceeds: a trial there
+    would be trained on the same data as one at the last."""
     *caps, last = study.trajectory_counts
     most = most_trajectories(study) or last
     return replace(study, trajectory_counts=(*(cap for cap in caps if cap < most), last))
 
 
 def most_trajectories(study: Study) -> int | None:
-    """Training trajectories of the largest dataset, as the registry says; where it does not say how many are held out,
-    with those. None where it does not say it of all."""
+    """Training trajectories of the largest dataset by the registry; of a dataset whose held-out ones it does not count,
+    all. None unless it has a number for every dataset."""
 
     specs = [find_spec(name) for name in study.dataset_names()]
     counts = [count_trained_on(spec, study.store) or spec.episodes if spec else 0 for spec in specs]
@@ -304,9 +304,9 @@ def most_trajectories(study: Study) -> int | None:
 
 
 def count_trained_on(spec: DatasetSpec, settings: StoreConfig) -> int | None:
-    """Trajectories that the registry says a dataset has, less those that are held out by hash, as if none was damaged
-    and joined datasets were one. None where it does not say how many there are, or how many are in the split that is
-    held out."""
+    """Training trajectories of a dataset by the registry: its number of episodes less those held out by hash. Damaged
+    episodes count, and joined datasets are taken for one. None without that number, and where a split is held out,
+    whose size no entry says."""
     if not spec.episodes or spec.val_split:
         return None
     return spec.episodes - settings.held_out.count(spec.episodes)

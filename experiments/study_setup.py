@@ -70,7 +70,7 @@ class StudyArguments:
     Short for --set execution.mesh.data=... and so on. Does not change results."""
 
     def anywhere(self) -> StudyArguments:
-        """The same, meant in the same way from any working directory. Raises ConfigError for an `out` at a URL."""
+        """The same with absolute paths. Raises ConfigError for an `out` or a `tokenizer` at a URL."""
         from data_pipelines.sources.rlds.location import absolute
 
         require_local("--out", self.out)
@@ -126,7 +126,7 @@ class StudySetup:
 
 
 def require_local(flag: str, path: Path | None) -> None:
-    """Raises ConfigError for what was meant as an address: datasets are read there, but nothing is written."""
+    """Raises ConfigError for a URL: only datasets are read from one, and nothing is written to one."""
     if path is not None and is_address(path):
         raise ConfigError(
             f"{flag} {path}: results cannot be written to a bucket, only to a directory of a file system; mount the "
@@ -145,8 +145,9 @@ def command_words(*arguments: str | Path) -> str:
 
 
 def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> StudySetup:
-    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. Of its numbers of
-    trajectories those that would be trained on the same are left out, but for points of the study in the directory.
+    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. On the user's data,
+    numbers of trajectories beyond what there is are left out (`without_equal_caps`), unless the study in the directory
+    has them.
 
     `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that
     are no datasets.
@@ -183,8 +184,8 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
 
 
 def _with_earlier_caps(study: Study, workspace: Workspace) -> Study:
-    """The same study with the numbers of trajectories of the one in `workspace`, as an earlier version planned it, if
-    they differ only in such as no dataset has to train on: or that one could not go on."""
+    """`study` with the `trajectory_counts` of the study in `workspace`, if they differ only in those that
+    `without_equal_caps` leaves out. Earlier versions planned them, and that study could not go on without them."""
     try:
         earlier = find_record(workspace)
     except ConfigError:  # who goes on with it says so
@@ -202,8 +203,8 @@ def use_entries(registry: Path | None) -> None:
 
 
 def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
-    """Says which of the datasets `names` (in their files) are read by the project's own entries, where the file has
-    unused ones: the heading of such a one may be misspelt, which reads as an entry of another dataset."""
+    """Says which of the datasets `names` (as their files call them) are read by the project's own entries, where the
+    user's file has entries that nothing uses: the name of one may be misspelt."""
     if registry is None:
         return
     from data_pipelines.registry.toml_file import load_entries
@@ -220,15 +221,14 @@ def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
 
 
 def under_another_name(names: Sequence[str]) -> str:
-    """Advice where datasets are called `names` in their own files and the robot of one may be meant that is called
-    something else."""
+    """Advice for datasets that their files call `names`, where a robot of another name may be the same one."""
     joins = json.dumps(list(names[:1]))
     return f"If {names[0]} is one of these robots, add joins = {joins} to its entry in the file of --registry"
 
 
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:
-    """`<root>/<name>` for every name, or those that its entry joins, in the first root that has it. ConfigError for
-    those missing."""
+    """`<root>/<name>` for every name, or for those that its entry joins, in the first root that has it. Raises
+    ConfigError, with the names, where some are in none."""
     from data_pipelines.sources.rlds.location import locate
 
     entries = {name: find_spec(name) for name in names}

@@ -1,8 +1,8 @@
 """The difference between the two ends of an axis, or of a variant from the default, window by window.
 
 Trials of both sides were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
-robots are judged that are others for every seed, each seed's difference is taken on its own robots, and the error is
-over seeds. Of a metric that a model lacks where it should have it there is no difference: the page names the model
+every seed judges robots of its own, each seed's difference is taken on these, and the error is over seeds. Where a
+model has no number of a metric that it should have, there is no difference: the page names the model
 (`report.validity`).
 """
 

@@ -59,8 +59,8 @@ class Difference:
 def compare(a: Side, b: Side) -> list[Difference]:
     """Every metric, nats first, overall and by robot, of the robots that both were judged on.
 
-    Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things; of
-    retrieval those where the true actions were ranked among another number of others.
+    Metrics of tokens are left out where the tokenizers are known to differ, since the same nats are then of other
+    things, and retrieval where the two sides ranked the true actions among different numbers of others.
     Raises NotComparable, naming the first window that differs, and NoNumbers, naming the first that lacks what it has
     in every sound model.
     """
@@ -147,7 +147,7 @@ def lacks_numbers(metric: str, values: np.ndarray) -> np.ndarray:
 
 
 def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
-    """Of each robot, and overall where there are several, over the windows that have it, of which there may be none."""
+    """The difference overall, where there are several robots, and of each, over the windows that have the metric."""
     known = a.known & b.known
     rows = [(robot, known & (a.robot == robot)) for robot in dict.fromkeys(a.robot[known].tolist())]
     if len(rows) > 1:

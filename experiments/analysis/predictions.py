@@ -107,8 +107,8 @@ def predict(
 def compare(
     prediction: Prediction, curves: Sequence[Curve], windows: Mapping[str, WindowTable], hashes: Mapping[str, str]
 ) -> Outcome:
-    """The outcome of a prediction, measured beside what it was made from: where seeds have robots of their own, on the
-    level of these, and not of the seeds that happen to have finished."""
+    """The outcome of a prediction, measured together with the trials that it was made from: where seeds have robots of
+    their own, its level is then that of the prediction's, and not of the seeds that happen to have finished."""
     curve = next((c for c in curves if c.name == prediction.curve), None)
     there = curve.finished(windows) if curve else ()
     finished = [p for p in there if p.trial in prediction.trials]

@@ -230,9 +230,9 @@ def curve(
     """The points of a curve by increasing x; none where no trial has the metric.
 
     sem^2 = variance over seeds / seeds + mean of each seed's sem^2 over episodes: all seeds are judged
-    on the same windows, so that the second part does not shrink with their number. Where robots are `robots_vary` for
-    every seed (`Sweep.robots_vary`), windows are others too, and what they do is within the variance over seeds: the
-    first part is all, where there are several. So it is of the training loss, which every seed has of steps of its own.
+    on the same windows, so that the second part does not shrink with their number. Where every seed judges robots of
+    its own (`Sweep.robots_vary`), it has windows of its own, too, and what they do is within the variance over seeds:
+    with several seeds the first part is all. So it is with the training loss, which every seed has of its own steps.
     """
     own_windows = robots_vary or scope == TRAINING
     groups: dict[float, list[Row]] = defaultdict(list)
@@ -278,8 +278,8 @@ def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
 
 
 def all_series(rows: Iterable[Row], sweep: str) -> dict[str, list[str]]:
-    """{role: its series}, of a sweep with several curves of trained models, in the order of the rows. Of controls there
-    is no curve, whichever they stand beside."""
+    """{role: its series} of a sweep with several curves, in the order of the rows, without controls and untrained
+    models, which make no curve."""
     found: dict[str, list[str]] = {}
     for r in rows:
         of_curve = r.sweep == sweep and r.series and r.role not in (UNTRAINED, CONTROL)

@@ -90,8 +90,8 @@ def repeat_option(arguments: Sequence[str]) -> str:
 
 
 def joined(doc: str) -> str:
-    """A docstring with every paragraph and every argument on one line, for a help to break where it must, and a
-    default that is told in words at the end as tyro tells others."""
+    """A docstring with every paragraph and every argument on one line, which a help breaks where it must. 'Default: X.'
+    at the end of an argument becomes '(default: X)', as tyro writes it."""
     lines: list[str] = []
     arguments = False
     for line in inspect.cleandoc(doc).splitlines():
@@ -125,7 +125,7 @@ def wrapped(text: str, width: int) -> str:
 
 
 class _Caught(io.StringIO):
-    """What is printed, by one who sees the properties of the stream that it is for."""
+    """Collects what is printed, with the properties of the stream that it is meant for."""
 
     def __init__(self, stream: TextIO):
         super().__init__()
@@ -152,7 +152,7 @@ def _wrapped() -> Iterator[None]:
 
 
 def _values() -> ConstructorRegistry:
-    """Rules that call values as `VALUES` does, and an option that may be left out like any other."""
+    """Rules by which a help calls values as `VALUES` says, also those of an option that may be left out."""
     registry = ConstructorRegistry()
 
     @registry.primitive_rule

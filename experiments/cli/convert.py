@@ -201,8 +201,8 @@ def to_stablehlo(
 
 
 def _decode(run: Path, temperature: float | None, unmask_steps: int | None, latents: dict[str, Any]) -> DecodeConfig:
-    """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, but for what is asked for (not
-    None), of the sampler as well: `latents`."""
+    """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, changed where an argument, or a
+    value of `latents` for the sampler, is not None."""
     from hma_jax.simulator.folder import DECODE, change_decode, find_decode
 
     found = find_decode(run) if (run / DECODE).exists() else PLAIN
@@ -211,8 +211,8 @@ def _decode(run: Path, temperature: float | None, unmask_steps: int | None, late
 
 
 def _rates(run: Run) -> tuple[str, list[str]]:
-    """Registry entries of the run's robots, at the rates that give their strides; notes on robots that have none, or
-    need more than a rate."""
+    """(registry entries of the run's robots, at the rates that give their strides; notes on robots that have none, or
+    need more than a rate)."""
     from data_pipelines.registry.toml_file import to_toml
 
     entries, unknown, other, thinned = [], [], [], []

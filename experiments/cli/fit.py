@@ -141,9 +141,9 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
 
 
 def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: str) -> tuple[Curve, list[Position]]:
-    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` one is added. Raises
-    ConfigError where a power law is not what the axis is to show, where it is not said which of several curves, and for
-    a curve without a trial there."""
+    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` they are added, for the
+    message where there are none. Raises ConfigError for that, for an axis along which no power law is expected, and
+    where it is not clear which of several curves is meant."""
     from experiments.analysis.scaling import curves_of
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import POINT

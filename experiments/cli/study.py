@@ -106,7 +106,7 @@ def _dry_run(
     launcher_options: LauncherOptions,
     replace: Step | None,
 ) -> None:
-    """The dry run: the table of trials, the notes on them, and whether the command would be refused for what is there."""
+    """Prints the table of trials, notes on them, and why the command itself would be refused for what is there."""
     from experiments.dry_run.done import find_done
     from experiments.dry_run.notes import say_notes
     from experiments.dry_run.plan_table import Devices, plan_table

@@ -96,8 +96,8 @@ def _of(names: Collection[str], asked: Asked) -> Asked:
 
 
 def _wait_for_asked(workspace: Workspace, busy: Busy, began: float, *, opened: bool = False) -> Asked | None:
-    """What the holder of the directory was asked for, if so asked with the recordings that it has `opened`; None if it
-    is at another command, which is not waited for again if it was since `began`, or has ended."""
+    """What the holder of the directory was asked for; with `opened`, once it says its recordings too. None if it has
+    ended, or is at another command, having written nothing for WRITTEN_WITHIN seconds since `began`."""
     announced = False
     for pause in backoff():
         asked = _read(workspace)

@@ -62,8 +62,8 @@ def _of_robot(
     prompt: int,
     study: Study,
 ) -> np.ndarray:
-    """uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros. Of a window that no other episode's
-    actions cover, as one of the longest episode, they are the recorded frames, which nobody reads."""
+    """Frames uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros. A window that no other episode's
+    actions cover, as one of the longest episode, has the recorded frames, which nobody reads."""
     from data_pipelines.suite.counterfactual import frames_under
 
     name, size = spec.name, study.tokenizer.image_size

@@ -104,7 +104,7 @@ def judge_tokenizer(
 
 
 def _training(stamp: MadeFrom | None) -> MadeFrom:
-    """The stamp of a tokenizer's training, by that of a copy too; without inputs if it is not known."""
+    """The stamp of a tokenizer's training, also from the stamp of a copy; without inputs if it is not known."""
     if stamp is None:
         return MadeFrom({})
     if stamp.inputs.get(ORIGIN) == TRAINED:
@@ -113,8 +113,8 @@ def _training(stamp: MadeFrom | None) -> MadeFrom:
 
 
 def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: Step | None) -> bool:
-    """Whether the tokenizer that is given, by its directory `source`, is there. ConfigError if another one is, unless
-    allowed."""
+    """Whether the workspace has the tokenizer that is given, by its directory `source`. Raises ConfigError if it has
+    another one, unless `replace` allows it."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     place = workspace.tokenizer

@@ -23,9 +23,8 @@ Source = tuple["DatasetSpec", "Location | Parts"]
 
 
 def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
-    """The datasets at these locations, by name: of each the locations of its parts, which are several where an entry
-    joins them, by the names in their own files. Raises DataError for a location that is none, ConfigError for two of
-    one name."""
+    """{dataset: {name in its files: location}} of the datasets at these locations; several locations are one dataset
+    where an entry joins them. Raises DataError for a location that is no dataset, ConfigError for two of one name."""
     from data_pipelines.sources.open import source_name
 
     places: dict[str, str] = {}
@@ -124,8 +123,8 @@ def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
 
 
 def say_short_episodes(study: Study, sources: Sequence[Source]) -> None:
-    """Names the datasets of which, as far as their entries say, few episodes or none give a window to evaluate on: how
-    long each is may be known only when it is tokenised, after a tokenizer was trained."""
+    """Names the datasets most of whose episodes, by their entries, are too short for a window to evaluate on: how long
+    each is may be known only when it is tokenised, after a tokenizer was trained."""
     from data_pipelines.windows.windows import least_judged, settings_for_short
 
     least, short, stride = least_judged(study.eval.prompt_frames, study.model.frames), [], 1

@@ -75,8 +75,9 @@ def suite_is_there(study: Study, workspace: Workspace) -> bool:
 
 
 def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | None:
-    """How the inputs of a dataset that is there differ from `suite`; [] if only the simulator does; None if it
-    is as it should be, is not there, or lacks shards and is to be made in any case."""
+    """Lines on how a dataset that is there was made otherwise than `suite` says; [] if only by another version of the
+    simulator. None for a dataset that is as it should be, and for one that is to be made in any case: it is not there,
+    or lacks shards."""
     from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
     from data_pipelines.suite.embodiments import select
     from data_pipelines.suite.generate import episode_count, fingerprint

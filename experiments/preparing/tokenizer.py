@@ -61,8 +61,8 @@ where a decoder could make them, by another filter than that of the frames that 
 
 
 def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[Source]) -> MadeFrom:
-    """What the tokenizer of a study is trained from, under the names that --set has for it. Recordings are named as the
-    tokenizer that is there names them, if by earlier versions.
+    """What the tokenizer of a study is trained from, under the names that --set has for it. Recordings are named as in
+    the stamp of the tokenizer that is there, which may be of an earlier version.
 
     Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
     of where a dataset's frames are.
@@ -78,8 +78,8 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
 
 
 def frames_made_from(study: Study, sources: Sequence[Source], existing: MadeFrom | None) -> dict[str, Any]:
-    """Which frames there are to train a tokenizer on and to judge it by; as inputs of a stamp, of which an `existing`
-    one may name recordings as earlier versions did."""
+    """Inputs of a stamp that say which frames a tokenizer is trained on and judged by. Recordings are named as in an
+    `existing` stamp, which may be of an earlier version."""
 
     settings = study.store
     known = existing.inputs.get("data", {}) if existing else {}
@@ -177,7 +177,8 @@ def seen(study: Study, sources: Sequence[Source]) -> list[Source]:
 
 
 def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
-    """Whether the tokenizer that is to be trained is there. ConfigError if another one is, unless allowed."""
+    """Whether the tokenizer that is to be trained is there. Raises ConfigError if another one is, unless `replace`
+    allows it."""
     if not place.exists():
         return False
     existing = read_stamp(place)

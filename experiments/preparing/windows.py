@@ -90,7 +90,7 @@ def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
 
 def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) -> None:
     """Raises ConfigError if a dataset that is `judged` has no evaluation window, or any of the study no training
-    window: a point of an axis would say of more datasets than it was made with."""
+    window: a point of an axis would seem to be of more datasets than it was made with."""
     from data_pipelines.windows.evalset import EvalManifest
     from data_pipelines.windows.windows import least_judged
 

@@ -114,8 +114,7 @@ def draw_figures(
 def draw_again(out: Path) -> None:
     """Report of a study that ran before, without touching its data or trials.
 
-    Where its trials are not, as with results that are kept for the record, its figures are drawn from its table,
-    and table and page stay as they are.
+    Without its trials, as of results that are kept for the record, only figures are drawn, from its table.
     """
     from experiments.analysis.rows import read_rows
 

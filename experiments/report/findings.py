@@ -7,8 +7,8 @@ page, a section per axis, shown with its curves:
 
     Everything improves with width ...
 
-What stands under a heading that names several axes in backticks is shown with the last of them; what names none, or
-stands before them all, comes at the end. No other line may begin with `## `.
+A section whose heading names several axes in backticks is shown with the last of them; one that names none, and what
+stands before all sections, comes at the end. No other line may begin with `## `.
 """
 
 from __future__ import annotations

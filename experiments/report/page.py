@@ -104,7 +104,7 @@ def write_report(
 
 @dataclass(frozen=True)
 class _ShownTrials:
-    """The trials, one a seed, of which the page shows numbers, clips and robots: those at the default of a sweep."""
+    """The trials, one a seed, whose numbers, clips and robots the page shows: those at the default of a sweep."""
 
     sweep: Sweep
     name: str  # what they are
@@ -116,8 +116,8 @@ class _ShownTrials:
 
 
 def _choose_shown(sweeps: Sequence[Sweep], study: Study) -> _ShownTrials | None:
-    """The reference trials, by the sweep of the widest scope in which they stand; where they stand in none, what the
-    widest has instead, by the name that it has."""
+    """The reference trials, in the sweep of the widest scope that has them at its default; if none has, the trials at
+    the default of the widest sweep that has one."""
     with_default = [s for s in sweeps if _defaults(s)]
     with_reference = [s for s in with_default if all(t == reference_trial(study, t.train.seed) for t in _defaults(s))]
     sweep = max(with_reference or with_default, key=lambda s: len(s.scope), default=None)
@@ -207,10 +207,8 @@ def _curves(
     expected: Sequence[ExpectationOutcome],
     findings: Findings,
 ) -> list[str]:
-    """A section for the scaling curves, which share a figure, and one for each other sweep.
-
-    Of each its numbers, what was expected of it and what its author makes of it.
-    """
+    """A section for the scaling curves, which share a figure, and one for each other sweep: numbers, preregistered
+    expectations and the author's findings."""
 
     def say(sweep: Sweep) -> str:
         said = findings.of_axes.get(sweep.name, "")

@@ -82,7 +82,7 @@ def picture(path: Path, alt: str) -> str:
 
 
 def moving(animation: bytes, alt: str, attributes: str, lossless: bool = True) -> str:
-    """An animated WebP, and its last frame for whom motion disturbs. `attributes`: of both elements."""
+    """An animated WebP, and its last frame for readers whom motion disturbs. `attributes`: of both elements."""
     still = io.BytesIO()
     with Image.open(io.BytesIO(animation)) as film:
         film.seek(film.n_frames - 1)

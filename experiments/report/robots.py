@@ -83,7 +83,7 @@ def _rows_of(rows: Sequence[Row], sweep: Sweep) -> list[Row]:
 
 
 def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
-    """The standard error for trials that kept no numbers of their windows."""
+    """Standard errors from zero of the first of ORDER, for trials that kept no numbers of their windows."""
     points = (_at_reference(rows, sweep, metric, name) for metric in ORDER)
     return next((p.mean / p.sem for p in points if p and p.sem > 0), math.nan)
 

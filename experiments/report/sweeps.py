@@ -149,8 +149,8 @@ def _table(sweep: Sweep, rows: Sequence[Row], lines: Sequence[Sequence[str]]) ->
 
 
 def _with_parameters(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table of `lines` that end with their numbers of parameters: these stand last, since on a phone only the first
-    columns are seen, and below the table where all lines have one number."""
+    """A table of `lines`, whose last cells are numbers of parameters. These stand last, since a phone shows only the
+    first columns; where all are equal, a sentence below the table says them."""
     distinct = {parameters for *_, parameters in lines if parameters}
     if len(distinct) != 1:
         return table([*head, "parameters, all robots"], lines)
@@ -172,7 +172,7 @@ def _lines(sweep: Sweep, rows: Sequence[Row], role: str = POINT, remark: str = "
 
 
 def _parameters(point: CurvePoint) -> str:
-    """From the fewest to the most of its seeds, which train on robots of their own in the designs over robots."""
+    """The number of parameters, or the fewest to the most: in designs over robots each seed has robots of its own."""
     return " to ".join(f"{n:,}" for n in dict.fromkeys((point.parameters[0], point.parameters[-1])))
 
 

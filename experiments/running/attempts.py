@@ -86,8 +86,8 @@ def newest_step(run: Path) -> int:
 
 
 def reached(directory: Path) -> int:
-    """How far a trial has got, of what the next attempt need not do again: its newest checkpoint's step, and how many
-    batches of its evaluation are measured."""
+    """How far a trial has got: its newest checkpoint's step, plus the batches of its evaluation that are measured. The
+    next attempt does none of that again."""
     return newest_step(directory / RUN) + len(list((directory / EVALUATING).glob("*.npz")))
 
 

@@ -70,9 +70,9 @@ def enter_child(parent: int = 0) -> None:
 
 
 def require_accelerator(kind: str | None = None) -> None:
-    """Raises NoAccelerator if JAX computes on the processor though there is this `kind` of accelerator, by default the
-    one that the parent of this process named; "": none is expected, and so is none with JAX_PLATFORMS=cpu. JAX itself
-    would go on without a word."""
+    """Raises NoAccelerator if JAX computes on the processor though an accelerator of this `kind` is expected, by
+    default of the kind that this process's parent named; none is for "", or with JAX_PLATFORMS=cpu. JAX itself would
+    go on without a word."""
     kind = os.environ.get(_ACCELERATOR, "") if kind is None else kind
     if not kind or os.environ.get("JAX_PLATFORMS") == "cpu":
         return

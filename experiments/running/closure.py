@@ -2,8 +2,8 @@
 
 The closure of a program is what Python imports to run it: its root modules, what they import anywhere, their
 functions included, and what those modules import in turn where they are imported themselves. Only modules of this
-project count; versions of other packages are recorded beside (`machine`). What a branch imports that few programs
-take, inside a function of another module, is not found here but when it has been imported: see `imported_modules`.
+project count; versions of other packages are recorded beside (`machine`). What functions of other modules import is
+not followed: `imported_modules` finds it once it has been imported.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def imported_modules() -> dict[str, str]:
 
 
 def changed(old: Closure, new: Closure) -> list[str]:
-    """Modules in both that differ, in words of one line each; those that only one has are not compared."""
+    """Names of the modules in both that differ; those that only one has are not compared."""
     return [name for name in sorted(old.keys() & new.keys()) if old[name] != new[name]]
 
 

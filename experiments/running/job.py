@@ -31,8 +31,7 @@ def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, SharedTrai
 
 
 def trial_in(directory: Path) -> tuple[Trial, Provenance]:
-    """A finished trial and what it depends on, by the job.json in its directory. Raises ConfigError where that cannot be
-    read."""
+    """A finished trial and what it depends on, from its job.json. Raises ConfigError where that cannot be read."""
     try:
         job = json.loads((directory / JOB).read_text())
         return read_job(job)[0], inputs_of(job["provenance"])

@@ -237,8 +237,8 @@ def run_trial(
 ) -> dict[str, Any]:
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
 
-    `keep`: steps after which its checkpoint stays, for trials that go on from there. `begin` gives what
-    a trial with a source goes on from (`newcomers`). Returns what it writes to result.json. Raises ConfigError,
+    `keep`: steps after which its checkpoint stays, for trials that go on from there. `begin` makes what a trial with a
+    source begins with (`initial_model.InitialModel`). Returns what it writes to result.json. Raises ConfigError,
     DataError, DivergedError or Interrupted.
     """
     import jax

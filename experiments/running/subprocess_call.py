@@ -50,8 +50,8 @@ def call_in_subprocess(what: str, function: Callable[..., T], *arguments: Any) -
 
 
 def _start(process: SpawnProcess) -> None:
-    """SIGINT is blocked while the process starts: until that has a session of its own, a terminal sends Ctrl-C to it
-    too, and with what is passed on it would get two."""
+    """Starts it with SIGINT blocked: until the process has a session of its own, a terminal sends Ctrl-C to it too, and
+    with the one that is passed on it would get two."""
     resource_tracker.ensure_running()  # whose start unblocks SIGINT: before
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -22,8 +22,8 @@ from hma_jax.training.run_lock import CHECKPOINTS
 def find_trained(
     trials: Path, ids: Collection[str], provenance: Provenance, sources: Closure | None
 ) -> dict[str, Trial]:
-    """Finished trials in `trials` by id, without those of `ids`, that were trained on the same tokens, are what today's
-    code would name so, and have checkpoints.
+    """Finished trials in `trials` besides `ids`, by id, that have checkpoints, were trained on the same tokens, and
+    have the id that today's code gives them.
 
     `sources`: those that they have to have run; None: whichever. What cannot be read is nothing to go on from.
     """

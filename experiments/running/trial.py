@@ -66,8 +66,8 @@ def training_of(trial: Trial) -> dict[str, Any]:
 def trajectories_of(
     trial: Trial, available: Mapping[str, int], result: Mapping[str, Any] | None = None
 ) -> dict[str, int]:
-    """{robot: training trajectories that windows are drawn of}, as the trial's `result` counts them. Where it does not,
-    what its cap leaves of those that are `available`: a few more where a subset contains damaged ones."""
+    """{robot: training trajectories that windows are drawn of}, as the trial's `result` counts them. Without such a
+    count, the `available` ones up to its cap: a few more than there were, where a subset contains damaged ones."""
     if result and "trajectories" in result:
         return dict(result["trajectories"])
     capped, most = trial.capped or trial.datasets, trial.max_trajectories

@@ -44,8 +44,8 @@ def is_file(axis: str) -> bool:
 
 
 def join_axes(study: Study, root: Path, before: Sequence[str], axes: Sequence[str]) -> dict[str, str]:
-    """{name: axis} of the axes that a study in `root` had `before`, whose files lie there, and of those asked for now:
-    an axis takes the place of another one only if it has its name, whatever their files are called."""
+    """{name: axis} of the axes that a study in `root` had `before`, whose files lie there, and of those asked for now.
+    An axis takes the place of another of its name, whatever their files are called."""
     had = [str(root / axis) if is_file(axis) else axis for axis in before]
     return {
         sweep.name: axis for some in (had, axes) for axis, sweep in zip(some, plan_sweeps(study, some), strict=True)
@@ -53,8 +53,8 @@ def join_axes(study: Study, root: Path, before: Sequence[str], axes: Sequence[st
 
 
 def keep_axes(axes: Mapping[str, str], root: Path) -> tuple[str, ...]:
-    """The axes, {name: axis}, as a study in `root` remembers them: of a user's file a copy there, by the axis's name,
-    so that its report can be drawn anywhere and its trials be planned again."""
+    """The axes, {name: axis}, as the record of a study in `root` has them. A user's file is copied there, under the
+    name of its axis, so that the report can be drawn anywhere and the trials planned again."""
     texts = {name: Path(axis).read_bytes() for name, axis in axes.items() if is_file(axis)}
     for name, text in texts.items():
         (root / KEPT).mkdir(exist_ok=True)
@@ -80,8 +80,8 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
 
 def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
     """The sweeps along `axes` that are asked for now, of a study in `root`. Raises ConfigError as `plan_sweeps` does,
-    for a file that plans other trials each time, and for a new one without a point at its reference. Of those that the
-    study keeps the files, some were accepted by earlier versions."""
+    for a file that plans other trials each time, and for a new one without a point at its reference: of files that a
+    study keeps, earlier versions accepted such."""
     sweeps = plan_sweeps(study, axes)
     for axis, sweep in zip(axes, sweeps, strict=True):
         require(

@@ -94,8 +94,8 @@ class Sweep:
 
 
 def reference_trial(study: Study, seed: int, steps: int | None = None) -> Trial:
-    """All datasets, most trajectories, base model: the end of two axes and part of others. `steps`: other than the
-    study's, a branch of the same run; of that one alone the model before its first step is judged too."""
+    """All datasets, most trajectories, base model: the end of two axes and part of others. `steps`: others than the
+    study's, for a branch of the same run. With the study's own, the model is also judged before its first step."""
     names = study.dataset_names()
     train = study.train if steps is None else replace(study.train, steps=steps)
     return Trial(

@@ -24,7 +24,7 @@ from hma_jax.runtime.exits import raise_pending_stop
 
 class _Output(Console):
     def on_broken_pipe(self) -> None:
-        """What rich has caught goes on to the boundary of the program; rich itself would end it as failed."""
+        """Raises what rich has caught again, for the boundary of the program; rich itself would exit."""
         raise
 
 

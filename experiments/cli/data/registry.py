@@ -305,7 +305,7 @@ def _in_words(spec: DatasetSpec) -> str:
 
 
 def _write_entry(path: Path, suggestion: Suggestion) -> None:
-    """Adds the entry to a TOML file, in place of one of the same name. Says what that said otherwise."""
+    """Adds the entry to a TOML file, in place of one of the same name, whose differences it prints."""
     from data_pipelines.registry.toml_file import load_entries, put_entry
 
     spec = suggestion.spec()
@@ -322,7 +322,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
 
 def _say_displaced(own: DatasetSpec | None, spec: DatasetSpec, path: Path) -> None:
-    """Says how the data are read otherwise by the entry `spec`, which is in a file now, than by the project's `own`."""
+    """Prints how the entry `spec`, which is in the file at `path` now, differs from the project's `own`."""
     if own is not None and (lines := diff(own.facts(), spec.facts())):
         say(
             f"note: this takes the place of the project's entry of {own.name}, in commands with --registry {path} (there "
@@ -331,8 +331,8 @@ def _say_displaced(own: DatasetSpec | None, spec: DatasetSpec, path: Path) -> No
 
 
 def _say_other_rate(facts: Facts, hz: float | None) -> None:
-    """Says that the user's rate is not that of the files, which counts no more. It may be the right one: a file of
-    another's may be wrong, and a model was trained at the rate that somebody gave its robot."""
+    """Prints that the user's rate takes the place of that of the files. Either may be right: files may be wrong, and a
+    model is trained at the rate that somebody gave its robot."""
     from data_pipelines.sources.source import same_rate
 
     if hz is not None and facts.hz is not None and not same_rate(hz, facts.hz):

@@ -116,7 +116,7 @@ def _view_one(
 
 
 def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
-    """Fingerprints of another split. It need not be readable: the page is about the split that was asked for."""
+    """Fingerprints of another split; none, with a note, if it cannot be read: the page is about the one asked for."""
     from data_pipelines.inspection.inspect import inspect_dataset
 
     try:

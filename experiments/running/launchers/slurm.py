@@ -204,8 +204,8 @@ class SlurmLauncher(Launcher):
 
 @contextmanager
 def _no_job() -> Iterator[None]:
-    """What the job that this process may be in has in its environment would be taken for that of the jobs it submits,
-    besides how Slurm is found and the user's own options of sbatch."""
+    """Hides the environment of the job that this process may be in, which the jobs it submits would take for theirs;
+    not how Slurm is found, nor the user's own options of sbatch."""
     from submitit.helpers import clean_env
 
     kept = {key: value for key, value in os.environ.items() if key == "SLURM_CONF" or key.startswith("SBATCH_")}
