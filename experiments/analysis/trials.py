@@ -23,6 +23,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.analysis.rows import training_loss
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of
 from hma_jax.config.json import leaves, to_dict
@@ -37,11 +38,10 @@ def trial_row(
     trial: Trial,
     provenance: Provenance,
     result: dict[str, Any] | None,
-    loss: float,
     available: Mapping[str, int],
 ) -> dict[str, Any]:
-    """One row; `result` is that of result.json (None: there is none), `loss` its training loss, `available` the
-    training trajectories with windows that each robot has."""
+    """One row; `result` is that of result.json (None: there is none), `available` the training trajectories with
+    windows that each robot has."""
     row = {"trial": id, "title": title, "status": status}
     for path, value in leaves(to_dict(trial)).items():
         row[f"config.{path}"] = json.dumps(value) if isinstance(value, list) else value
@@ -52,7 +52,8 @@ def trial_row(
     if result is None:
         return row
     summary = Summary.from_dict(result["evaluation"])
-    row |= {"parameters": result["parameters"], "train_flops": result["train_flops"], "training_loss": loss}
+    row |= {name: result[name] for name in ("parameters", "train_flops")}
+    row["training_loss"] = training_loss(result).mean
     row["robots"] = len(summary.datasets)
     for metric, stat in summary.overall.items():
         row |= {metric: stat.mean, f"{metric}.sem": stat.sem}

@@ -92,29 +92,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     require_prepared(setup)
     prepared = open_prepared_data(setup.workspace)
     check_fits(trained, prepared)
-    frozen, untrained = set(prepared.manifest.names), _not_trained_on(trained, prepared)
-    masking = trained.train.masking
-    if not masking.predicts_frames:
-        say(
-            f"note: the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames, "
-            "so only its actions are evaluated"
-        )
-    empty = prepared.manifest.empty
-    if absent := [name for name in trained.table.names if name not in frozen and name not in empty]:
-        say(f"note: not evaluated, because the study does not have them: {', '.join(absent)}")
-    for name in [name for name in trained.table.names if name in empty]:
-        say(f"note: {name} is not evaluated: {empty[name]}")
-    if unseen := [name for name in untrained if name in frozen]:
-        say(f"note: not evaluated, because the model was not trained on them: {', '.join(unseen)}")
-    names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
-    besides = [name for name in names if setup.data and name not in setup.study.dataset_names()]
-    if besides:
-        say(
-            f"note: all windows that are frozen in {short(setup.workspace.root)} are evaluated, also those of "
-            f"{few(besides)}, which --data does not name"
-        )
-    _note_other_data(setup, prepared)
-    note_possible_leakage(trained, names, prepared.store)
+    names = _choose_datasets(setup, trained, prepared)
     execution, protocol = setup.study.execution, setup.study.eval
     made_from = describe_evaluation(trained, names, prepared, protocol)
     if not replace:
@@ -132,7 +110,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
             trained.table,
             prepared,
             protocol,
-            masking.setting,
+            trained.train.masking.setting,
             execution=execution,
             progress=lambda phase, done, total: update(done, total, phase),
             parts=parts,
@@ -151,6 +129,34 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     made_from.save(place, STAMP)
     parts.remove()
     wrote(place / MEANS, place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
+
+
+def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) -> tuple[str, ...]:
+    """The datasets on whose windows a model is evaluated. Prints notes on those that are left out, and on what a reader
+    of the results should know of the others."""
+    frozen, empty = set(prepared.manifest.names), prepared.manifest.empty
+    known, untrained = trained.table.names, _not_trained_on(trained, prepared)
+    if not trained.train.masking.predicts_frames:
+        say(
+            f"note: the model was trained with train.masking.setting {trained.train.masking.setting!r}, which predicts no "
+            "frames, so only its actions are evaluated"
+        )
+    if absent := [name for name in known if name not in frozen and name not in empty]:
+        say(f"note: not evaluated, because the study does not have them: {', '.join(absent)}")
+    for name in [name for name in known if name in empty]:
+        say(f"note: {name} is not evaluated: {empty[name]}")
+    if unseen := [name for name in untrained if name in frozen]:
+        say(f"note: not evaluated, because the model was not trained on them: {', '.join(unseen)}")
+    names = tuple(name for name in known if name in frozen - set(untrained))
+    besides = [name for name in names if setup.data and name not in setup.study.dataset_names()]
+    if besides:
+        say(
+            f"note: all windows that are frozen in {short(setup.workspace.root)} are evaluated, also those of "
+            f"{few(besides)}, which --data does not name"
+        )
+    _note_other_data(setup, prepared)
+    note_possible_leakage(trained, names, prepared.store)
+    return names
 
 
 def table_of(summary: Summary, title: str) -> TidyTable:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from experiments.analysis.rows import CurvePoint
-from experiments.terminal import words
+from experiments.terminal.words import number
 
 STILL = (
     "<p class=pause><input type=checkbox id=pause> <label for=pause>clips stand still, at their last frame</label></p>"
@@ -60,12 +60,8 @@ def pm(mean: float, error: float) -> str:
     """Mean ± standard error, with the digits that the error leaves meaningful."""
     if not 0 < error < math.inf:  # also nan
         return f"{mean:.4g}".replace("-", "\u2212")
-    return f"{number(mean, error)}\u00a0<span class=sem>±\u00a0{number(error, error)}</span>"
-
-
-def number(value: float, error: float) -> str:
-    """`words.number` with a minus sign as it is set in print."""
-    return words.number(value, error).replace("-", "\u2212")
+    value = number(mean, error).replace("-", "\u2212")
+    return f"{value}\u00a0<span class=sem>±\u00a0{number(error, error)}</span>"
 
 
 def picture(path: Path, alt: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.analysis.controllability import Controllability, controllability
-from experiments.analysis.rows import training_loss, write_csv
+from experiments.analysis.rows import write_csv
 from experiments.report.robots import count_usable
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
@@ -36,8 +36,7 @@ def write_tables(
     for id, trial in unique_trials(sweeps, provenance).items():
         state = states[id].event
         result = results[id] if state == FINISHED else None
-        loss = training_loss(result).mean if result else 0.0
-        rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, available))
+        rows.append(trial_row(id, names[id], state, trial, provenance, result, available))
     write_trials(workspace.trial_table, rows)
     controllability_rows = []
     references = [reference_trial(record.study, seed) for seed in record.study.seeds]

@@ -92,6 +92,7 @@ def _print_list(title: str, specs: Sequence[DatasetSpec]) -> None:
 
 def _cells(spec: DatasetSpec) -> tuple[str, ...]:
     unsure = f" [dim]* {escape(spec.unverified)}[/]" if spec.unverified else ""
+    joins = f"joins {few(spec.joins)}" if spec.joins else ""
     return (
         spec.name,
         f"{spec.action_dim}",
@@ -100,7 +101,7 @@ def _cells(spec: DatasetSpec) -> tuple[str, ...]:
         f"{spec.episodes:,}" if spec.episodes else "?",
         f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
         spec.image_key.removeprefix("observation/"),
-        escape(", ".join(filter(None, (spec.note, _joined(spec))))) + unsure,
+        escape(", ".join(filter(None, (spec.note, joins)))) + unsure,
     )
 
 
@@ -111,10 +112,6 @@ def _table_of(title: str, specs: Sequence[DatasetSpec]):
     for spec in specs:
         table.add_row(*_cells(spec))
     return table
-
-
-def _joined(spec: DatasetSpec) -> str:
-    return f"joins {few(spec.joins)}" if spec.joins else ""
 
 
 def data_inspect(

@@ -68,8 +68,8 @@ def test_a_row_per_trial_has_every_setting_and_result(tmp_path):
     other = replace(trial, max_trajectories=None)
     there = {"arm": 3, "rover": 20, "pusher": 8}
     rows = [
-        trial_row(directory.name, "a", "finished", trial, PROVENANCE, read_result(directory), 2.0, there),
-        trial_row(trial_id(other, PROVENANCE), "b", "failed", other, PROVENANCE, None, 0.0, there),
+        trial_row(directory.name, "a", "finished", trial, PROVENANCE, read_result(directory), there),
+        trial_row(trial_id(other, PROVENANCE), "b", "failed", other, PROVENANCE, None, there),
     ]
     write_trials(tmp_path / "trials.parquet", rows)
     before = (tmp_path / "trials.parquet").read_bytes()
@@ -83,9 +83,9 @@ def test_a_row_per_trial_has_every_setting_and_result(tmp_path):
     assert one["cross_entropy"] == pytest.approx(table.metrics["cross_entropy"].mean(), rel=1e-6)
     assert (one["trajectories"], two["trajectories"]) == (3 + 8 + 8, 3 + 20 + 8)
     assert one["windows_drawn"] == trial.train.steps * trial.train.batch
-    poor = trial_row("c", "c", "failed", replace(trial, capped=("rover",)), PROVENANCE, None, 0.0, {**there, "arm": 30})
+    poor = trial_row("c", "c", "failed", replace(trial, capped=("rover",)), PROVENANCE, None, {**there, "arm": 30})
     assert poor["trajectories"] == 30 + 8 + 8
-    assert trial_row("d", "d", "failed", trial, PROVENANCE, None, 0.0, {})["trajectories"] is None
+    assert trial_row("d", "d", "failed", trial, PROVENANCE, None, {})["trajectories"] is None
     short = read_result(directory) | {"trajectories": {"arm": 2, "rover": 5, "pusher": 8}}  # the others were damaged
-    assert trial_row("e", "e", "finished", trial, PROVENANCE, short, 2.0, there)["trajectories"] == 2 + 5 + 8
+    assert trial_row("e", "e", "finished", trial, PROVENANCE, short, there)["trajectories"] == 2 + 5 + 8
     assert two["status"] == "failed" and two["cross_entropy"] is two["parameters"] is None
