@@ -59,10 +59,10 @@ class ModelArguments:
     trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Train on N trajectories of each robot, chosen by hash: the same ones as in a sweep over trajectories."""
 
-    def directory(self) -> Path | None:
-        """`run`. Raises ConfigError for a URL."""
+    def directory(self, study: StudyArguments) -> Path:
+        """`run`, or else that of a model of the study. Raises ConfigError for a URL."""
         require_local("--run", self.run)
-        return self.run
+        return self.run or study.anywhere().out / "model"
 
 
 # As commands take them: `--help` shows those of each under its name.

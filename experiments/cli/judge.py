@@ -104,16 +104,19 @@ def judge(
     _require_options_of(recordings, task, expert, {
         "--real": real, "--registry": registry, "--split": split, "--reward": reward
     })  # fmt: skip
-    defaults = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
+    usual = {
+        "--demonstrations": JudgeConfig.demonstrations, "--steps": LadderConfig.steps, "--cloned": LadderConfig.cloned,
+        "--diffusion": LadderConfig.diffusion,
+    }  # fmt: skip
     if recordings is None:
         if robot not in ROBOTS:
             require_robot(robot, load_run(run, "auto").table.names)
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
-        defaults[2:] = 0, 0  # recordings have no expert to clone
+        usual |= {"--cloned": 0, "--diffusion": 0}  # recordings have no expert to clone
         split = split or "train"
         judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold, reward)
-    expert = {flag: n if given is None else given for n, (flag, given) in zip(defaults, expert.items(), strict=True)}
+    expert = usual | {flag: n for flag, n in expert.items() if n is not None}
     demonstrations, steps, cloned, diffusion = expert.values()
     config = JudgeConfig(
         judged_task,

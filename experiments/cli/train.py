@@ -71,7 +71,7 @@ def train(
     """
     if not dry_run:
         hosts.join()
-    run = model.directory() or arguments.anywhere().out / "model"
+    run = model.directory(arguments)
     trained = None if initial is None else load_initial(initial, run)
     setup = make_setup(arguments) if trained is None else setup_of(initial, trained, arguments)
     _say_swept(setup)
@@ -122,7 +122,7 @@ def adapt(
     from experiments.running.run_trial import open_prepared_data
 
     hosts.join()
-    run = model.directory() or arguments.anywhere().out / "model"
+    run = model.directory(arguments)
     trained, gone = load_initial(source, run), not source.exists()
     setup = setup_of(source, trained, arguments)
     study = setup.study
