@@ -66,26 +66,27 @@ def _draw(workspace: Workspace, record: Record) -> None:
         say(f"note: x of the axis episodes is by the registry's entries, not by what was trained on: {few(other)}")
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
-    others = write_tables(workspace, record, sweeps, states, provenance, numbers.results)
+    others = write_tables(workspace, record, sweeps, states, numbers.results)
     tables = [workspace.results, workspace.robots, workspace.fits, *others]
-    changes = find_changes(sweeps, provenance, numbers.windows)
-    at_best = judge_at_best(sweeps, provenance, numbers.windows)
-    growth = find_growth(sweeps, provenance, numbers.windows, numbers.results, available)
-    optima = find_optima(rows, sweeps)
+    along = AxisStatistics(
+        find_changes(sweeps, provenance, numbers.windows),
+        judge_at_best(sweeps, provenance, numbers.windows),
+        find_growth(sweeps, provenance, numbers.windows, numbers.results, available),
+        find_differences(sweeps, provenance, numbers.windows),
+        find_optima(rows, sweeps),
+    )
     for path, kind, table_rows in (
-        (workspace.changes, Change, changes),
-        (workspace.best_steps, BestSteps, at_best),
-        (workspace.growth, Growth, growth),
-        (workspace.optima, Optimum, optima),
+        (workspace.changes, Change, along.changes),
+        (workspace.best_steps, BestSteps, along.best),
+        (workspace.growth, Growth, along.growth),
+        (workspace.optima, Optimum, along.optima),
     ):
         if table_rows:
             write_csv(path, kind, table_rows)
             tables.append(path)
         else:
             path.unlink(missing_ok=True)  # of other trials, drawn before
-    differences = find_differences(sweeps, provenance, numbers.windows)
-    along = AxisStatistics(changes, at_best, growth, differences)
-    write_report(workspace, record, sweeps, rows, optima, along, states, provenance, numbers, checked)
+    write_report(workspace, record, sweeps, rows, along, states, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 
 

@@ -17,7 +17,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.analysis.optima import Optimum
 from experiments.analysis.preregistered import FILE as PREREGISTERED
 from experiments.analysis.preregistered import ExpectationOutcome, compare_expected, read_expected
 from experiments.analysis.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
@@ -58,15 +57,13 @@ def write_report(
     record: Record,
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
-    optima: Sequence[Optimum],
     along: AxisStatistics,
     states: dict[str, State],
-    provenance: Provenance,
     numbers: Numbers,
     checked: Check,
 ) -> None:
     """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
-    shown = _choose_shown(sweeps, record.study)
+    shown, provenance = _choose_shown(sweeps, record.study), record.provenance
     first = trial_id(_defaults(shown.sweep)[0], provenance) if shown else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
     has_reference = first in finished
@@ -75,12 +72,14 @@ def write_report(
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
     expected = compare_expected(read_expected(workspace.predictions / PREREGISTERED), rows)
-    checks = check_study(sweeps, rows, optima, states, robots, name, numbers.outcomes, expected, checked, vocabulary)
+    checks = check_study(
+        sweeps, rows, along.optima, states, robots, name, numbers.outcomes, expected, checked, vocabulary
+    )
     findings = read_findings(workspace.findings, [s.name for s in sweeps])
     headline = _headline(workspace, record, sweeps, rows, states, shown, _finished_when(numbers.results, finished))
     body = [
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, optima, along, expected, findings),
+        *_curves(workspace, sweeps, rows, along, expected, findings),
         _fits(workspace, numbers),
         findings.rest,
         _clips(workspace.trials / first / SAMPLES, record, robots, aside) if has_reference else "",
@@ -88,7 +87,7 @@ def write_report(
             rows, shown.sweep, robots, workspace.data_summary
         )) if has_reference else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),
-        section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
+        section("How to repeat it", _origin(workspace, record, finished, numbers.results)),
     ]  # fmt: skip
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -202,7 +201,6 @@ def _curves(
     workspace: Workspace,
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
-    optima: Sequence[Optimum],
     along: AxisStatistics,
     expected: Sequence[ExpectationOutcome],
     findings: Findings,
@@ -212,7 +210,7 @@ def _curves(
 
     def say(sweep: Sweep) -> str:
         said = findings.of_axes.get(sweep.name, "")
-        return describe(sweep, rows, optima, along) + describe_expected(sweep, expected) + said
+        return describe(sweep, rows, along) + describe_expected(sweep, expected) + said
 
     note = TWO_PERPLEXITIES if "perplexity" in {r.metric for r in rows} else ""
     sections = []
@@ -298,13 +296,9 @@ def _trial_table(
 
 
 def _origin(
-    workspace: Workspace,
-    record: Record,
-    provenance: Provenance,
-    finished: Sequence[str],
-    results: Mapping[str, Mapping[str, Any]],
+    workspace: Workspace, record: Record, finished: Sequence[str], results: Mapping[str, Mapping[str, Any]]
 ) -> str:
-    suite = record.study.suite
+    suite, provenance = record.study.suite, record.provenance
     machines = [results[id]["run"]["machine"] for id in finished]
     ran = group_by_sources(workspace.trials, finished)
     several = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""

@@ -34,20 +34,21 @@ LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
 @dataclass(frozen=True)
 class AxisStatistics:
-    """Statistics of whole axes, computed from every window's numbers."""
+    """Statistics of whole axes."""
 
     changes: Sequence[Change] = ()
     best: Sequence[BestSteps] = ()
     growth: Sequence[Growth] = ()
     differences: Sequence[Change] = ()
+    optima: Sequence[Optimum] = ()
 
 
-def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along: AxisStatistics) -> str:
+def describe(sweep: Sweep, rows: Sequence[Row], along: AxisStatistics = AxisStatistics()) -> str:
     """Heading, question and numbers of a sweep of any kind."""
     if sweep.labels:
         numbers = _names(sweep, rows, [c for c in along.differences if c.sweep == sweep.name])
     elif sweep.base:
-        numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
+        numbers = _optima(sweep, [o for o in along.optima if o.sweep == sweep.name])
     elif sweep.has_series:
         names = all_series(rows, sweep.name).get(POINT, [])
         numbers = "".join(_series(sweep, rows, name, along.changes) for name in names)

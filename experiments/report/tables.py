@@ -11,7 +11,6 @@ from experiments.analysis.rows import write_csv
 from experiments.report.robots import count_usable
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
-from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, control_of, reference_trial, titles, unique_trials
@@ -23,7 +22,6 @@ def write_tables(
     record: Record,
     sweeps: Sequence[Sweep],
     states: Mapping[str, State],
-    provenance: Provenance,
     results: Mapping[str, dict[str, Any]],
 ) -> list[Path]:
     """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
@@ -31,6 +29,7 @@ def write_tables(
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
 
+    provenance = record.provenance
     names, rows = titles(sweeps, provenance), []
     available = count_usable(workspace.data_summary)
     for id, trial in unique_trials(sweeps, provenance).items():

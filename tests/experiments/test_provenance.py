@@ -313,7 +313,7 @@ def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
     del result["hash"], result["files"]
     result["run"]["machine"] |= {"processor": "another", "cores": 1}
     write_result(workspace.trials / ids[0], result)
-    page = _origin(workspace, record_of(), PROVENANCE, ids, {id: read_result(workspace.trials / id) for id in ids})
+    page = _origin(workspace, record_of(), ids, {id: read_result(workspace.trials / id) for id in ids})
     assert f"{len(ids) - 1} trials: abacus, 2 cores per trial; 1 trial: another, 1 core per trial" in page
     assert "2 different ones, by hash: " in page and closure_hash(NEW) in page and closure_hash(OLD) in page
 

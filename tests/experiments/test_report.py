@@ -301,7 +301,7 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     several = replace(sweep, points=tuple(replace(p, series=f"width {p.x}") for p in sweep.points))
     plots.plot_sweep([replace(r, series=f"width {r.x}") for r in rows], several, tmp_path / "several.png")
     assert {p.get_ylabel() for p in kept[1].axes} == {p.get_ylabel() for p in kept[0].axes}
-    said = describe(sweep, rows, [], AxisStatistics())
+    said = describe(sweep, rows)
     assert "perplexity" not in said and all(name.removeprefix("squared ") in said for name in shown)
     checked = check_study([sweep], rows, [], {}, [], "reference", [], [], Check("", "good", ""), None)
     assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
@@ -341,7 +341,7 @@ def test_a_control_beside_one_of_several_curves_is_no_curve(drawn, base, tmp_pat
     plots.plot_sweep(rows, several, tmp_path / "width.png")
     optima = find_optima(rows, [several])
     assert {o.role for o in optima} == ({POINT} if base else set())
-    assert "width 16" in describe(several, rows, optima, AxisStatistics())
+    assert "width 16" in describe(several, rows, AxisStatistics(optima=optima))
 
 
 @pytest.mark.parametrize("status", ["finished", "diverged"])
@@ -358,7 +358,7 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
     for plan, own in ((plan_newcomers, True), (plan_conditioning, False)):
         sweep = plan(CPU_FULL)
         caption = plot_names([], sweep).get_supxlabel()
-        said = describe(sweep, [], [], AxisStatistics())
+        said = describe(sweep, [])
         assert ("each seed judged on robots of its own" in caption) == ("evaluates robots of its own" in said) == own
         assert ("all judged on the same windows" in caption) != own
         assert ("one seed and its robots: do not compare it with the means" in caption) == own
@@ -451,7 +451,7 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
     rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
     lines = re.findall(
         r"<tr><th scope=row class=text>(\d+)</th>(.*?)<td>([\d,]+)</td></tr>",
-        describe(sweep, rows, [], AxisStatistics()),
+        describe(sweep, rows),
     )
     assert [(x, cells.count("–"), parameters) for x, cells, parameters in lines] == [
         ("8", 1, "6,400"),
@@ -462,7 +462,7 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
 def test_numbers_of_parameters_stand_below_a_table_in_which_they_are_one_number(drawn):
     """They stood before the results, in every line."""
     rows = rows_of(drawn, [plan_datasets(STUDY)])
-    said = describe(plan_datasets(STUDY), rows, [], AxisStatistics())
+    said = describe(plan_datasets(STUDY), rows)
     (number,) = {f"{r.parameters:,}" for r in rows if r.parameters}
     assert f"</table></div><p>All have {number} parameters, all robots together.</p>" in said
     assert said.count(number) == 1 and "parameters, all robots</th>" not in said
@@ -474,7 +474,7 @@ def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():
     for id, trial in unique_trials([sweep], PROVENANCE).items():
         windows = windows_of(trial)
         alone[id] = replace(windows, episode=np.zeros_like(windows.episode), start=np.arange(len(windows)))
-    said = describe(sweep, [], [], AxisStatistics(changes=find_changes([sweep], PROVENANCE, alone)))
+    said = describe(sweep, [], AxisStatistics(changes=find_changes([sweep], PROVENANCE, alone)))
     assert "nats per token \u22120." in said and "One held-out episode per robot gives no interval." in said
     assert "nan" not in said
 

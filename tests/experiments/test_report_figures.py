@@ -64,7 +64,7 @@ def test_the_best_rate_of_the_figure_is_that_of_the_nats():
 
 def test_tables_have_nats_beside_the_perplexity():
     sweep = plan_conditioning(CPU_FULL)
-    said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.1, "perplexity": 75.0}), [], AxisStatistics())
+    said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.1, "perplexity": 75.0}))
     assert (
         "".join(f"<th scope=col>{h}</th>" for h in ("nats per token", "minus the default", "perplexity", "seeds"))
         in said
@@ -77,7 +77,7 @@ def test_a_difference_over_fewer_seeds_than_the_mean_beside_it_is_said_to_be():
     rows = rows_of(sweep, lambda p: {"cross_entropy": 4 + 0.1 * p.trial.train.seed})
     fewer = [r for r in rows if r.x == sweep.reference_x or r.seed == 0]
     for own, told in ((rows, False), (fewer, True)):
-        said = describe(sweep, own, [], AxisStatistics())
+        said = describe(sweep, own)
         assert ("the difference is over the seeds that both have" in said) == told
 
 
@@ -95,7 +95,7 @@ def test_errors_of_variants_count_seeds_and_episodes():
         return Side("", {t.train.seed: windows[trial_id(t, PROVENANCE)] for t in own}, "")
 
     d = overall_difference(side(0), side(sweep.reference_x), "delta_psnr", sweep.scope)
-    said = describe(sweep, rows, [], AxisStatistics(differences=differences))
+    said = describe(sweep, rows, AxisStatistics(differences=differences))
     assert f"<td>{'+' * (d.mean > 0)}{pm(d.mean, d.sem)}</td>" in said
     [point] = [p for p in curve(rows, sweep.name, "delta_psnr") if p.x == 0]
     assert point.sem > 5 * point.seed_sem and f"<td>{pm(point.mean, point.sem)}</td>" in said
@@ -180,7 +180,7 @@ def test_variants_without_a_seed_in_common_have_no_difference():
     rows = [
         r for r in rows_of(sweep, lambda _: {"cross_entropy": 4.0}) if (r.seed == alone) == (r.x == sweep.reference_x)
     ]
-    said = describe(sweep, rows, [], AxisStatistics())
+    said = describe(sweep, rows)
     assert "<td>–</td>" in said and "nan" not in said
 
 
@@ -192,7 +192,7 @@ def test_several_curves_are_shown_with_their_controls():
     [bars] = [c for c in figure.axes[0].containers if c.get_label() == label]
     at = sorted({p.x for p in sweep.points if p.role == CONTROL})
     assert bars.lines[0].get_xdata().tolist() == at and bars.lines[0].get_ydata() == pytest.approx([math.exp(5.3)] * 2)
-    said = describe(sweep, rows, [], AxisStatistics())
+    said = describe(sweep, rows)
     of_controls = said.split("<h4>4,000 steps, shuffled actions</h4>")[1]
     assert all(f"<th scope=row class=text>{x:,}</th>" in of_controls for x in at) and pm(5.3, 0.1) in of_controls
 
@@ -201,7 +201,7 @@ def test_a_curve_s_table_has_its_controls():
     from experiments.sweeps.width import plan
 
     sweep = plan(CPU_FULL)
-    said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.0}), [], AxisStatistics())
+    said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.0}))
     assert all(
         f"<th scope=row class=text>{p.x:,}, shuffled actions</th>" in said for p in sweep.points if p.role == CONTROL
     )
@@ -210,7 +210,7 @@ def test_a_curve_s_table_has_its_controls():
 def test_a_table_without_a_finished_trial_has_the_columns_of_frames():
     from experiments.sweeps.width import plan
 
-    said = describe(plan(CPU_FULL), [], [], AxisStatistics())
+    said = describe(plan(CPU_FULL), [])
     assert "perplexity</th>" in said and "error of actions" not in said
 
 

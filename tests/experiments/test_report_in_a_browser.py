@@ -14,7 +14,7 @@ from experiments.presets import CPU_FULL
 from experiments.report.fits import describe_fits
 from experiments.report.pieces import section, table
 from experiments.report.style import CSS
-from experiments.report.sweeps import AxisStatistics, describe
+from experiments.report.sweeps import describe
 from experiments.sweeps.conditioning import plan as plan_conditioning
 from experiments.sweeps.width import plan as plan_width
 from tests.experiments.applications.browser import chromium  # noqa: F401  a fixture
@@ -61,7 +61,7 @@ def test_a_table_on_a_phone_shows_results_and_keeps_what_they_are_of(plan, chrom
     sweep = plan(CPU_FULL)
     rows = rows_of(sweep, lambda _: {"cross_entropy": 4.1, "perplexity": 75.0, "delta_psnr": 0.5, "psnr": 20.0})
 
-    tables = look(chromium, 390, describe(sweep, rows, [], AxisStatistics()), WHERE)
+    tables = look(chromium, 390, describe(sweep, rows), WHERE)
     assert tables and any(at["scrolled"] > 0 for at in tables)
     for at in tables:
         assert min(*at["first"], *at["heading"]) >= 0, at

@@ -119,7 +119,7 @@ def test_the_axis_of_trajectories_is_judged_at_its_best_steps():
         table = replace(table, metrics={**table.metrics, "action_nats": nats})
         tables[trial_id(point.trial, PROVENANCE)] = with_loss(table, table.metrics["cross_entropy"] + worse)
     found = judge_at_best([sweep], PROVENANCE, tables)
-    assert "At the best number of steps for each point" in describe(sweep, [], [], AxisStatistics(best=found))
+    assert "At the best number of steps for each point" in describe(sweep, [], AxisStatistics(best=found))
     assert {r.mean for r in found if r.metric == "action_nats"} == {1.0}, "of the robots that have it"
     rows = {r.x: r for r in found if r.metric == "cross_entropy"}
     fewest, most = min(rows), max(rows)

@@ -86,7 +86,7 @@ def tables_of_points():
 
 
 def test_the_page_shows_both_groups():
-    said = describe(SWEEP, [], [], AxisStatistics(growth=find_growth([SWEEP], PROVENANCE, tables(), {}, THERE)))
+    said = describe(SWEEP, [], AxisStatistics(growth=find_growth([SWEEP], PROVENANCE, tables(), {}, THERE)))
     assert "Robots whose data grows, and others" in said and "1 with more" in said and "2 with no more" in said
 
 
