@@ -29,6 +29,16 @@ class Busy(Held):
     """Another command is at work in the directory."""
 
 
+class _Under:
+    """An attribute of a workspace: a path under its root."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __get__(self, workspace: Workspace, owner: type) -> Path:
+        return workspace.root / self.name
+
+
 @dataclass(frozen=True)
 class Workspace:
     """Paths under `root`. Deleting any of them is safe, the next run makes it again, but for predictions and
@@ -36,122 +46,54 @@ class Workspace:
 
     root: Path
 
+    suite = _Under("suite")
+    """Simulated RLDS datasets."""
+    tokenizer = _Under("tokenizer")
+    store = _Under("tokens")
+    """Token store."""
+    manifest = _Under("eval_manifest.json")
+    """Frozen evaluation windows."""
+    counterfactual = _Under("counterfactual.npz")
+    """Their true frames under other actions, where they are of the suite."""
+    data_summary = _Under("data.json")
+    """Episodes and windows per dataset, as JSON."""
+    trials = _Under("trials")
+    ledger = _Under("ledger.jsonl")
+    results = _Under("results.csv")
+    """Means over robots, a line for each point, seed and metric."""
+    robots = _Under("robots.parquet")
+    """The same of every robot."""
+    trial_table = _Under("trials.parquet")
+    """A row per trial, its configuration and results flat."""
+    controllability = _Under("controllability.csv")
+    """Per robot, whether the reference model follows actions."""
+    optima = _Under("optima.csv")
+    """Best learning rates per width, where they were swept."""
+    changes = _Under("changes.csv")
+    """Differences between the two ends of each axis."""
+    best_steps = _Under("best_steps.csv")
+    """Points of an axis at the number of steps that suits them."""
+    growth = _Under("growth.csv")
+    """The effect of more trajectories on robots that have more, and on those that have not."""
+    fits = _Under("fits.csv")
+    """Coefficients of scaling fits."""
+    registry = _Under("registry.toml")
+    """The registry entries of the user's own that its axes were planned with; there is none without any."""
+    predictions = _Under("predictions")
+    """Predictions of trials, made before they ran."""
+    findings = _Under("findings.md")
+    """The author's findings by axis, shown on the page."""
+    figures = _Under("figures")
+    report = _Under("report.html")
+    record = _Under("study.json")
+    """Which study lives here."""
+
     @classmethod
     def of_run(cls, run: Path) -> Workspace:
         """The study that a run is of: STUDY/RUN, or the trial STUDY/trials/ID/run."""
         parent = run.absolute().parent
         study = parent.parent.parent
         return cls(study if cls(study).trials == parent.parent else parent)
-
-    @property
-    def suite(self) -> Path:
-        """Simulated RLDS datasets."""
-        return self.root / "suite"
-
-    @property
-    def tokenizer(self) -> Path:
-        return self.root / "tokenizer"
-
-    @property
-    def store(self) -> Path:
-        """Token store."""
-        return self.root / "tokens"
-
-    @property
-    def manifest(self) -> Path:
-        """Frozen evaluation windows."""
-        return self.root / "eval_manifest.json"
-
-    @property
-    def counterfactual(self) -> Path:
-        """Their true frames under other actions, where they are of the suite."""
-        return self.root / "counterfactual.npz"
-
-    @property
-    def data_summary(self) -> Path:
-        """Episodes and windows per dataset, as JSON."""
-        return self.root / "data.json"
-
-    @property
-    def trials(self) -> Path:
-        return self.root / "trials"
-
-    @property
-    def ledger(self) -> Path:
-        return self.root / "ledger.jsonl"
-
-    @property
-    def results(self) -> Path:
-        """Means over robots, a line for each point, seed and metric."""
-        return self.root / "results.csv"
-
-    @property
-    def robots(self) -> Path:
-        """The same of every robot."""
-        return self.root / "robots.parquet"
-
-    @property
-    def trial_table(self) -> Path:
-        """A row per trial, its configuration and results flat."""
-        return self.root / "trials.parquet"
-
-    @property
-    def controllability(self) -> Path:
-        """Per robot, whether the reference model follows actions."""
-        return self.root / "controllability.csv"
-
-    @property
-    def optima(self) -> Path:
-        """Best learning rates per width, where they were swept."""
-        return self.root / "optima.csv"
-
-    @property
-    def changes(self) -> Path:
-        """Differences between the two ends of each axis."""
-        return self.root / "changes.csv"
-
-    @property
-    def best_steps(self) -> Path:
-        """Points of an axis at the number of steps that suits them."""
-        return self.root / "best_steps.csv"
-
-    @property
-    def growth(self) -> Path:
-        """The effect of more trajectories on robots that have more, and on those that have not."""
-        return self.root / "growth.csv"
-
-    @property
-    def fits(self) -> Path:
-        """Coefficients of scaling fits."""
-        return self.root / "fits.csv"
-
-    @property
-    def registry(self) -> Path:
-        """The registry entries of the user's own that its axes were planned with; there is none without any."""
-        return self.root / "registry.toml"
-
-    @property
-    def predictions(self) -> Path:
-        """Predictions of trials, made before they ran."""
-        return self.root / "predictions"
-
-    @property
-    def findings(self) -> Path:
-        """The author's findings by axis, shown on the page."""
-        return self.root / "findings.md"
-
-    @property
-    def figures(self) -> Path:
-        return self.root / "figures"
-
-    @property
-    def report(self) -> Path:
-        return self.root / "report.html"
-
-    @property
-    def record(self) -> Path:
-        """Which study lives here."""
-        return self.root / "study.json"
 
     @property
     def holder(self) -> Holder | None:
