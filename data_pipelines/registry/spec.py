@@ -13,6 +13,7 @@ from data_pipelines.names import NAME_RULE, is_dataset_name, quote
 from data_pipelines.registry.angles import AngleForm, AngleUnit, angle_width, convert_angles
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import ConfigError, require
+from hma_jax.config.base import later
 from hma_jax.config.json import stable_hash
 
 if TYPE_CHECKING:
@@ -90,19 +91,19 @@ class DatasetSpec:
     video_targets: bool = True
     version: str = ""  # of tfds, for which the keys were written
     unverified: str = ""  # which of this entry's facts no public source confirms
-    rate: float | None = None  # Hz at which its frames are shown, whatever the study's rate; None: the study's
-    angles: tuple[int, ...] = ()  # values that wrap; data, as the next two
-    angle_form: AngleForm = "as_recorded"
-    angle_unit: AngleUnit = "radian"
+    rate: float | None = later(None)  # Hz at which its frames are shown, whatever the study's rate; None: the study's
+    angles: tuple[int, ...] = later(())  # values that wrap; data, as the next two
+    angle_form: AngleForm = later("as_recorded")
+    angle_unit: AngleUnit = later("radian")
     # For people again; 0 where nobody says.
-    episodes: int = 0  # of `split`
-    median_steps: float = 0.0  # of an episode
-    mean_steps: float = 0.0
-    val_split: str = ""  # the part of `split` ("train+val") that is held out; "": episodes chosen by hash
+    episodes: int = later(0)  # of `split`
+    median_steps: float = later(0.0)  # of an episode
+    mean_steps: float = later(0.0)
+    val_split: str = later("")  # the part of `split` ("train+val") that is held out; "": episodes chosen by hash
     # What is done to every frame that is read: for a camera that hangs upside down, or colours written as BGR.
-    image_corrections: tuple[ImageCorrection, ...] = ()
+    image_corrections: tuple[ImageCorrection, ...] = later(())
     # Datasets, by the names in their own files, that together are this one, in this order; (): it is one by itself.
-    joins: tuple[str, ...] = ()
+    joins: tuple[str, ...] = later(())
 
     def __post_init__(self):
         name = self.name

@@ -24,7 +24,8 @@ from data_pipelines.sources.identity import EpisodeRun, runs_of_parts
 from data_pipelines.tokens.moments import Moments
 from data_pipelines.tokens.row_sample import ActionRange, quantiles_vary
 from hma_jax.config import require
-from hma_jax.config.json import stable_hash, to_dict
+from hma_jax.config.base import later
+from hma_jax.config.json import identity_of, stable_hash
 from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import Embodiment
 
@@ -33,25 +34,6 @@ SPLITS = ("train", "val")
 COLUMNS_FILE = "episodes.columns"
 EPISODE_COLUMNS = ("episodes", "steps")
 """Columns of `SplitFacts` with an entry per episode: up to millions, so no code loops over them."""
-
-ADDED_FIELDS = (
-    ("", "runs", []),
-    ("", "action_quantiles", []),
-    ("", "recipe", 1),
-    ("spec", "rate", None),
-    ("spec", "angles", []),
-    ("spec", "angle_form", "as_recorded"),
-    ("spec", "angle_unit", "radian"),
-    ("spec", "episodes", 0),
-    ("spec", "median_steps", 0.0),
-    ("spec", "mean_steps", 0.0),
-    ("spec", "val_split", ""),
-    ("spec", "image_corrections", []),
-    ("spec", "joins", []),
-    ("settings", "max_val_fraction", 0.5),
-)
-"""Fields that were added to the format ("": to the manifest itself), with the value that holds for older stores. A
-field that has this value is left out of the file and of the hash, so that older stores keep their hash."""
 
 RECIPE_VERSION = 1
 """Raise it when a change to the code alters what `tokenize_job` stores of the same source: tokens of an older version
@@ -85,8 +67,7 @@ class JobSettings:
     max_val: int = HeldOut.max_val
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
-    # Limits min_val too. The default is that of older stores (`ADDED_FIELDS`), not of new ones (`HeldOut`).
-    max_val_fraction: float = 0.5
+    max_val_fraction: float = later(0.5)  # limits min_val too; new stores take that of `HeldOut`
 
     def __post_init__(self):
         self.held_out.check()
@@ -146,10 +127,11 @@ class Manifest:
     val: SplitFacts
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
-    action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
+    action_quantiles: tuple[tuple[float, ...], ...] = later(())  # one row per `row_sample.QUANTILES`
     skipped: tuple[SkippedEpisodes, ...] = ()  # what was left out
-    runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): only numbers
-    recipe: int = 1  # RECIPE_VERSION of the code that made it; 1 where the file does not say
+    # Names of all episodes of the source, by number; (): only numbers.
+    runs: tuple[EpisodeRun, ...] = later(())
+    recipe: int = later(1)  # RECIPE_VERSION of the code that made it
     format: int = FORMAT_VERSION
 
     def stride_at(self, rate: float | None) -> int:
@@ -251,13 +233,8 @@ class Manifest:
         return stable_hash([self._facts(), list(self._digests().values())])
 
     def _facts(self) -> dict[str, Any]:
-        """All but the episode columns, without ADDED_FIELDS that have the value of older stores, as plain JSON."""
-        values = to_dict(self._without_episodes())
-        for group, field, default in ADDED_FIELDS:
-            owner = values[group] if group else values
-            if owner[field] == default:
-                del owner[field]
-        return values
+        """All but the episode columns, as plain JSON: equal for stores that are equal but for their version."""
+        return identity_of(self._without_episodes())
 
     def _columns(self) -> dict[str, Column]:
         return {f"{s}.{name}": getattr(self.split(s), name) or Column() for s in SPLITS for name in EPISODE_COLUMNS}

@@ -21,10 +21,10 @@ from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.analysis.isoflop import IsoFlop, fit_isoflop
 from experiments.analysis.measured import PRIOR, Measurements, NoLevel, Position, measure
 from experiments.running.provenance import Provenance
-from experiments.running.trial import Trial, drop_later_fields, trial_id
+from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ModelConfig
-from hma_jax.config.json import stable_hash, to_dict
+from hma_jax.config.json import identity_of, stable_hash
 from hma_jax.evaluation.windows import WindowTable
 
 TRUNK, WINDOWS, FLOPS = "trunk parameters", "windows seen", "training FLOPs"
@@ -180,11 +180,11 @@ def _all_but_size(trial: Trial) -> str:
 
 
 def _without_steps(trial: Trial) -> dict[str, Any]:
-    values: dict[str, Any] = to_dict(trial)
+    # No field that is added may change in which order runs are drawn; these two were there when runs got names.
+    values: dict[str, Any] = {"capped": [], "source": None} | identity_of(trial)
     for name in ("steps", "seed"):
         values["train"].pop(name)
     values.pop("measure_untrained")
-    drop_later_fields(values)  # or runs would be drawn again in another order for every field that is added
     return values
 
 

@@ -21,7 +21,7 @@ import argparse
 import csv
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -50,6 +50,7 @@ from experiments.applications.tables import make_once, write_table
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import step, wrote
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
+from hma_jax.config.json import identity_of
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.files import write_file
@@ -203,7 +204,7 @@ def compare(
         "windows to train on; give a run with a shorter window",
     )
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
-    pin_settings(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
+    pin_settings(out, run, simulator, identity_of(settings), unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():
         with step(f"record {settings.demonstrations} demonstrations"):

@@ -25,7 +25,7 @@ import csv
 import sys
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,7 @@ from experiments.applications.tables import make_once, write_table
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import require
+from hma_jax.config.json import identity_of
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
@@ -139,7 +140,7 @@ def pinned(settings: Settings, stride: int) -> dict[str, Any]:
     """The settings, and how many actions the expert has where a frame has several: in earlier versions it had fewer,
     so their goals were others."""
     more = {"expert_actions": count_expert_actions(settings.make_task(), stride)} if stride > 1 else {}
-    return asdict(settings) | more
+    return identity_of(settings) | more
 
 
 def run_planner(way: str, simulator: Simulator, robot: Robot, settings: Settings, seed: int) -> dict:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from hma_jax.config import require
-from hma_jax.config.json import diff, to_dict
+from hma_jax.config.json import diff, identity_of
 from hma_jax.model.params import Params
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.simulator import Simulator
@@ -72,8 +72,10 @@ def write_settings(out: Path, run: Path, simulator: Simulator, settings: Mapping
 def described(run: Path, simulator: Simulator, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The content of the file. Runs are identified by name and a hash of their weights, robots by name and a hash of
     their descriptions."""
-    robots = {name: short_hash(json.dumps(to_dict(robot)).encode()) for name, robot in sorted(simulator.robots.items())}
-    besides_weights = {"decode": to_dict(simulator.decode), "robots": robots}
+    robots = {
+        name: short_hash(json.dumps(identity_of(robot)).encode()) for name, robot in sorted(simulator.robots.items())
+    }
+    besides_weights = {"decode": identity_of(simulator.decode), "robots": robots}
     description = {
         "run": run.resolve().name,
         "weights": hash_of(simulator.model.params),

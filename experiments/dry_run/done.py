@@ -25,7 +25,6 @@ from experiments.study import Study
 from experiments.study_setup import StudySetup
 from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ConfigError
-from hma_jax.config.json import to_dict
 
 UNKNOWN = Provenance("", "", "")
 """Stands in where nothing is known of it, and only the trials' own fields matter."""
@@ -110,9 +109,10 @@ def _suite(setup: StudySetup) -> bool:
 
 
 def _tokenizer(setup: StudySetup) -> bool:
+    from experiments.preparing.tokenizer import training_settings
+
     stamp = read_stamp(setup.workspace.tokenizer)
-    wanted = {name: to_dict(getattr(setup.study, name)) for name in ("tokenizer", "tokenizer_train")}
-    return stamp is not None and all(stamp.inputs.get(name) == value for name, value in wanted.items())
+    return stamp is not None and training_settings(setup.study).items() <= stamp.inputs.items()
 
 
 def _tokens(study: Study, workspace: Workspace) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.preparing.made_from import MadeFrom, dataset_differences, differences, read_stamp
 from hma_jax.config import ConfigError, EvalConfig
-from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.config.json import from_dict, identity_of, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from experiments.running.run_trial import PreparedData
@@ -25,7 +25,7 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
     The step is recorded only: of a run that trains on, later results replace earlier ones. So are, for `hma compare`,
     the steps that its training was to have, and the seed, which is part of the model's hash as well.
     """
-    train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
+    train = {key: value for key, value in identity_of(trained.train).items() if key != "steps"}
     chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {
         name: {

@@ -33,7 +33,7 @@ from experiments.study import Study
 from experiments.terminal.progress import console, step
 from experiments.terminal.words import plus_minus
 from hma_jax.config import TokenizerConfig, require
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import identity_of
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -69,12 +69,16 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
     """
     inputs = {
         ORIGIN: TRAINED,
-        "tokenizer": to_dict(study.tokenizer),
-        "tokenizer_train": to_dict(study.tokenizer_train),
+        **training_settings(study),
         **frames_made_from(study, sources, read_stamp(workspace.tokenizer)),
     }
     recorded = {"code": closure_hash(trace(SOURCES)), FRAMES: ENCODED}
     return MadeFrom(inputs, recorded, describe_machine())
+
+
+def training_settings(study: Study) -> dict[str, Any]:
+    """The inputs of a tokenizer's training that are settings of a study, as a stamp has them."""
+    return {name: identity_of(getattr(study, name)) for name in ("tokenizer", "tokenizer_train")}
 
 
 def frames_made_from(study: Study, sources: Sequence[Source], existing: MadeFrom | None) -> dict[str, Any]:
@@ -92,7 +96,7 @@ def frames_made_from(study: Study, sources: Sequence[Source], existing: MadeFrom
         for spec, path in sources
     }
     return {
-        "store": to_dict(settings.held_out),
+        "store": identity_of(settings.held_out),
         "tau": study.tau,
         "order": ORDER_VERSION,
         "datasets": list(data),

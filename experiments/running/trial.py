@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 from experiments.running.provenance import Provenance
 from experiments.running.results_version import OF_SOME
 from hma_jax.config import EvalConfig, ModelConfig, TrainConfig
-from hma_jax.config.json import stable_hash, to_dict
+from hma_jax.config.base import later
+from hma_jax.config.json import identity_of, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.loading.selection import LoaderConfig
@@ -31,8 +33,9 @@ class Trial:
     weighed: Literal["used", "all"] = "used"  # whose windows weigh in the mixture
     shuffle_actions: bool = False  # the control: actions from another episode
     measure_untrained: bool = False  # also evaluate the model before its first step
-    capped: tuple[str, ...] = ()  # datasets that max_trajectories concerns; (): all of them
-    source: Trial | None = None  # a trained model that `datasets` are added to, and alone trained; None: a new one
+    capped: tuple[str, ...] = later(())  # datasets that max_trajectories concerns; (): all of them
+    # A trained model that `datasets` are added to, and alone trained; None: a new one.
+    source: Trial | None = later(None)
 
     def with_source(self) -> tuple[Trial, ...]:
         """The trials that must have run for this one, and this one."""
@@ -81,63 +84,19 @@ def trajectories_of(
 @functools.cache
 def trial_id(trial: Trial, provenance: Provenance) -> str:
     """The name of a trial: equal exactly when everything that determines it is equal."""
-    return stable_hash({"trial": _identity(trial), "provenance": to_dict(provenance)})
-
-
-LATER: dict[str, Any] = {
-    "capped": [],
-    "source": None,
-    "model.recall": False,
-    "model.chain_factors": False,
-    "model.diffusion.weight_cap": 0.0,
-    "model.diffusion.time_shift": 1.0,
-    "train.optimizer.matrices": "adamw",
-    "train.masking.change_weight": 1.0,
-    "train.masking.own_past_rounds": 1,
-    "train.masking.displaced_past": 0.0,
-    "eval.lpips": False,
-}
-"""Fields that came after trials were published, by their path (`train.masking.own_past`), with the value that all had
-before: they name a trial where they have another. A new field of `Trial` or of a configuration within it is added here,
-or every trial that is finished, committed ones too, is another trial and has to be run again."""
+    return stable_hash({"trial": _identity(trial), "provenance": provenance})
 
 
 def _identity(trial: Trial) -> dict[str, Any]:
-    fields = to_dict(trial)
+    fields = identity_of(trial)
     if trial.source:
         fields["source"] = _identity(trial.source)
     altered = [
         what
         for what, where in OF_SOME.items()
-        if all(_has(_at(fields, path.split(".")), wanted) for path, wanted in where.items())
+        if all(_has(attrgetter(path)(trial), wanted) for path, wanted in where.items())
     ]
-    for path, before in LATER.items():
-        _drop(fields, path.split("."), before)
     return fields | {"altered": altered} if altered else fields
-
-
-def drop_later_fields(fields: dict[str, Any]) -> None:
-    """Takes away the fields of configurations that came later (`LATER`), where they have the value that all had
-    before."""
-    for path, before in LATER.items():
-        if "." in path:
-            _drop(fields, path.split("."), before)
-
-
-def _drop(fields: dict[str, Any], path: list[str], value: Any) -> None:
-    """Deletes the entry at `path` where it is `value`."""
-    *parents, name = path
-    within = _at(fields, parents)
-    if within and name in within and within[name] == value:
-        del within[name]
-
-
-def _at(fields: dict[str, Any], path: list[str]) -> Any:
-    """None where a configuration on the way is absent."""
-    found: Any = fields
-    for name in path:
-        found = found[name] if found else None
-    return found
 
 
 def _has(found: Any, wanted: Any) -> bool:

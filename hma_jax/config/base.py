@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import types
@@ -9,9 +10,19 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
+BEFORE = "before"
+"""The key of a field's metadata under which `later` keeps its value."""
+
 
 class ConfigError(ValueError):
     """A configuration that cannot work; the message names the field and what to change."""
+
+
+def later(default: Any, *, before: Any = dataclasses.MISSING) -> Any:
+    """A field that was added after things were named by its configuration: finished trials, trained tokenizers, token
+    stores. `before` is the value that computes what was computed without the field, if that is not its default. A field
+    that has this value is part of no name (`json.identity_of`); read from a file without the field, it has it."""
+    return dataclasses.field(default=default, metadata={BEFORE: default if before is dataclasses.MISSING else before})
 
 
 def require(condition: bool, message: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_fields, require, require_seed
+from hma_jax.config.base import check_fields, later, require, require_seed
 from hma_jax.config.model import ModelConfig
 
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
@@ -99,7 +99,7 @@ class EvalConfig:
     # Perplexity is exp(mean loss) of groups of this many windows, as in the official evaluation.
     perplexity_group: int = 4
     # Compute LPIPS too (AlexNet; its weights are the extra `lpips`); needs images of at least 31 x 31 pixels.
-    lpips: bool = False
+    lpips: bool = later(False)
     seed: int = 0  # random seed of the choice of windows and of all samples
 
     def __post_init__(self):

@@ -15,7 +15,7 @@ import types
 import typing
 from typing import Any, Literal
 
-from hma_jax.config.base import require, require_choice
+from hma_jax.config.base import BEFORE, require, require_choice
 
 INFINITE = ("Infinity", "-Infinity")
 """Numbers that `to_plain_json` writes as strings."""
@@ -23,21 +23,36 @@ INFINITE = ("Infinity", "-Infinity")
 
 def to_dict(config: Any) -> Any:
     """Plain JSON types from a config (dataclasses, tuples and scalars, nested)."""
+    return _plain(config, whole=True)
+
+
+def identity_of(config: Any) -> Any:
+    """What `config` is called and compared by: `to_dict` without the fields that came later (`base.later`) where they
+    have the value that computes what was computed before. Equal for equal results, whatever fields are added."""
+    return _plain(config, whole=False)
+
+
+def _plain(config: Any, whole: bool) -> Any:
     if config is None or isinstance(config, (str, int, float)):  # most of what there is
         return config
     if dataclasses.is_dataclass(config):
-        return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
+        values = {f.name: _plain(getattr(config, f.name), whole) for f in dataclasses.fields(config)}
+        for f in () if whole else dataclasses.fields(config):
+            if BEFORE in f.metadata and values[f.name] == _plain(f.metadata[BEFORE], whole):
+                del values[f.name]
+        return values
     if isinstance(config, (tuple, list)):
-        return [to_dict(v) for v in config]
+        return [_plain(v, whole) for v in config]
     if isinstance(config, dict):
-        return {k: to_dict(v) for k, v in config.items()}
+        return {k: _plain(v, whole) for k, v in config.items()}
     return config
 
 
 def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
-    """A `cls` from `to_dict`'s output.
+    """A `cls` from `to_dict`'s output, of an earlier version too, or from `identity_of`'s: a missing field that came
+    later (`base.later`) has the value from before, any other its default.
 
-    Unknown and missing keys, values of the wrong kind and choices that are not on offer raise
+    Unknown keys, missing ones without a default, values of the wrong kind and choices that are not on offer raise
     ConfigError naming the field.
     """
     hints = _hints(cls)
@@ -52,7 +67,8 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
         if n not in values and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
     ]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
-    return cls(**{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
+    before = {n: f.metadata[BEFORE] for n, f in known.items() if BEFORE in f.metadata and n not in values}
+    return cls(**before, **{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
 
 
 _hints = functools.cache(typing.get_type_hints)  # by class; thousands are read
@@ -126,8 +142,9 @@ def to_plain_json(values: Any) -> str:
 
 
 def stable_hash(config: Any) -> str:
-    """Hex digest of the canonical JSON: the same on every machine and Python version."""
-    # Not `to_dict` of all of it: most of what is hashed is JSON already, and copying it takes longer than the rest.
+    """Hex digest of the canonical JSON, of configs within it by their `identity_of`: the same on every machine, with
+    every Python version and after fields were added."""
+    # Not `identity_of` all of it: most of what is hashed is JSON already, and copying it takes longer than the rest.
     canonical = json.dumps(config, sort_keys=True, separators=(",", ":"), default=_of_dataclass)
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -135,7 +152,7 @@ def stable_hash(config: Any) -> str:
 def _of_dataclass(config: Any) -> dict[str, Any]:
     if not dataclasses.is_dataclass(config):
         raise TypeError(f"Object of type {type(config).__name__} is not JSON serializable")
-    return to_dict(config)
+    return identity_of(config)
 
 
 def diff(old: Any, new: Any, path: str = "") -> list[str]:

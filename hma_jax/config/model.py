@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_fields, require
+from hma_jax.config.base import check_fields, later, require
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class DiffusionConfig:
     repeats: int = 1  # noised copies of each token per training step
     # Weight of a noising step in the training loss: 0, all steps count alike, as released (squared error of the noise);
     # above 0, noise over signal, at most this (squared error of the clean vector, so noisy steps count most).
-    weight_cap: float = 0.0
+    weight_cap: float = later(0.0)
     # Shift k of the noising steps that are sampled in training: 1, uniform, as released; larger, towards noise (a
     # uniform position u becomes k u / (1 + (k - 1) u); Esser et al. 2024).
-    time_shift: float = 1.0
+    time_shift: float = later(1.0)
 
     def __post_init__(self):
         check_fields(self, infinite_allowed=("clip", "weight_cap"))
@@ -103,10 +103,10 @@ class ModelConfig:
     action_heads: bool = True  # whether the model has heads that predict actions; forward dynamics needs none
     # Add to the embedding of a masked token that of the token at its place in the frame before, so that the first block
     # already sees what is to move. DIFFERS: at masked tokens the release has one learned vector alone.
-    recall: bool = False
+    recall: bool = later(False)
     # Predict a token's factors one after the other, each given those before it. DIFFERS: the release draws them as if
     # independent, so that where two tokens are likely it may show a third, made of a piece of each.
-    chain_factors: bool = False
+    chain_factors: bool = later(False)
     mlp_ratio: float = 4.0  # width of a block's MLP, as a multiple of the trunk's
     qkv_bias: bool = False  # biases of queries, keys and values
     proj_bias: bool = True  # biases of attention's output projection

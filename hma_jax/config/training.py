@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_fields, require, require_seed
+from hma_jax.config.base import check_fields, later, require, require_seed
 from hma_jax.config.model import ModelConfig
 
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
@@ -55,13 +55,13 @@ class MaskingConfig:
     own_past: float = 0.0
     # Rounds in which own_past generates frames, each from the frames of the round before; each round costs one more
     # pass over every frame per training step.
-    own_past_rounds: int = 1
+    own_past_rounds: int = later(1)
     # With teacher forcing: probability that a rectangle of the past frames shows the contents of another place, for
     # some frames (`objective.displaced`). DIFFERS: the release has nothing like it.
-    displaced_past: float = 0.0
+    displaced_past: float = later(0.0)
     # Weight in the loss of discrete tokens that differ from the token at the same place one frame earlier; tokens that
     # do not change, most of a video, have weight 1. DIFFERS: the release counts all alike. Effect: docs/models.md.
-    change_weight: float = 1.0
+    change_weight: float = later(1.0)
     max_corrupt_rate: float = 0.2  # models on ids: largest share of tokens replaced by random ones
     # Models on ids: smallest share of tokens kept in the first frame after an unmasked prompt.
     clean_rate_min: float = 0.2
@@ -154,7 +154,7 @@ class OptimizerConfig:
     clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
     # Optimiser of the trunk's hidden matrices: AdamW, as for all other parameters, or Muon, which orthogonalises their
     # momentum (Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
-    matrices: Literal["adamw", "muon"] = "adamw"
+    matrices: Literal["adamw", "muon"] = later("adamw")
 
     def __post_init__(self):
         check_fields(self, infinite_allowed=("clip_norm",))

@@ -28,7 +28,7 @@ from flax import nnx
 from jax.experimental.buffer_callback import Buffer, ExecutionContext, buffer_callback
 
 from hma_jax.config import PythonConfig, require
-from hma_jax.config.json import from_dict, to_dict
+from hma_jax.config.json import from_dict, identity_of
 from hma_jax.model.params import Declared, Params, declare
 from hma_jax.runtime.user_code import naming_line
 from hma_jax.tokenizers.base import fitting_piece, in_pieces
@@ -213,7 +213,7 @@ def folder_identity(config: PythonConfig, folder: Path) -> str:
 
 
 def _identity(config: PythonConfig, files: str) -> str:
-    named = [PythonTokenizer.kind, to_dict(config), files]
+    named = [PythonTokenizer.kind, identity_of(config), files]
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from hma_jax.config import MeshConfig, require
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import identity_of
 from hma_jax.model.params import Declared, Params, path_name, require_params
 from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.sharding import BATCH, replicated
@@ -128,7 +128,7 @@ class BaseTokenizer(abc.ABC):
 
     @cached_property
     def identity(self) -> str:
-        settings = {k: v for k, v in to_dict(self.config).items() if k not in self.ignored}
+        settings = {k: v for k, v in identity_of(self.config).items() if k not in self.ignored}
         named = [self.kind, settings, *(getattr(self, name) for name in self.measured)]
         digest = hashlib.sha256(json.dumps(named, sort_keys=True).encode())
         for path, array in jax.tree.leaves_with_path(self.params):

@@ -86,7 +86,7 @@ def train_tokenizer(
 
 
 def _modernise(described: dict[str, Any]) -> dict[str, Any]:
-    """A description that an earlier version wrote: fields that it lacks take today's default."""
+    """A description that an earlier version wrote, with the fields that came later (`config.base.later`)."""
     parts = {"tokenizer": TokenizerConfig, "train": TokenizerTrainConfig}
     return described | {name: to_dict(from_dict(kind, described[name])) for name, kind in parts.items()}
 

@@ -116,7 +116,7 @@ def describe_run(
 def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[str, Any]:
     """A description that this or an earlier version wrote, as `describe_run` writes it today.
 
-    A field that it lacks takes today's default: a run does not depend on what came later. Raises
+    A field that it lacks has the value that computes what was computed without it (`config.base.later`). Raises
     ConfigError for a field that this version does not know.
     """
     parts = {"model": ModelConfig, "train": TrainConfig, "table": EmbodimentTable}

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.presets import CPU_FULL, SMOKE
+from experiments.presets import CPU_FULL
 from experiments.run_study import make_jobs, say_trained
-from experiments.running import trial as trial_module
 from experiments.running.attempts import RUN
 from experiments.running.provenance import FILE, Start, TrialRecord, read_record
 from experiments.running.runner import Job
@@ -21,8 +20,7 @@ from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
 from experiments.terminal.progress import console
-from hma_jax.config import DiffusionConfig
-from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.config.json import from_dict, to_dict
 from tests.experiments import fakes
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.test_runner import events, job, run
@@ -173,62 +171,6 @@ def test_jobs_of_the_designs_wait_for_their_sources_and_siblings():
     longest = trial_id(reference_trial(CPU_FULL, 0, 32_000), PROVENANCE)
     assert len(jobs[longest].after) == 6  # 500 to 16,000 steps
     assert len({j.title for j in jobs.values()}) == len(jobs)
-
-
-FIRST = {"capped": [], "source": None}
-"""What came later before anything else did."""
-
-
-def test_fields_that_came_later_do_not_change_the_name_of_a_trial(monkeypatch):
-    """Named as before there were `capped` and `source`, where a trial has neither."""
-    monkeypatch.setattr(trial_module, "LATER", FIRST)
-    name = trial_id.__wrapped__  # not what is remembered, nor to be remembered
-    plain = reference_trial(SMOKE, 0)
-    fields = {field: value for field, value in to_dict(plain).items() if field not in FIRST}
-    assert name(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
-    others = [replace(plain, capped=("arm_night",)), replace(plain, source=plain)]
-    others.append(replace(plain, source=replace(plain, tau=1.0)))
-    assert len({name(one, PROVENANCE) for one in (plain, *others)}) == 4
-
-
-def test_a_field_within_a_configuration_may_come_later(monkeypatch):
-    """At any depth, in a source too, and in a configuration that not every trial has."""
-    plain = replace(reference_trial(CPU_FULL, 0), source=reference_trial(CPU_FULL, 1))
-    latents = replace(plain, model=replace(plain.model, diffusion=DiffusionConfig()))
-    masking = replace(plain.train.masking, own_past=0.5)
-    drawn = replace(plain, train=replace(plain.train, masking=masking))
-    named = {trial_id(one, PROVENANCE) for one in (plain, latents)}
-    fields = to_dict(plain)
-    for one in (fields, fields["source"]):
-        del one["train"]["masking"]["own_past"], one["capped"]
-    del fields["source"]["source"]
-    within = {
-        "train.masking.own_past": plain.train.masking.own_past, "model.diffusion.depth": DiffusionConfig().depth,
-    }  # fmt: skip
-    monkeypatch.setattr(trial_module, "LATER", FIRST | within)
-    name = trial_id.__wrapped__  # not what is remembered, nor to be remembered
-    assert name(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
-    assert len({name(one, PROVENANCE) for one in (plain, latents, drawn)} | named) == 5
-
-
-def test_a_change_that_alters_some_trials_renames_these_alone(monkeypatch):
-    one = reference_trial(CPU_FULL, 0)
-    attends = replace(one, model=replace(one.model, conditioning="cross_attention"))
-    after = replace(one, source=attends)
-    averages = [replace(one, train=replace(one.train, ema_decay=decay)) for decay in (0.5, 0.9999)]
-    trials = one, attends, after, *averages
-    name = trial_id.__wrapped__  # not what is remembered, nor to be remembered
-    before = [name(trial, PROVENANCE) for trial in trials]
-    monkeypatch.setattr(trial_module, "OF_SOME", {})
-    changed = [name(trial, PROVENANCE) != id for trial, id in zip(trials, before, strict=True)]
-    assert changed == [False, True, True, True, True]
-
-
-def test_names_of_trials_stay():
-    """Published trials have such names: whoever adds a field to a configuration adds it to LATER."""
-    inputs = replace(PROVENANCE, results=2)
-    assert trial_id(reference_trial(SMOKE, 0), inputs) == "4925133387f6a4df"
-    assert trial_id(reference_trial(CPU_FULL, 0), inputs) == "c3091af5fd3a8aa1"
 
 
 @pytest.mark.parametrize("seed", CPU_FULL.seeds)

@@ -26,8 +26,8 @@ from hma_jax.config import (
     TokenizerTrainConfig,
     TrainConfig,
 )
-from hma_jax.config.base import check_fields
-from hma_jax.config.json import diff, from_dict, to_strict_json
+from hma_jax.config.base import check_fields, later
+from hma_jax.config.json import diff, from_dict, identity_of, stable_hash, to_dict, to_strict_json
 from hma_jax.model.embodiments import Embodiment
 
 ARM = {"name": "arm", "action_dim": 1, "stride": 1, "mean": (0.0,), "std": (1.0,)}
@@ -165,6 +165,37 @@ def test_limits_that_can_work_are_accepted():
     ModelConfig(factors=9, diffusion=DiffusionConfig())  # of latents, which have none
     MaskingConfig(mask_angle_min=1.0, min_ratio=0.5)  # half of every frame
     MeshConfig(min_shard_size=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    first: int = 1
+    added: tuple[int, ...] = later(())
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    first: float = 1.0
+    inner: Inner = Inner()
+    added: float = later(0.5, before=0.0)
+
+
+def test_a_field_that_came_later_is_part_of_no_name_with_the_value_from_before():
+    before = {"first": 1.0, "inner": {"first": 1}}
+    assert identity_of([Outer(added=0.0)]) == [before]
+    assert identity_of(Outer(added=0.0, inner=Inner(added=[]))) == before  # a list is as good as a tuple
+    assert identity_of(Outer()) == before | {"added": 0.5}
+    assert identity_of({"a": Outer(added=0.0, inner=Inner(added=(2,)))}) == {
+        "a": before | {"inner": {"first": 1, "added": [2]}}
+    }
+    assert stable_hash(["x", Outer(added=0.0)]) == stable_hash(["x", before]) != stable_hash(["x", Outer()])
+    assert to_dict(Outer(added=0.0)) == {"first": 1.0, "inner": {"first": 1, "added": []}, "added": 0.0}
+
+
+def test_what_was_written_before_a_field_was_there_has_its_value_from_before():
+    assert from_dict(Outer, {"first": 2.0, "inner": {"first": 3}}) == Outer(2.0, Inner(3), added=0.0)
+    for one in (Outer(), Outer(added=0.0), Outer(inner=Inner(added=(4,)))):
+        assert from_dict(Outer, identity_of(one)) == from_dict(Outer, to_dict(one)) == one
 
 
 def test_files_for_other_programs_hold_no_number_that_json_does_not_have():
