@@ -158,6 +158,22 @@ def read_rows(workspace: Workspace) -> list[Row]:
         ) from error
 
 
+def place_rows(rows: Iterable[Row], sweeps: Sequence[Sweep]) -> tuple[list[Row], list[str]]:
+    """(rows of a table at the positions that their names have on the axes of today's `sweeps`, names that an axis no
+    longer has, whose rows are left out): on an axis of names x counts those that it had when the table was written."""
+    places = {sweep.name: {label: x for x, label in enumerate(sweep.labels)} for sweep in sweeps if sweep.labels}
+    placed, gone = [], dict[str, None]()
+    for r in rows:
+        names = places.get(r.sweep)
+        if not names or not r.label:  # of numbers, or of a version that did not write the name
+            placed.append(r)
+        elif r.label in names:
+            placed.append(r if r.x == names[r.label] else dataclasses.replace(r, x=names[r.label]))
+        else:
+            gone[f"{r.label} (axis {r.sweep})"] = None
+    return placed, list(gone)
+
+
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
     """A line for each of `rows`, dataclasses of one `kind`."""
     write_file(path, csv_text(kind, rows))

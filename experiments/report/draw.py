@@ -38,7 +38,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.analysis.changes import Change, find_changes, find_differences
     from experiments.analysis.growth import Growth, find_growth
     from experiments.analysis.optima import Optimum, find_optima
-    from experiments.analysis.rows import collect, read_rows, write_csv, write_rows
+    from experiments.analysis.rows import collect, place_rows, read_rows, write_csv, write_rows
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers, find_fewer, find_other_x
     from experiments.report.page import write_report
@@ -50,7 +50,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     provenance = record.provenance
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
-    written = read_rows(workspace) if workspace.results.exists() else []
+    written, _ = place_rows(read_rows(workspace) if workspace.results.exists() else [], sweeps)
     numbers = compute_numbers(workspace, sweeps, provenance)
     write_rows(workspace, collect(sweeps, provenance, workspace.trials, states, numbers.results))
     rows = read_rows(workspace)  # figures show what the files say
@@ -117,7 +117,7 @@ def draw_again(out: Path) -> None:
 
     Without its trials, as of results that are kept for the record, only figures are drawn, from its table.
     """
-    from experiments.analysis.rows import read_rows
+    from experiments.analysis.rows import place_rows, read_rows
 
     workspace = Workspace(out.absolute())
     record = load_record(workspace)
@@ -126,7 +126,10 @@ def draw_again(out: Path) -> None:
         draw(workspace, record)
         return
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
-    draw_figures(workspace, sweeps, read_rows(workspace))
+    rows, gone = place_rows(read_rows(workspace), sweeps)
+    if gone:
+        say(f"note: left out, since the study no longer has it: {few(gone)}")
+    draw_figures(workspace, sweeps, rows)
     console.print(
         f"no trials in {short(workspace.root)}: figures are drawn from the existing table; the page is not changed"
     )
