@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from experiments.study_setup import UNSET, command, use_entries
-from experiments.terminal.progress import console, say, step, tidy_table, wrote
+from experiments.terminal.progress import console, say, tidy_table, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -130,10 +130,10 @@ def judge(
     )
     counts = None if real is None else read_real(real)
     if recordings is None:
-        judged = judge_run(run, out, config, step, policies)
+        judged = judge_run(run, out, config, policies)
     else:
         use_entries(registry)
-        judged = judge_recorded(run, out, config, recordings, step, policies, split, tuple(counts or ()))
+        judged = judge_recorded(run, out, config, recordings, policies, split, tuple(counts or ()))
     given: dict[str, Any] = {
         "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
         "--recordings": recordings, "--split": split, "--reward": reward, "--registry": registry, "--real": real,

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 from experiments.applications.judging.head import HeadConfig
 from experiments.applications.judging.ladder import LadderConfig
-from experiments.applications.policies.learning import Report
 from experiments.applications.policies.tasks import AnyTask
 from hma_jax.config import require
-
-OpenProgress = Callable[[str], AbstractContextManager[Report]]
-"""Opens a progress bar with a title: `experiments.terminal.progress.step`."""
 
 
 @dataclass(frozen=True)

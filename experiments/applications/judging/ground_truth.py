@@ -10,14 +10,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from experiments.applications.judging.config import JudgeConfig, OpenProgress
+from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.head import Head, SuccessHead, measure_head, train_head
 from experiments.applications.judging.outcomes import WORLDS
 from experiments.applications.judging.rollouts import make_starts
 from experiments.applications.policies.demonstrations import Demonstrations, record
 from experiments.applications.policies.tasks import OWN, Task, join
 from experiments.applications.simulators import has_truth, true_simulator
-from experiments.terminal.progress import say
+from experiments.terminal.progress import say, step
 from hma_jax.config import require
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
@@ -71,10 +71,10 @@ class SimulatedTruth:
 
     worlds = WORLDS
 
-    def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator, step: OpenProgress):
+    def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator):
         """Raises ConfigError for a robot that has none."""
         require(has_truth(robot), f"{robot.name} has no true simulator here; give recordings of it with --recordings")
-        self.config, self._robot, self._learned, self._step = config, robot, learned, step
+        self.config, self._robot, self._learned = config, robot, learned
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class SimulatedTruth:
 
     def demonstrations(self) -> Demonstrations:
         config, task = self.config, replace(self.config.task, frames=self._demonstrated_frames())
-        with self._step(f"record {config.demonstrations} demonstrations"):
+        with step(f"record {config.demonstrations} demonstrations"):
             made = record(
                 task,
                 config.demonstrations,
@@ -105,15 +105,15 @@ class SimulatedTruth:
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
         config, size, stride = self.config, self._size, self._robot.stride
-        with self._step("record episodes for the success head"):
+        with step("record episodes for the success head"):
             known = head_recordings(config, size, stride, config.head_episodes, config.seed)
-        with self._step("train the success head") as report:
+        with step("train the success head") as report:
             return train_head(known, config.head, config.seed, reconstruct, report)
 
     def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
         del reconstruct  # rates of the true frames stand beside those of the model
         config, episodes = self.config, max(self.config.head_episodes // 10, 12)
-        with self._step("record episodes to measure the success head on"):
+        with step("record episodes to measure the success head on"):
             new = head_recordings(config, self._size, self._robot.stride, episodes, config.seed + HELD_OUT)
         return measure_head(head, new, config.task)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.applications.generating.trajectories import open_trajectories, require_layout
-from experiments.applications.judging.config import JudgeConfig, OpenProgress
+from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.ground_truth import GroundTruth, SimulatedTruth
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
 from experiments.applications.judging.head import Head, load_head, save_head
@@ -34,6 +34,7 @@ from experiments.applications.policies.policy import Policy
 from experiments.applications.settings_file import pin_settings, short_hash
 from experiments.applications.simulators import load_simulator
 from experiments.running.workspace import Workspace
+from experiments.terminal.progress import step
 from experiments.terminal.words import few
 from experiments.user_input.user_file import naming_line
 from hma_jax.config import require
@@ -62,9 +63,7 @@ class Judgement:
     rollouts: Callable[[str, str], Rollout]  # by policy and world
 
 
-def judge_run(
-    run_directory: Path, out: Path, config: JudgeConfig, step: OpenProgress, user_file: Path | None = None
-) -> Judgement:
+def judge_run(run_directory: Path, out: Path, config: JudgeConfig, user_file: Path | None = None) -> Judgement:
     """The ladder's policies, and those of the user's file `user_file`, in the true and in the learned simulator.
 
     Raises ConfigError where `out` holds other judgements, the robot is not the run's or has no true simulator, or what
@@ -73,7 +72,7 @@ def judge_run(
     simulator = load_simulator(run_directory, episodes=config.batch)
     _require_policy(simulator, user_file is not None or config.ladder.cloned or config.ladder.diffusion)
     robot = simulator.robot(config.task.robot)
-    return _judge(run_directory, out, simulator, robot, SimulatedTruth(config, robot, simulator, step), step, user_file)
+    return _judge(run_directory, out, simulator, robot, SimulatedTruth(config, robot, simulator), user_file)
 
 
 def judge_recorded(
@@ -81,7 +80,6 @@ def judge_recorded(
     out: Path,
     config: JudgeConfig,
     dataset: str,
-    step: OpenProgress,
     user_file: Path | None = None,
     split: str = "train",
     counted: Sequence[str] = (),
@@ -98,10 +96,8 @@ def judge_recorded(
     robot, stores = simulator.robot(config.task.robot), Workspace.of_run(run_directory).store
     recorded, _ = open_trajectories(dataset, split, robot, {}, simulator.tokenizer, stores)
     require_layout(recorded, robot, simulator.model.table)
-    truth = RecordedTruth(config, recorded, robot, step)
-    return _judge(
-        run_directory, out, _with_episodes(simulator, truth.config.batch), robot, truth, step, user_file, counted
-    )
+    truth = RecordedTruth(config, recorded, robot)
+    return _judge(run_directory, out, _with_episodes(simulator, truth.config.batch), robot, truth, user_file, counted)
 
 
 def _require_policy(simulator: Simulator, given: bool | int) -> None:
@@ -128,7 +124,6 @@ def _judge(
     simulator: Simulator,
     robot: Robot,
     truth: GroundTruth,
-    step: OpenProgress,
     user_file: Path | None,
     counted: Sequence[str] = (),
 ) -> Judgement:

@@ -18,7 +18,7 @@ import numpy as np
 from data_pipelines.sampling.order import hash64, stream_seed
 from experiments.applications.generating.source import confined
 from experiments.applications.generating.trajectories import Trajectories, describe
-from experiments.applications.judging.config import JudgeConfig, OpenProgress
+from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.ground_truth import Reconstruct
 from experiments.applications.judging.head import Head, SuccessHead, balanced_error, fit_heads, worth_of
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
@@ -27,6 +27,7 @@ from experiments.applications.policies.learning import Report, log_spaced_steps
 from experiments.applications.policies.network import downsample_uint8
 from experiments.applications.policies.tasks import RecordedTask, held
 from experiments.applications.simulators import START_FRAMES
+from experiments.terminal.progress import step
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
@@ -67,12 +68,12 @@ class RecordedTruth:
 
     worlds = (LEARNED, SHUFFLED)
 
-    def __init__(self, config: JudgeConfig, recorded: Trajectories, robot: Robot, step: OpenProgress):
+    def __init__(self, config: JudgeConfig, recorded: Trajectories, robot: Robot):
         """Raises ConfigError for too few recordings of either kind."""
         task = config.task
         if not isinstance(task, RecordedTask):
             raise TypeError(f"recordings have a RecordedTask, not {task}")
-        self._recorded, self._robot, self._step = recorded, robot, step
+        self._recorded, self._robot = recorded, robot
         with step("which recordings succeeded") as report:
             outlines = [recorded.outline(i) for i in _one_by_one(range(len(recorded)), report)]
         length = np.array([outline.frames - BEFORE for outline in outlines])
@@ -126,7 +127,7 @@ class RecordedTruth:
         if least is None:
             return None
         reached = []
-        with self._step("at which frames their goal is reached") as report:
+        with step("at which frames their goal is reached") as report:
             for i in _one_by_one(range(len(frames)), report):
                 rewards = self._recorded.rewards(i)
                 require(
@@ -151,7 +152,7 @@ class RecordedTruth:
         tuned_on = {
             i for kind in (True, False) for i in [j for j in self.learnt if self._success[j] == kind][::TUNED_ON]
         }
-        with self._step(f"read {len(self.learnt)} recordings for the success head") as report:
+        with step(f"read {len(self.learnt)} recordings for the success head") as report:
             read = {i: self._pairs(i, reconstruct) for i in _one_by_one(self.learnt, report)}
         learnt, tuning = (
             [np.concatenate(x) for x in zip(*(read[i] for i in self.learnt if (i in tuned_on) == tunes), strict=True)]
@@ -159,7 +160,7 @@ class RecordedTruth:
         )
         keep = log_spaced_steps(fit.steps, CHECKPOINTS, FIRST) if fit.steps > FIRST else ()
         kept = replace(config, fit=replace(fit, keep=keep))
-        with self._step("train the success head") as report:
+        with step("train the success head") as report:
             heads = fit_heads(*learnt, kept, self.config.seed, report, round(SHIFT * config.encoder.size))
         errors = {step: balanced_error(head, *tuning) for step, head in heads.items()}
         best = min(errors, key=errors.__getitem__)

@@ -24,7 +24,6 @@ from experiments.applications.policies import find_task
 from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.network import EncoderConfig
 from experiments.cli.main import main
-from experiments.terminal.progress import step
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
@@ -56,7 +55,7 @@ def judged(tmp_path_factory):
     train = TrainConfig(masking=MaskingConfig(setting="full"))
     run = Run(CONFIG, train, table, declare_model(CONFIG, table).init(0), 0, {"tokenizer": tokenizer.identity})
     write_run(run, root / "model")
-    return root, judge_run(root / "model", root / "out", ASKED, step)
+    return root, judge_run(root / "model", root / "out", ASKED)
 
 
 def test_every_policy_is_judged_at_every_start_in_every_world(judged):
@@ -89,7 +88,7 @@ def test_demonstrations_are_as_long_as_the_task_where_little_is_left_of_them_to_
     task = find_task("gripper_wood", frames=lasts, hold=hold)
     robot = SimpleNamespace(name="gripper_wood", action_dim=4, stride=1)
     learned = SimpleNamespace(tokenizer=SimpleNamespace(image_size=8))
-    truth = SimulatedTruth(replace(ASKED, task=task), robot, learned, step)
+    truth = SimulatedTruth(replace(ASKED, task=task), robot, learned)
     assert truth.demonstrations().actions.shape[1] == frames
     assert truth.about() == ({"demonstrated_frames": frames} if told else {})
 
@@ -115,7 +114,7 @@ def test_the_random_policy_alone_is_not_judged(tmp_path, monkeypatch):
     monkeypatch.setattr(judge, "load_simulator", lambda *_, **__: SimpleNamespace(model=model))
     alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
     with pytest.raises(ConfigError, match="no policy to evaluate except the random one: give --policies FILE"):
-        judge_run(tmp_path / "model", tmp_path / "out", alone, step)
+        judge_run(tmp_path / "model", tmp_path / "out", alone)
 
 
 def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged):
@@ -124,12 +123,12 @@ def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged)
     kept = root / "out" / "rollouts" / "random.learned.npz"
     before, images = kept.stat().st_mtime_ns, found.rollouts("cloned-3", LEARNED).images
     lost.unlink()
-    again = judge_run(root / "model", root / "out", ASKED, step)
+    again = judge_run(root / "model", root / "out", ASKED)
     assert kept.stat().st_mtime_ns == before
     np.testing.assert_array_equal(again.rollouts("cloned-3", LEARNED).images, images)
     assert again.outcomes == found.outcomes
     with pytest.raises(ConfigError, match="other settings .config.starts: 4 -> 2"):
-        judge_run(root / "model", root / "out", replace(ASKED, starts=2), step)
+        judge_run(root / "model", root / "out", replace(ASKED, starts=2))
 
 
 OWN = """
@@ -157,7 +156,7 @@ def test_policies_of_ones_own_are_judged_beside_the_random_one_and_told_from_cha
         (out / "rollouts").mkdir(exist_ok=True)
         shutil.copy(kept, out / "rollouts" / kept.name)
     alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
-    found = judge_run(root / "model", out, alone, step, file)
+    found = judge_run(root / "model", out, alone, file)
     assert found.policies == ("random", "hma", "still") and found.user_policies == ("still",)
     assert not (out / "policies").exists() and (out / "own_policies.py").read_text() == file.read_text()
     assert (found.rollouts("still", TRUE).actions == 0).all()
@@ -166,11 +165,11 @@ def test_policies_of_ones_own_are_judged_beside_the_random_one_and_told_from_cha
 
     kept = out / "rollouts" / "still.learned.npz"
     kept.unlink()
-    again = judge_run(root / "model", out, alone, step, file)
+    again = judge_run(root / "model", out, alone, file)
     assert again.outcomes == found.outcomes and kept.exists()
     file.write_text(OWN.format(value=9.0))
     with pytest.raises(ConfigError, match="other settings .contents of --policies: '[0-9a-f]+' -> '[0-9a-f]+'"):
-        judge_run(root / "model", out, alone, step, file)
+        judge_run(root / "model", out, alone, file)
 
 
 def test_actions_in_other_units_are_told():
@@ -183,12 +182,12 @@ def test_a_policy_without_right_actions_is_refused_before_anything_is_made(judge
     root, file = judged[0], tmp_path / "mine.py"
     file.write_text(OWN.format(value="0"))
     with pytest.raises(ConfigError, match=r"mine.py: policy 'still': .*float32 \[2, 4\].* it returned int64 \[2, 4\]"):
-        judge_run(root / "model", tmp_path / "out", ASKED, step, file)
+        judge_run(root / "model", tmp_path / "out", ASKED, file)
     file.write_text(OWN.format(value="images.widht"))
     with pytest.raises(
         ConfigError, match=r"mine.py, line 9: AttributeError: 'numpy.ndarray' object has no attribute 'widht'"
     ):
-        judge_run(root / "model", tmp_path / "out", ASKED, step, file)
+        judge_run(root / "model", tmp_path / "out", ASKED, file)
     assert not (tmp_path / "out").exists()
 
 
@@ -197,7 +196,7 @@ def test_frames_that_no_policy_could_look_at_are_refused_before_anything_is_reco
     for part in ("ladder", "head"):
         larger = replace(ASKED, **{part: replace(getattr(ASKED, part), encoder=EncoderConfig())})
         with pytest.raises(ConfigError, match="policies and success heads need images of 32 x 32 pixels, but 8 x 8"):
-            judge_run(root / "model", root / "small", larger, step)
+            judge_run(root / "model", root / "small", larger)
     assert not (root / "small").exists()
 
 
