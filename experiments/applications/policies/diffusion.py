@@ -31,7 +31,7 @@ from experiments.applications.policies.network import (
     stack_frames,
 )
 from hma_jax.config import require
-from hma_jax.config.base import require_choice
+from hma_jax.config.base import later, require_choice
 from hma_jax.kernels.random import key_of
 
 EMBEDDED = 32
@@ -39,9 +39,6 @@ EMBEDDED = 32
 
 SPREAD = 3.0
 """Standard deviations of the demonstrated actions, for the limits of this name."""
-
-FORMER = {"limits": "spread"}
-"""Fields of policies that were saved before there were these fields, where they differ from the defaults."""
 
 Predicts = Literal["noise", "chunk"]
 """What the denoiser is trained to predict."""
@@ -59,8 +56,8 @@ class DiffusionConfig(ChunkConfig):
     execute: int = 2
     levels: int = 100
     samples: int = 10
-    predicts: Predicts = "noise"  # policies that were saved without this field predict noise
-    limits: Limits = "range"
+    predicts: Predicts = later("noise")
+    limits: Limits = later("range", before="spread")
     width: int = 256
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=FitConfig)

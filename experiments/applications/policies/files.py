@@ -17,15 +17,15 @@ from safetensors.numpy import load_file
 from data_pipelines.publishing.files import publish, remove
 from experiments.applications.policies.acting import ChunkPolicy, Scale
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc
-from experiments.applications.policies.diffusion import FORMER, DiffusionConfig, DiffusionPolicy, init_diffusion
+from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, init_diffusion
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.convert.tensors import write_safetensors
 
 DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
 KINDS = {
-    ClonedPolicy.kind: (ClonedPolicy, BcConfig, init_bc, {}),
-    DiffusionPolicy.kind: (DiffusionPolicy, DiffusionConfig, init_diffusion, FORMER),
+    ClonedPolicy.kind: (ClonedPolicy, BcConfig, init_bc),
+    DiffusionPolicy.kind: (DiffusionPolicy, DiffusionConfig, init_diffusion),
 }
 
 
@@ -56,8 +56,8 @@ def load_policy(directory: Path) -> ChunkPolicy:
         raise ConfigError(f"{directory} cannot be read as a policy ({error}); train it again") from error
     kind = description.get("kind")
     require(kind in KINDS, f"{directory}: unknown kind of policy {kind!r}; known: {', '.join(KINDS)}")
-    cls, config_type, init, former = KINDS[kind]
-    config = from_dict(config_type, former | description["config"], f"{directory}: config")
+    cls, config_type, init = KINDS[kind]
+    config = from_dict(config_type, description["config"], f"{directory}: config")
     scale = from_dict(Scale, description["scale"], f"{directory}: scale")
     wanted = jax.eval_shape(lambda: init(config, len(scale.mean), 0))
     return cls(config, unnamed(weights, wanted, directory), scale)
