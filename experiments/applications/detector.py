@@ -42,7 +42,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.kernels.random import key_of
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.robots import Robot
-from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.tokenizers.base import Tokenizer
 
 COMMITTED, OUT = Path("experiments/results/detector"), Path("runs/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
@@ -218,19 +218,19 @@ def enlarged(images: np.ndarray) -> np.ndarray:
     return images.repeat(times, axis=1).repeat(times, axis=2)
 
 
-def resized(tokenizer: BaseTokenizer, scenes: Scenes) -> Scenes:
+def resized(tokenizer: Tokenizer, scenes: Scenes) -> Scenes:
     """The scenes with frames resized to the tokenizer's size, then enlarged to the detector's."""
     return scenes._replace(images=enlarged(fit_images(scenes.images, tokenizer.image_size)))
 
 
-def reconstruct(tokenizer: BaseTokenizer, images: np.ndarray) -> np.ndarray:
+def reconstruct(tokenizer: Tokenizer, images: np.ndarray) -> np.ndarray:
     """Frames uint8 [n, H, W, 3] encoded and decoded by a tokenizer, enlarged to the detector's size."""
     images = fit_images(images, tokenizer.image_size)
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
     return enlarged(in_blocks(whole, images))
 
 
-def reconstructed(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> Scenes:
+def reconstructed(tokenizer: Tokenizer, scenes: Scenes, every: int = 1) -> Scenes:
     """The scenes `resized`, every n-th frame encoded and decoded by the tokenizer."""
     given = resized(tokenizer, scenes)
     given.images[::every] = reconstruct(tokenizer, scenes.images[::every])
@@ -251,7 +251,7 @@ def select_robots(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, R
     return {name: robot for name, robot in robots.items() if not names or name in names}
 
 
-def make_detector(robots: Sequence[str], tokenizer: BaseTokenizer, out: Path) -> Detector:
+def make_detector(robots: Sequence[str], tokenizer: Tokenizer, out: Path) -> Detector:
     """Trains a detector on frames resized and reconstructed by `tokenizer`; writes it and its errors into `out`."""
     episodes = max(EPISODES // len(robots), MIN_EPISODES)
     with step("true frames") as update:

@@ -9,15 +9,15 @@ import numpy as np
 from experiments.bench.record import Stage
 from experiments.bench.timing import WARM_UP, time_by_turns, time_once
 from hma_jax.config import Magvit2Config, SvdVaeConfig, require
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.io import load_tokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 PUBLISHED = {"magvit2": (Magvit2Tokenizer, Magvit2Config), "svd-vae": (SvdVaeTokenizer, SvdVaeConfig)}
 """Timed with drawn weights: speed does not depend on them."""
 
 
-def make_tokenizer(name: str, dtype: str, piece: int | None, seed: int) -> BaseTokenizer:
+def make_tokenizer(name: str, dtype: str, piece: int | None, seed: int) -> Tokenizer:
     """A published tokenizer by name, or the one in a directory. Raises ConfigError if there is none."""
     if name not in PUBLISHED:
         require(Path(name).is_dir(), f"no tokenizer {name!r}: give {', '.join(PUBLISHED)} or a tokenizer's directory")
@@ -27,7 +27,7 @@ def make_tokenizer(name: str, dtype: str, piece: int | None, seed: int) -> BaseT
     return kind(config, kind.declare(config).init(seed), piece=piece)
 
 
-def time_tokenizer(tokenizer: BaseTokenizer, repeats: int, seed: int) -> list[Stage]:
+def time_tokenizer(tokenizer: Tokenizer, repeats: int, seed: int) -> list[Stage]:
     """Stages `encode`, `decode` and `both`, for as many images as the devices take at once."""
     rows = tokenizer.at_once
     shape = (rows, tokenizer.image_size, tokenizer.image_size, 3)

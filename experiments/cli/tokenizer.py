@@ -16,7 +16,7 @@ from experiments.terminal.words import counted
 from hma_jax.config import PixelsConfig, require
 
 if TYPE_CHECKING:
-    from hma_jax.tokenizers.shared import BaseTokenizer
+    from hma_jax.tokenizers.base import Tokenizer
 
 tokenizer_app = Commands()
 
@@ -145,7 +145,7 @@ def train_tokenizer(setup: StudySetup, replace: Step | None) -> None:
     wrote(workspace.tokenizer, then=setup.command("tokenize"))
 
 
-def _write(tokenizer: BaseTokenizer, out: Path) -> None:
+def _write(tokenizer: Tokenizer, out: Path) -> None:
     from hma_jax.convert.atomic import atomic_directory
     from hma_jax.tokenizers.io import save_tokenizer
 

@@ -23,8 +23,8 @@ from hma_jax.convert.table import check_names, nested
 from hma_jax.convert.tensors import FLOATS, Stored, read_finite, read_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.params import Declared, Params, ParamSpec
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 LOSS, AVERAGE, ADAPTIVE = "loss.", "model_ema.", "decoder.adaptive."
 """Tensors in the file of a MAGVIT2 training, by how their names begin: of the discriminator, which no tokenizer needs;
@@ -46,7 +46,7 @@ FILES = (
 class Source:
     """How one kind is published."""
 
-    tokenizer: type[BaseTokenizer]
+    tokenizer: type[Tokenizer]
     fields: Mapping[str, str]  # official field of config.json -> field of our configuration
     required: tuple[str, ...]  # official fields without which a config.json is not one of this kind
     fixed: Mapping[str, tuple[Any, ...]]  # official field -> values that are supported
@@ -216,7 +216,7 @@ def read_tensors(path: Path) -> dict[str, Stored]:
     return read_torch(path, within="state_dict")
 
 
-def find_reader(path: Path) -> Callable[..., BaseTokenizer]:
+def find_reader(path: Path) -> Callable[..., Tokenizer]:
     """`read_svd_vae` for a directory whose config.json is of that VAE, else `read_magvit2`.
 
     Raises ConfigError for a directory of anything else.

@@ -24,8 +24,8 @@ from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import FILE as STARTS
 from hma_jax.simulator.starts import Start, load_starts
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.io import load_tokenizer
-from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.training.runs import Run
 
 ROBOTS = "robots.json"
@@ -36,7 +36,7 @@ DEFAULT_DECODE = DecodeConfig(sampler=SamplerConfig("dpm++", 12))
 """How frames are decoded without a decode.json. Latents take fewer evaluations of the denoiser than in evaluation."""
 
 
-def find_tokenizer(directory: Path, run: Run, given: Path | None) -> BaseTokenizer:
+def find_tokenizer(directory: Path, run: Run, given: Path | None) -> Tokenizer:
     """The tokenizer whose tokens the run was trained on. Raises ConfigError if it is not there, or another one is."""
     places = [Path(given)] if given else [directory / TOKENIZER, directory.absolute().parent / TOKENIZER]
     found = [place for place in places if place.is_dir()]

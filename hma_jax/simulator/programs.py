@@ -19,7 +19,7 @@ from hma_jax.generation.episodes import Episodes, advance_each, put, start_each,
 from hma_jax.kernels.random import key_of
 from hma_jax.model.params import Params
 from hma_jax.simulator.episode import Episode
-from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.training.runs import Model
 
 
@@ -65,7 +65,7 @@ def padded(rows: list[int], episodes: int) -> list[int]:
 class Programs:
     """The compiled programs of a simulator of `episodes` episodes."""
 
-    def __init__(self, model: Model, tokenizer: BaseTokenizer, episodes: int, decode: DecodeConfig):
+    def __init__(self, model: Model, tokenizer: Tokenizer, episodes: int, decode: DecodeConfig):
         self.weights = ProgramParams(model.params, tokenizer.params)
         declared, capacity = model.declared, model.config.frames - 1
         hidden = model.run.train.masking.ignores_actions

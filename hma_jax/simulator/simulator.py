@@ -25,8 +25,7 @@ from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_
 from hma_jax.simulator.programs import Programs, ResetInputs, padded
 from hma_jax.simulator.robots import Outside, Robot, require_robot
 from hma_jax.simulator.starts import Start
-from hma_jax.tokenizers.base import token_mismatch
-from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.tokenizers.base import Tokenizer, token_mismatch
 from hma_jax.training.runs import Model, load_model, require_frames
 
 Rate = Literal["model", "native"]
@@ -52,7 +51,7 @@ class Simulator:
     def __init__(
         self,
         model: Model,
-        tokenizer: BaseTokenizer,
+        tokenizer: Tokenizer,
         *,
         robots: Sequence[Robot] = (),
         starts: Sequence[Start] = (),

@@ -12,8 +12,8 @@ import jax
 
 from hma_jax.config import TokenizerConfig
 from hma_jax.model.params import Declared, Params, declare
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.network import Autoencoder, from_pixels, to_pixels
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 
 @lru_cache(maxsize=16)
@@ -22,7 +22,7 @@ def declare_tokenizer(config: TokenizerConfig) -> Declared[Autoencoder]:
     return declare(lambda: Autoencoder(config))
 
 
-class AutoencoderTokenizer(BaseTokenizer):
+class AutoencoderTokenizer(Tokenizer):
     """Encodes and decodes with `network.Autoencoder`; subclasses convert between its latents and tokens."""
 
     config_class = TokenizerConfig

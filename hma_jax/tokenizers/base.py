@@ -1,20 +1,28 @@
-"""The interface of all tokenizers, whether one fits a model, and how images pass through it in batches of one size.
+"""What a tokenizer is, and what every one here shares: checked weights, identity, batches of one size on each device.
 
-Code outside this package depends on `Tokenizer` alone: any model that turns frames into ids or
-latent vectors and back can stand behind it.
+Subclasses decide what a token is, and encode and decode.
 """
 
 from __future__ import annotations
 
+import abc
+import hashlib
+import json
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.sharding import PartitionSpec
 
-from hma_jax.config import ModelConfig, require
-from hma_jax.model.params import Params
+from hma_jax.config import MeshConfig, ModelConfig, require
+from hma_jax.config.json import identity_of
+from hma_jax.model.params import Declared, Params, path_name, require_params
+from hma_jax.runtime.mesh import make_mesh
+from hma_jax.runtime.sharding import BATCH, replicated
 
 PIECE = 64
 """Images per call of a jitted encoder or decoder; smaller batches are padded to it."""
@@ -23,89 +31,202 @@ PIXELS = 2**18
 """Pixels that go through a large network at once: four images of 256 x 256."""
 
 
-class Tokenizer(Protocol):
+class Tokenizer(abc.ABC):
     """Images to S tokens each, and back.
 
-    A token is an id, int32, or a vector of C latent channels, float32 of about unit standard
-    deviation. Tokens run over a grid row by row, a square one where images are square. An id is
-    sum_q digit_q V^q: factor 0 in the low digits. Both directions are deterministic, and an image's
-    result does not depend on the others of its batch: tokens made in one job equal those made in another. Another
-    kind of device sums products in another order, which may turn a bit whose latent is all but 0.
+    A token is an id, int32, or a vector of C latent channels, float32 of about unit standard deviation. Tokens run over
+    a grid row by row, a square one where images are square. An id is sum_q digit_q V^q: factor 0 in the low digits.
+    Both directions are deterministic, and an image's result does not depend on the others of its batch: tokens made in
+    one job equal those made in another. Another kind of device sums products in another order, which may turn a bit
+    whose latent is all but 0.
+
+    All devices of this process share every batch: `piece` images at a time go through the network on each of them, so
+    that tokens do not depend on how many there are.
     """
+
+    kind: ClassVar[str]
+    config_class: ClassVar[type]
+    ignored: ClassVar[tuple[str, ...]] = ()
+    """Settings without effect on this kind, left out of its identity."""
+    measured: ClassVar[tuple[str, ...]] = ()
+    """Numbers beside the weights that the tokens depend on: attributes, and arguments by name."""
+
+    def __init__(self, config: Any, params: Params, *, piece: int | None = None):
+        """Raises ConfigError if `params` are not those that `config` declares, or for a `piece` without an image."""
+        self._declared = self.declare(config)
+        self._set_up(config, params, self.default_piece(config) if piece is None else piece, jax.local_devices())
+        require_params(self._declared, params, "tokenizer weights do not fit their configuration")
+
+    def _set_up(self, config: Any, params: Params, piece: int, devices: list[jax.Device]) -> None:
+        require(piece >= 1, f"a tokenizer must encode at least 1 image at a time, got {piece}")
+        self.config, self.params, self.piece = config, params, piece
+        self._mesh = make_mesh(MeshConfig(), devices)
+        self._encode = self._jit_over_devices(self.encode_fn)
+        self._decode = self._jit_over_devices(self.decode_uint8_fn)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickling; where it is unpickled, it uses the devices of that process."""
+        options = {name: getattr(self, name) for name in self.measured} | {"piece": self.piece}
+        return partial(type(self), **options), (self.config, self.params)
+
+    @classmethod
+    @abc.abstractmethod
+    def declare(cls, config: Any) -> Declared:
+        """The network's parameters, without arrays."""
+
+    @classmethod
+    def default_piece(cls, config: Any) -> int:
+        del config
+        return PIECE
+
+    # --- Facts -------------------------------------------------------------------------------
 
     @property
     def image_size(self) -> int:
-        """Pixels along one side. ConfigError if images are not square."""
-        ...
+        """Pixels along one side. Raises ConfigError if images are not square."""
+        height, width = self.image_shape
+        require(
+            height == width,
+            f"this tokenizer is for images of {height} x {width} pixels, but square images are needed; import it "
+            "again with a single image size",
+        )
+        return height
 
     @property
     def image_shape(self) -> tuple[int, int]:
         """(height, width) in pixels."""
-        ...
+        return self.config.image_shape
 
     @property
     def grid(self) -> int:
-        """Tokens along one side of the image. ConfigError if images are not square."""
-        ...
+        """Tokens along one side of the image. Raises ConfigError if images are not square."""
+        return self.config.grid
 
     @property
     def tokens(self) -> int:
         """S: tokens per frame."""
-        ...
+        return self.config.tokens
 
     @property
     def channels(self) -> int:
         """C; 0: tokens are ids."""
-        ...
+        return self.config.token_channels
 
     @property
     def vocab_size(self) -> int:
         """V^Q; 0: tokens are latents."""
-        ...
+        return self.config.vocab_size
 
     @property
     def factors(self) -> int:
         """Q; 0: tokens are latents."""
-        ...
+        return 0 if self.channels else self.config.factors
 
     @property
     def factor_vocab(self) -> int:
         """V; 0: tokens are latents."""
-        ...
+        return self.config.factor_vocab
 
-    @property
+    @cached_property
     def identity(self) -> str:
         """Hash of configuration and weights: equal means the same tokens for the same images."""
-        ...
+        settings = {k: v for k, v in identity_of(self.config).items() if k not in self.ignored}
+        named = [self.kind, settings, *(getattr(self, name) for name in self.measured)]
+        digest = hashlib.sha256(json.dumps(named, sort_keys=True).encode())
+        for path, array in jax.tree.leaves_with_path(self.params):
+            digest.update(path_name(path).encode())
+            digest.update(np.ascontiguousarray(array, "<f4").tobytes())
+        return digest.hexdigest()[:16]
 
-    @property
-    def params(self) -> Params: ...
+    # --- Images in and out -------------------------------------------------------------------
 
-    @property
-    def piece(self) -> int:
-        """Images that a device takes at a time."""
-        ...
+    @abc.abstractmethod
+    def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
+        """Pure: images [B, H, W, 3] in 0..255 -> tokens, int32 [B, S] or float32 [B, S, C]."""
+
+    @abc.abstractmethod
+    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure: tokens [B, S] or [B, S, C] -> float32 [B, H, W, 3] in 0..255."""
+
+    def encode(self, images: np.ndarray) -> np.ndarray:
+        """uint8 [B, H, W, 3] -> int32 [B, S] or float32 [B, S, C].
+
+        Raises ConfigError for another shape or type.
+        """
+        images = np.asarray(images)
+        require_images(images, self.image_shape, "the tokenizer encodes")
+        return in_pieces(lambda piece: self._encode(self._device_params, piece), images, self.at_once)
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """Tokens [B, S] or [B, S, C] -> uint8 [B, H, W, 3].
+
+        Raises ConfigError for another shape or type, and for values that are no tokens.
+        """
+        tokens = self._checked(np.asarray(tokens))
+        return in_pieces(lambda piece: self._decode(self._device_params, piece), tokens, self.at_once)
+
+    def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure: `decode` without its checks of the tokens."""
+        # DIFFERS: the release truncates, which darkens every image by half a grey level.
+        return jnp.round(self.decode_fn(params, tokens)).astype(jnp.uint8)
+
+    def _checked(self, tokens: np.ndarray) -> np.ndarray:
+        """`tokens` in the type that is decoded; ConfigError if they cannot be."""
+        if self.channels:
+            return self._checked_latents(tokens)
+        require(
+            tokens.dtype.kind in "iu" and tokens.ndim == 2 and tokens.shape[1] == self.tokens,
+            f"the tokenizer decodes ids, integers [B, {self.tokens}], got {tokens.dtype} {list(tokens.shape)}",
+        )
+        low, high = int(tokens.min(initial=0)), int(tokens.max(initial=0))
+        require(
+            low >= 0 and high < self.vocab_size,
+            f"token ids must lie in [0, {self.vocab_size}), got {low} to {high}; do they contain a mask id, or were "
+            "they made by another tokenizer?",
+        )
+        return tokens.astype(np.int32)
+
+    def _checked_latents(self, tokens: np.ndarray) -> np.ndarray:
+        shape = (self.tokens, self.channels)
+        require(
+            tokens.dtype.kind == "f" and tokens.ndim == 3 and tokens.shape[1:] == shape,
+            f"the tokenizer decodes latents, float [B, {self.tokens}, {self.channels}], "
+            f"got {tokens.dtype} {list(tokens.shape)}",
+        )
+        tokens = tokens.astype(np.float32)
+        require(bool(np.isfinite(tokens).all()), "latents are not finite; did the model diverge?")
+        return tokens
+
+    # --- Devices -----------------------------------------------------------------------------
 
     @property
     def at_once(self) -> int:
         """Images of one call: `piece` on every device. A smaller batch is padded to it."""
-        ...
+        return self.piece * self._mesh.size
 
-    def encode(self, images: np.ndarray) -> np.ndarray:
-        """uint8 [B, height, width, 3] -> int32 [B, S] or float32 [B, S, C]."""
-        ...
+    def _jit_over_devices(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:
+        """`function`, jitted; every device applies it to its own rows of the batch."""
+        if self._mesh.size == 1:
+            return jax.jit(function)
+        whole, rows = PartitionSpec(), PartitionSpec(BATCH)
+        # One program per device, of the shape that a single one has: the same rounding on any number.
+        return jax.jit(jax.shard_map(function, mesh=self._mesh, in_specs=(whole, rows), out_specs=rows))
 
-    def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """What `encode` makes -> uint8 [B, height, width, 3]."""
-        ...
+    @cached_property
+    def _device_params(self) -> Params:
+        """The parameters where the devices need them."""
+        if self._mesh.size == 1:
+            return self.params
+        return jax.device_put(self.params, replicated(self._mesh))
 
-    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
-        """Pure, for use inside a jit: what `encode` makes -> float32 [B, ...] in 0..255."""
-        ...
 
-    def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
-        """Pure, for use inside a jit: `decode_fn` rounded as `decode` does it."""
-        ...
+def require_images(images: np.ndarray, shape: tuple[int, int], what: str) -> None:
+    """Raises ConfigError, which begins with `what`, for anything but uint8 images of `shape` (height, width)."""
+    height, width = shape
+    require(
+        images.dtype == np.uint8 and images.ndim == 4 and images.shape[1:] == (height, width, 3),
+        f"{what} uint8 images [B, {height}, {width}, 3], got {images.dtype} {list(images.shape)}",
+    )
 
 
 def token_mismatch(model: ModelConfig, tokenizer: Tokenizer) -> str:
@@ -126,7 +247,7 @@ def fitting_piece(image_shape: tuple[int, int]) -> int:
     return max(1, min(PIECE, PIXELS // math.prod(image_shape)))
 
 
-def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int = PIECE) -> np.ndarray:
+def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int) -> np.ndarray:
     """Applies `function` to consecutive pieces of exactly `size` rows; the last one is padded.
 
     One static shape means one compilation, and rounding that does not depend on the number of rows: a latent near zero

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +31,7 @@ class ContinuousTokenizer(AutoencoderTokenizer):
     ignored = ("quantise", "factors", "entropy_weight", "entropy_temperature", "commitment_weight")
     measured = ("latent_std",)
 
-    def __init__(self, config: TokenizerConfig, params: Params, latent_std: float, **placement: Any):
+    def __init__(self, config: TokenizerConfig, params: Params, latent_std: float, *, piece: int | None = None):
         """`latent_std`: of the encoder's own output.
 
         Raises ConfigError if `params` are not those that `config` declares, or if it is no scale.
@@ -44,7 +43,7 @@ class ContinuousTokenizer(AutoencoderTokenizer):
             "not vary, so it has learnt nothing",
         )
         self.latent_std = latent_std
-        super().__init__(config, params, **placement)
+        super().__init__(config, params, piece=piece)
 
     def _from_latents(self, z: jax.Array) -> jax.Array:
         return z / self.latent_std

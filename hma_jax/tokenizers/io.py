@@ -21,18 +21,18 @@ from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.arrays import UNREADABLE, write_arrays
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.user_code import require_trusted, trust
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 from hma_jax.tokenizers.python import PythonTokenizer, copy_folder, folder_identity
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
 FILES = "files"
 """The folder of a tokenizer of the user's own code."""
-KINDS: dict[str, type[BaseTokenizer]] = {
+KINDS: dict[str, type[Tokenizer]] = {
     cls.kind: cls
     for cls in (
         LfqTokenizer,
@@ -46,7 +46,7 @@ KINDS: dict[str, type[BaseTokenizer]] = {
 ADVICE = "train, make, import or copy the tokenizer again"
 
 
-def save_tokenizer(tokenizer: BaseTokenizer, directory: str | Path) -> None:
+def save_tokenizer(tokenizer: Tokenizer, directory: str | Path) -> None:
     """Writes into `directory`, replacing a tokenizer that is there. Raises ConfigError if it cannot."""
     directory = Path(directory)
     description = {
@@ -76,8 +76,8 @@ def load_tokenizer(
     expect: AnyTokenizerConfig | None = None,
     *,
     piece: int | None = None,
-) -> BaseTokenizer:
-    """The tokenizer in `directory`. `piece` is explained at `BaseTokenizer`. Of the kind "python", its code is run, if
+) -> Tokenizer:
+    """The tokenizer in `directory`. `piece` is explained at `Tokenizer`. Of the kind "python", its code is run, if
     it was saved by this user or trusted (`trust_tokenizer`).
 
     Raises ConfigError if none is there, if a file is damaged, or if its configuration is not

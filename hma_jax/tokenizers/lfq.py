@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 
 from hma_jax.config import TokenizerConfig, require
@@ -18,10 +16,10 @@ class LfqTokenizer(AutoencoderTokenizer):
     kind = "lfq"
     ignored = ("quantise", "latent_noise")
 
-    def __init__(self, config: TokenizerConfig, params: Params, **placement: Any):
+    def __init__(self, config: TokenizerConfig, params: Params, *, piece: int | None = None):
         """Raises ConfigError if `params` are not those that `config` declares."""
         require(config.quantise, "a tokenizer for ids needs tokenizer.quantise=true")
-        super().__init__(config, params, **placement)
+        super().__init__(config, params, piece=piece)
 
     def _from_latents(self, z: jax.Array) -> jax.Array:
         return latents_to_ids(z)

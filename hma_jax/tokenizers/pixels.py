@@ -6,26 +6,24 @@ pixels it began with, also from float16, as the token store keeps latents.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 from flax import nnx
 
 from hma_jax.config import PixelsConfig
 from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.network import from_pixels, to_pixels
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 
-class PixelTokenizer(BaseTokenizer):
+class PixelTokenizer(Tokenizer):
     """Tokens are float32 [B, S, 3 patch^2]: a patch row by row, each pixel's channels together."""
 
     kind = "pixels"
     config_class = PixelsConfig
 
-    def __init__(self, config: PixelsConfig, params: Params | None = None, **placement: Any):
-        super().__init__(config, params or {}, **placement)
+    def __init__(self, config: PixelsConfig, params: Params | None = None, *, piece: int | None = None):
+        super().__init__(config, params or {}, piece=piece)
 
     @classmethod
     def declare(cls, config: PixelsConfig) -> Declared:

@@ -13,18 +13,17 @@ from einops import rearrange
 from hma_jax.config import Magvit2Config, SvdVaeConfig
 from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
-from hma_jax.tokenizers.base import fitting_piece
+from hma_jax.tokenizers.base import Tokenizer, fitting_piece
 from hma_jax.tokenizers.magvit2 import Magvit2
 from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
-from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.tokenizers.svd_vae import SvdVae
 
 LATENT_LIMIT = 25.0
 """What unscaled latents are clipped to before they are decoded, as in the release."""
 
 
-class Magvit2Tokenizer(BaseTokenizer):
+class Magvit2Tokenizer(Tokenizer):
     """Tokens are ids: int32 [B, S] below 2^bits. Bit k of an id is the sign of channel k."""
 
     kind = "magvit2"
@@ -47,7 +46,7 @@ class Magvit2Tokenizer(BaseTokenizer):
         return to_pixels(self._declared.merge(params).decoder(ids_to_codes(grid, self.config.bits)))
 
 
-class SvdVaeTokenizer(BaseTokenizer):
+class SvdVaeTokenizer(Tokenizer):
     """Tokens are patches of latent cells, float32 [B, S, C]: the posterior mean times `scale`."""
 
     kind = "svd-vae"

@@ -15,7 +15,7 @@ import logging
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
@@ -31,8 +31,7 @@ from hma_jax.config import PythonConfig, require
 from hma_jax.config.json import from_dict, identity_of
 from hma_jax.model.params import Declared, Params, declare
 from hma_jax.runtime.user_code import naming_line
-from hma_jax.tokenizers.base import fitting_piece, in_pieces
-from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.tokenizers.base import Tokenizer, fitting_piece, in_pieces
 
 FILE, FUNCTION = "tokenizer.py", "make_tokenizer"
 PAGE = 'docs/own_data.md, "Your own tokenizer"'
@@ -45,20 +44,13 @@ NEIGHBOURS = 0.01
 log = logging.getLogger(__name__)
 
 
-class PythonTokenizer(BaseTokenizer):
+class PythonTokenizer(Tokenizer):
     """Tokens are what the code makes of an image: ids, int32 [B, S], or latents, float32 [B, S, C]."""
 
     kind = "python"
     config_class = PythonConfig
 
-    def __init__(
-        self,
-        config: PythonConfig | None,
-        folder: Path,
-        *,
-        devices: Sequence[jax.Device] | None = None,
-        piece: int | None = None,
-    ):
+    def __init__(self, config: PythonConfig | None, folder: Path, *, piece: int | None = None):
         """Runs the code of `folder`. `config` is what it must say of its tokens; None: whatever it says.
 
         Raises ConfigError if there is no such code, if it fails, and for facts that are missing or wrong.
@@ -82,11 +74,11 @@ class PythonTokenizer(BaseTokenizer):
         require(isinstance(piece, int), f"{self._file}: piece must be a whole number, not {piece!r} ({PAGE})")
         self._on_host = not hasattr(own, "params")
         if self._on_host:
-            self._set_up(says, {}, jax.local_devices()[:1], piece)
+            self._set_up(says, {}, piece, jax.local_devices()[:1])
             self._encode = lambda _, images: self._host_encode(images)
             self._decode = lambda _, tokens: self._host_decode(tokens)
         else:
-            self._set_up(says, jax.tree.map(jnp.asarray, own.params), devices, piece)
+            self._set_up(says, jax.tree.map(jnp.asarray, own.params), piece, jax.local_devices())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), piece=self.piece), (self.config, self.folder)
@@ -101,7 +93,7 @@ class PythonTokenizer(BaseTokenizer):
         return _identity(self.config, self._hash)
 
     def encode(self, images: np.ndarray) -> np.ndarray:
-        """As `BaseTokenizer.encode`. Raises ConfigError for what are no tokens."""
+        """As `Tokenizer.encode`. Raises ConfigError for what are no tokens."""
         tokens = super().encode(images)
         low, high = tokens.min(), tokens.max()
         good = np.isfinite([low, high]).all() if self.channels else 0 <= low <= high < self.vocab_size

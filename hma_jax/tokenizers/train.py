@@ -21,12 +21,12 @@ from hma_jax.kernels.random import key_of
 from hma_jax.model.params import Declared, Params
 from hma_jax.runtime.devices import default_device
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
+from hma_jax.tokenizers.base import require_images
 from hma_jax.tokenizers.continuous import make_continuous
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.network import from_pixels
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
-from hma_jax.tokenizers.shared import require_images
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import LoopOptions, Progress, RunInfo, fit
 from hma_jax.training.state import FINITE, TrainState, all_finite, with_sharding

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from hma_jax.evaluation import evaluate as evaluation
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 PIXEL = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
@@ -41,19 +41,19 @@ def once(key: Any, make: Callable[..., Callable], *arguments: Any) -> Callable:
 def compiled_once() -> Iterator[None]:
     """Every command reads its tokenizer anew, whose functions are then others, and with them all that they are traced
     in. No test here replaces a part of them."""
-    make_evaluator, over_devices = evaluation.make_evaluator, BaseTokenizer._jit_over_devices
+    make_evaluator, over_devices = evaluation.make_evaluator, Tokenizer._jit_over_devices
 
     def evaluator(*settings: Any) -> Callable:
         *others, decode, piece = settings
         of = getattr(decode, "__self__", None)
         return once((*others, getattr(of, "identity", decode), piece), make_evaluator, *settings)
 
-    def jitted(tokenizer: BaseTokenizer, function: Callable) -> Callable:
+    def jitted(tokenizer: Tokenizer, function: Callable) -> Callable:
         if type(tokenizer) is not LfqTokenizer or tokenizer._mesh.size > 1:  # others may hold what was measured
             return over_devices(tokenizer, function)
         return once((tokenizer.config, function.__name__), over_devices, tokenizer, function)
 
     with pytest.MonkeyPatch.context() as patch:  # unlike the fixture, it leaves steps that were traced
         patch.setattr(evaluation, "make_evaluator", evaluator)
-        patch.setattr(BaseTokenizer, "_jit_over_devices", jitted)
+        patch.setattr(Tokenizer, "_jit_over_devices", jitted)
         yield

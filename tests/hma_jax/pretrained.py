@@ -11,9 +11,9 @@ import numpy as np
 from hma_jax.config import Magvit2Config, PixelsConfig, SvdVaeConfig
 from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, Source, tokenizer_shapes
 from hma_jax.convert.tensors import write_safetensors
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
-from hma_jax.tokenizers.shared import BaseTokenizer
 
 MAGVIT2_SMALL = Magvit2Config(image_size=16, channels=4, multipliers=(1, 2), res_blocks=1, bits=6, groups=2)
 VAE_SMALL = SvdVaeConfig(image_size=16, channels=(4, 8), layers=1, groups=2)
@@ -29,10 +29,10 @@ OFFICIAL = {
 """What describes the small networks in config.json."""
 
 
-def make(config: Any, seed: int = 0, **placement: Any) -> BaseTokenizer:
+def make(config: Any, seed: int = 0, piece: int | None = None) -> Tokenizer:
     kinds = {c.config_class: c for c in (Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)}
     cls = kinds[type(config)]
-    return cls(config, cls.declare(config).init(seed), **placement)
+    return cls(config, cls.declare(config).init(seed), piece=piece)
 
 
 def noise(count: int, size: int = 16, seed: int = 0) -> np.ndarray:

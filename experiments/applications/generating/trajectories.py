@@ -35,7 +35,7 @@ from hma_jax.simulator.robots import Robot
 
 if TYPE_CHECKING:
     from hma_jax.model.embodiments import EmbodimentTable
-    from hma_jax.tokenizers.shared import BaseTokenizer
+    from hma_jax.tokenizers.base import Tokenizer
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class StoredTrajectories(Trajectories):
     """Trajectories of a token store: its frames where it kept them, otherwise its tokens as the tokenizer decodes
     them."""
 
-    def __init__(self, store: TokenStore, name: str, split: str, tokenizer: BaseTokenizer, robot: Robot):
+    def __init__(self, store: TokenStore, name: str, split: str, tokenizer: Tokenizer, robot: Robot):
         """Raises ConfigError for tokens of another tokenizer, or of frames too far apart."""
         manifest = store.manifest(name)
         _require_fit(manifest.spec, robot)
@@ -241,7 +241,7 @@ def open_trajectories(
     split: str,
     robot: Robot | None,
     robots: dict[str, Robot],
-    tokenizer: BaseTokenizer,
+    tokenizer: Tokenizer,
     stores: Path,
     *,
     skip_damaged: bool = False,

@@ -17,14 +17,14 @@ from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.generation import predict_next_actions
 from hma_jax.kernels.random import key_of
 from hma_jax.simulator.robots import Robot
-from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.training.runs import Model
 
 
 class OwnHeadPolicy:
     """Acts by the action head of a model: gives whole chunks, as the head predicts them, within the robot's range."""
 
-    def __init__(self, model: Model, tokenizer: BaseTokenizer, robot: Robot):
+    def __init__(self, model: Model, tokenizer: Tokenizer, robot: Robot):
         """Raises ConfigError for a model that predicts no actions."""
         setting = model.run.train.masking.setting
         require(

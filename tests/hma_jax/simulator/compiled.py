@@ -12,13 +12,13 @@ import pytest
 from hma_jax.config import DecodeConfig
 from hma_jax.simulator import simulator as module
 from hma_jax.simulator.programs import ProgramParams, Programs
-from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.training.runs import Model
 
 COMPILED: dict[Any, Programs] = {}
 
 
-def programs(model: Model, tokenizer: BaseTokenizer, episodes: int, decode: DecodeConfig) -> Programs:
+def programs(model: Model, tokenizer: Tokenizer, episodes: int, decode: DecodeConfig) -> Programs:
     """In place of `Programs`: those that another simulator has compiled, if its settings were the same."""
     setting = model.run.train.masking.setting
     key = model.config, model.table, model.execution, setting, tokenizer.identity, episodes, decode
