@@ -14,16 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
+from hma_jax.config import ConfigError, require
 from hma_jax.config.base import require_choice
-from hma_jax.config.json import from_dict, to_plain_json
+from hma_jax.config.json import to_plain_json
 from hma_jax.convert.atomic import atomic_directory
-from hma_jax.convert.table import check_names, flat, nested
-from hma_jax.convert.tensors import FLOATS, read_finite, read_safetensors, write_safetensors
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.convert.table import flat, nested
+from hma_jax.convert.tensors import check_tensors, read_finite, read_safetensors, write_safetensors
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec
-from hma_jax.training.runs import Run, describe_run, modernise
+from hma_jax.training.runs import Run, describe_run, read_configs
 
 FORMAT, VERSION = "hma-jax", 1
 DESCRIPTION, WEIGHTS = "model.json", "model.safetensors"
@@ -78,9 +77,7 @@ def read_neutral(directory: Path) -> Run:
     for name in ("model", "train", "table", "tensors", "provenance"):
         kind = type(description[name]).__name__
         require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
-    description = modernise(description, str(path))
-    model, train = from_dict(ModelConfig, description["model"]), from_dict(TrainConfig, description["train"])
-    table = from_dict(EmbodimentTable, description["table"])
+    model, train, table = read_configs(description, str(path))
     # Earlier versions did not say which; by default they wrote the average where there was one.
     which = description.get("weights", "ema" if train.ema_decay else "last")
     require_choice(which, ("last", "ema"), f"{path}: weights")
@@ -95,19 +92,9 @@ def read_neutral(directory: Path) -> Run:
         not wrong,
         f"{path}: tensors whose description does not match the model: {', '.join(sorted(wrong)[:10])}",
     )
-    require((directory / WEIGHTS).is_file(), f"{directory} has no {WEIGHTS}")
-    tensors = read_safetensors(directory / WEIGHTS)
-    shapes = {name: spec.shape for name, spec in leaves.items()}
-    check_names(shapes, {name: tensor.shape for name, tensor in tensors.items()}, str(directory / WEIGHTS))
-    foreign = [name for name, tensor in tensors.items() if tensor.dtype.name not in FLOATS]
-    require(not foreign, f"{directory / WEIGHTS}: not of type {', '.join(FLOATS)}: {', '.join(foreign[:10])}")
-    arrays = {name: read_finite(tensors, name, str(directory / WEIGHTS)) for name in tensors}
-    return Run(
-        model,
-        train,
-        table,
-        nested({name: values.astype(np.float32, copy=False) for name, values in arrays.items()}),
-        step,
-        description["provenance"],
-        which,
-    )
+    weights = directory / WEIGHTS
+    require(weights.is_file(), f"{directory} has no {WEIGHTS}")
+    tensors = read_safetensors(weights)
+    check_tensors({name: spec.shape for name, spec in leaves.items()}, tensors, str(weights))
+    arrays = {name: read_finite(tensors, name, str(weights)).astype(np.float32, copy=False) for name in tensors}
+    return Run(model, train, table, nested(arrays), step, description["provenance"], which)

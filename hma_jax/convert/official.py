@@ -34,8 +34,8 @@ from hma_jax.convert.official_config import (
     write_config,
 )
 from hma_jax.convert.release_limits import ATTENTION_SCALE, loads_in_release, released_form, require_official
-from hma_jax.convert.table import check_names, flat, from_official, nested, official_parts, to_official
-from hma_jax.convert.tensors import FLOATS, Stored, read_finite, read_safetensors, write_safetensors
+from hma_jax.convert.table import flat, from_official, nested, official_parts, to_official
+from hma_jax.convert.tensors import Stored, check_tensors, read_finite, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
@@ -97,9 +97,7 @@ def read_official(directory: Path) -> Run:
     with _naming_file(where):
         table = read_table(config, statistics, where)
         shapes = official_shapes(model, table)
-    check_names(shapes, {name: tensor.shape for name, tensor in tensors.items()}, str(directory))
-    foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
-    require(not foreign, f"{directory}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
+    check_tensors(shapes, tensors, str(directory))
     leaves = declare_model(model, table).leaves()
     params = from_official(tensors, official_parts(model, table, leaves), leaves, str(directory))
     provenance = {

@@ -19,8 +19,8 @@ import numpy as np
 from hma_jax.config import Dtype, ImageSize, Magvit2Config, require
 from hma_jax.config.json import from_dict
 from hma_jax.convert.official import CONFIG, read_config
-from hma_jax.convert.table import check_names, nested
-from hma_jax.convert.tensors import FLOATS, Stored, read_finite, read_safetensors
+from hma_jax.convert.table import nested
+from hma_jax.convert.tensors import FLOATS, Stored, check_tensors, read_finite, read_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.params import Declared, Params, ParamSpec
 from hma_jax.tokenizers.base import Tokenizer
@@ -121,10 +121,7 @@ def tokenizer_shapes(source: Source, declared: Declared) -> dict[str, tuple[int,
 def tokenizer_params(source: Source, declared: Declared, tensors: Mapping[str, Stored], where: str) -> Params:
     """Our parameters, float32. Raises ConfigError naming tensors that are missing, too many, of another
     shape, no floats or not finite."""
-    check_names(tokenizer_shapes(source, declared), {n: t.shape for n, t in tensors.items()}, where)
-    floats = (*FLOATS, "float64")
-    foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in floats}
-    require(not foreign, f"{where}: tensors that are not of type {', '.join(floats)}: {foreign}")
+    check_tensors(tokenizer_shapes(source, declared), tensors, where, (*FLOATS, "float64"))
 
     def read(path: str, spec: ParamSpec) -> jnp.ndarray:
         values = read_finite(tensors, source.official_name(path), where).astype(np.float32)

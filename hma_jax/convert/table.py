@@ -19,7 +19,7 @@ import numpy as np
 from einops import rearrange
 from flax import nnx
 
-from hma_jax.config import ConfigError, ModelConfig
+from hma_jax.config import ModelConfig
 from hma_jax.convert.tensors import Stored, read_finite
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
@@ -213,25 +213,6 @@ def to_official(params: Params, parts: Mapping[str, list[Part]]) -> dict[str, np
     # Each parameter is fetched once: it may lie on an accelerator.
     arrays = {path: np.asarray(x) for path, x in flat(params).items() if path in parts}
     return {part.name: part.to_official(arrays[path]) for path, own in parts.items() for part in own}
-
-
-def check_names(want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Raises ConfigError naming (the first few) tensors that are missing, too many or of another shape."""
-    wrong = {
-        "missing": [f"{n} {want[n]}" for n in want if n not in found],
-        "not expected": [f"{n} {found[n]}" for n in found if n not in want],
-        "with another shape": [
-            f"{n}: expected {want[n]}, found {found[n]}" for n in want if n in found and found[n] != want[n]
-        ],
-    }
-    most = 10
-    lines = [
-        f"\n  {len(names)} {problem}: " + "; ".join(names[:most]) + ("; ..." if len(names) > most else "")
-        for problem, names in wrong.items()
-        if names
-    ]
-    if lines:
-        raise ConfigError(f"{where}: the tensors differ from those that the description requires:" + "".join(lines))
 
 
 def flat(params: Params) -> dict[str, np.ndarray]:

@@ -41,6 +41,37 @@ class Stored:
     read: Callable[[], np.ndarray]
 
 
+MOST_NAMED = 10
+"""Tensors that a message names; of more there is only the number."""
+
+
+def check_tensors(
+    want: Mapping[str, tuple[int, ...]],
+    tensors: Mapping[str, Stored],
+    where: str,
+    types: tuple[str, ...] = FLOATS,
+) -> None:
+    """Raises ConfigError naming (the first few) tensors of the file or directory `where` that are missing, too many, or
+    of another shape or type than `types`."""
+    found = {name: tensor.shape for name, tensor in tensors.items()}
+    wrong = {
+        "missing": [f"{n} {want[n]}" for n in want if n not in found],
+        "not expected": [f"{n} {found[n]}" for n in found if n not in want],
+        "with another shape": [
+            f"{n}: expected {want[n]}, found {found[n]}" for n in want if n in found and found[n] != want[n]
+        ],
+    }
+    lines = [
+        f"\n  {len(names)} {problem}: " + "; ".join(names[:MOST_NAMED]) + ("; ..." if len(names) > MOST_NAMED else "")
+        for problem, names in wrong.items()
+        if names
+    ]
+    if lines:
+        raise ConfigError(f"{where}: the tensors differ from those that the description requires:" + "".join(lines))
+    foreign = [f"{name} ({tensor.dtype.name})" for name, tensor in tensors.items() if tensor.dtype.name not in types]
+    require(not foreign, f"{where}: tensors that are not of type {', '.join(types)}: {', '.join(foreign[:MOST_NAMED])}")
+
+
 def read_finite(tensors: Mapping[str, Stored], name: str, where: str) -> np.ndarray:
     """The values of one tensor of the file or directory `where`. Raises ConfigError if some are not finite."""
     values = tensors[name].read()

@@ -113,19 +113,25 @@ def describe_run(
     }
 
 
-def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[str, Any]:
-    """A description that this or an earlier version wrote, as `describe_run` writes it today.
+def read_configs(described: dict[str, Any], where: str) -> tuple[ModelConfig, TrainConfig, EmbodimentTable]:
+    """What a description that this or an earlier version wrote says of a run.
 
     A field that it lacks has the value that computes what was computed without it (`config.base.later`). Raises
-    ConfigError for a field that this version does not know.
+    ConfigError, which begins with `where`, for a field that this version does not know.
     """
-    parts = {"model": ModelConfig, "train": TrainConfig, "table": EmbodimentTable}
-    today = dict(described)
-    for name, kind in parts.items():
+
+    def read(name: str, kind: type) -> Any:
         former = FORMER_FIELDS.get(name, ())
         values = {key: value for key, value in described[name].items() if key not in former}
-        today[name] = to_dict(from_dict(kind, values, f"{where}: {name}"))
-    return today
+        return from_dict(kind, values, f"{where}: {name}")
+
+    return read("model", ModelConfig), read("train", TrainConfig), read("table", EmbodimentTable)
+
+
+def modernise(described: dict[str, Any]) -> dict[str, Any]:
+    """A description that this or an earlier version wrote, as `describe_run` writes it today. Raises as
+    `read_configs`."""
+    return describe_run(*read_configs(described, "the checkpoint"), described["provenance"])
 
 
 def require_frames(run: Run, deed: str) -> None:
@@ -193,10 +199,7 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
             )
         averaged = has_item(checkpoint, "ema")
     averaged = bool(broadcast_from_writer("average", "kept" if averaged else ""))  # all read the same item
-    described = modernise(described, str(run_dir))
-    model = from_dict(ModelConfig, described["model"])
-    train = from_dict(TrainConfig, described["train"])
-    table = from_dict(EmbodimentTable, described["table"])
+    model, train, table = read_configs(described, str(run_dir))
     alone = train.ema_decay > 0 and not averaged  # shipped: `params` are the average
     require(
         averaged or alone or weights != "ema",

@@ -30,7 +30,7 @@ from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import NAME, ReadError
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
-from hma_jax.training.runs import describe_run, load_model, load_run, modernise
+from hma_jax.training.runs import describe_run, load_model, load_run, modernise, read_configs
 from hma_jax.training.train import train_model
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, lively_params, model_config, train_config
 
@@ -203,7 +203,7 @@ def test_a_field_that_came_later_takes_its_default_and_an_unknown_one_is_named()
     assert modernise(today) == today
     earlier["model"]["telepathy"] = True
     with pytest.raises(ConfigError, match=r"RUN: model: unknown field\(s\) telepathy"):
-        modernise(earlier, "RUN")
+        read_configs(earlier, "RUN")
 
 
 # --- Reading a model -------------------------------------------------------------------------
