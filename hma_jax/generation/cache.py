@@ -108,9 +108,7 @@ class Window(NamedTuple):
         remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
         earlier = jnp.stack([cache.valid] * count + [remaining])
         visible = jnp.concatenate([earlier, causal_mask(count + 1)], axis=1)
-        out = self._pass(
-            values, masked, at, cache.layers, visible, positions=positions, cache_frames=count, predict_from=count
-        )
+        out = self._pass(values, masked, at, cache.layers, visible, positions, cache_frames=count, predict_from=count)
         return cache.write(out.cache, slot), out.token_outputs[:, 0]
 
     def _pass(
@@ -120,9 +118,11 @@ class Window(NamedTuple):
         at: int | jax.Array,
         past: TemporalCache | None = None,
         visible: jax.Array | None = None,
+        positions: jax.Array | None = None,
         **options: Any,
     ) -> Outputs:
-        """One pass over frames that take the actions from `at` on; `options` are the model's."""
+        """One pass over frames that take the actions from `at` on, and those positions unless `positions` are given;
+        `options` are the model's."""
         count = values.shape[1]
         hidden = None if self.action_hidden_BT is None else cut(self.action_hidden_BT, at, count)
         return self.model(
@@ -132,7 +132,7 @@ class Window(NamedTuple):
             self.embodiment_B,
             action_hidden_BT=hidden,
             visible=visible,
-            first=at,
+            positions=at + jnp.arange(count) if positions is None else positions,
             past=past,
             **options,
         )

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, ModelConfig, check_decoding
+from hma_jax.kernels.random import fold_in_each
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
 from hma_jax.model.readout import ChainedReadout, Readout, choose_sampled
@@ -137,7 +138,7 @@ def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array
         chosen = choose_patches(order, size if decode.resample else before, still_masked)
         if not chosen.size:  # of more steps than tokens, the first few leave as many masked as the one before
             continue
-        keys = jax.vmap(lambda k, s=step: jax.random.fold_in(k, s))(key_B)
+        keys = fold_in_each(key_B, step)
         # The denoiser, not the trunk, costs most: it sees only the patches it is asked for.
         new = denoise(model, jnp.take_along_axis(z, chosen[..., None], axis=1), keys, decode)
         frame = commit(frame, chosen, new)

@@ -34,7 +34,7 @@ def predict_actions(
     `real_BT` (None: all are) are no part. Padding is 0. Raises ConfigError as `next_frame_outputs`, and for a model
     without an action head.
     """
-    frames = _checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT)
+    frames = checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT, shortest=1, subject="actions")
     count = frames.shape[1]
     visible = None if causally else bidirectional_mask(count, real_BT)
     hidden = model.align_hidden(action_hidden_BT, frames.shape[:2])
@@ -56,7 +56,7 @@ def predict_next_actions(
     One pass. With causal alignment no frame is shown its own chunk; otherwise the window is followed by a copy of
     itself whose actions are hidden, under the mask of teacher forcing. Raises ConfigError as `predict_actions`.
     """
-    frames = _checked_window(model, frames, actions_BTU, embodiment_B, None)
+    frames = checked_window(model, frames, actions_BTU, embodiment_B, None, shortest=1, subject="actions")
     batch, count = frames.shape[:2]
     if model.config.action_alignment == "causal":
         nothing = jnp.zeros((batch, count), bool)
@@ -76,13 +76,6 @@ def predict_next_actions(
     features_BTD = out.action_features_BTD
     own = out._replace(action_features_BTD=None if features_BTD is None else features_BTD[:, count:])
     return read_actions(model, own, embodiment_B, key_B, decode)
-
-
-def _checked_window(
-    model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, action_hidden_BT: Array | None
-) -> Array:
-    given = (frames, actions_BTU, embodiment_B, action_hidden_BT)
-    return checked_window(model.config, model.table, *given, shortest=1, subject="actions")
 
 
 def read_actions(

@@ -17,6 +17,7 @@ from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window, cut
 from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
+from hma_jax.kernels.random import fold_in_each
 from hma_jax.model.given import Array, as_frames, require_keys, require_known
 from hma_jax.model.hma import HMA
 
@@ -36,7 +37,7 @@ class Sequences(NamedTuple):
 
     def keys_at(self, t: jax.Array) -> jax.Array:
         """The keys of frame t."""
-        return fold_in(self.keys, t)
+        return fold_in_each(self.keys, t)
 
 
 def rollout(
@@ -168,16 +169,11 @@ def rollout_naive(
             unknown = unknown.at[:, t - first].set(frame.masked)
             return model(values, unknown, aligned, embodiment_B, action_hidden_BT=hidden).token_outputs[:, t - first]
 
-        frame = decode_frame(model, predict(blank), predict, fold_in(key_B, t), decode)
+        frame = decode_frame(model, predict(blank), predict, fold_in_each(key_B, t), decode)
         return known.at[:, t].set(frame), None
 
     known, _ = jax.lax.scan(next_frame, jnp.concatenate([prompt, *future], axis=1), jnp.arange(count, frames))
     return known[:, count:]
-
-
-def fold_in(key_B: jax.Array, data: int | jax.Array) -> jax.Array:
-    """`data` folded into every key."""
-    return jax.vmap(lambda key: jax.random.fold_in(key, data))(key_B)
 
 
 def _require_shapes(

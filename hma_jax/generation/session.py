@@ -16,7 +16,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.config.base import require_shapes
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
-from hma_jax.generation.rollout import fold_in
+from hma_jax.kernels.random import fold_in_each
 from hma_jax.model.given import Array, as_frames, require_finite, require_keys, require_known
 from hma_jax.model.hma import HMA
 
@@ -108,7 +108,7 @@ def advance(
     hidden = _written(session.action_hidden_BT, jnp.stack([action_hidden_B, action_hidden_B], axis=1), last)
     window = Window.over(model, chunks, hidden, session.embodiment_B)
     newest = jax.lax.dynamic_index_in_dim(session.frames, last, axis=1, keepdims=False)
-    keys = fold_in(key_B, t)
+    keys = fold_in_each(key_B, t)
 
     def within_the_window() -> tuple[FrameCache, jax.Array]:
         return steps.fill(window, session.cache, newest, t, keys, decode)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig
 from hma_jax.generation.decoding import Frame, decode_frame
-from hma_jax.generation.rollout import fold_in
+from hma_jax.kernels.random import fold_in_each
 from hma_jax.model.given import Array, checked_window, require_keys
 from hma_jax.model.hma import HMA, Outputs, causal_mask
 from hma_jax.model.teacher_forcing import teacher_forced_pass
@@ -26,7 +26,9 @@ def next_frame_outputs(
     Raises ConfigError for a window that is longer than the model's, for other shapes that do not fit the model or each
     other, and for unknown ids and robots as `rollout`.
     """
-    frames = _checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT)
+    frames = checked_window(
+        model, frames, actions_BTU, embodiment_B, action_hidden_BT, shortest=2, subject="next frames"
+    )
     return _fully_masked_pass(model, frames, actions_BTU, embodiment_B, action_hidden_BT).token_outputs
 
 
@@ -46,7 +48,9 @@ def next_frames(
     one over the true ones, where the official evaluation makes M (T - 1) over the window. Raises ConfigError as
     `next_frame_outputs`.
     """
-    frames = _checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT)
+    frames = checked_window(
+        model, frames, actions_BTU, embodiment_B, action_hidden_BT, shortest=2, subject="next frames"
+    )
     require_keys(key_B, len(frames))
     count = frames.shape[1] - 1
     out = _fully_masked_pass(model, frames, actions_BTU, embodiment_B, action_hidden_BT, cache_frames=count)
@@ -63,22 +67,15 @@ def next_frames(
             embodiment_B,
             action_hidden_BT=hidden,
             visible=jnp.concatenate([causal_mask(count), jnp.eye(count, dtype=bool)], axis=1),
-            first=1,
+            positions=jnp.arange(1, count + 1),
             past=out.cache,
             before=frames[:, :-1],
         )
         return _by_frame(out_of_past.token_outputs)
 
-    keys = jnp.stack([fold_in(key_B, t) for t in range(1, count + 1)], axis=1)
+    keys = jnp.stack([fold_in_each(key_B, t) for t in range(1, count + 1)], axis=1)
     filled = decode_frame(model, _by_frame(out.token_outputs), predict, _by_frame(keys), decode)
     return out.token_outputs, _by_window(filled, count)
-
-
-def _checked_window(
-    model: HMA, frames: Array, actions_BTU: Array, embodiment_B: Array, action_hidden_BT: Array | None
-) -> Array:
-    given = (frames, actions_BTU, embodiment_B, action_hidden_BT)
-    return checked_window(model.config, model.table, *given, shortest=2, subject="next frames")
 
 
 def _fully_masked_pass(

@@ -82,6 +82,11 @@ def key_of(seed: int | jax.Array) -> jax.Array:
     return jax.random.key(seed, impl=GENERATOR)
 
 
+def fold_in_each(key_B: jax.Array, tag: int | jax.Array) -> jax.Array:
+    """`jax.random.fold_in(key, tag)` of every key."""
+    return jax.vmap(lambda key: jax.random.fold_in(key, tag))(key_B)
+
+
 def draw_flat(sample: Sample, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """`sample(key, shape, float32)`, the same numbers. `key` may be an array of keys, each with numbers of its own:
     [*key.shape, *shape].

@@ -9,6 +9,7 @@ import numpy as np
 from hma_jax.config import ModelConfig, require
 from hma_jax.config.base import require_shapes
 from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import HMA
 
 Array = jax.Array | np.ndarray
 """An array on a device, traced, or on the host."""
@@ -57,8 +58,7 @@ def as_frames(config: ModelConfig, frames: Array) -> Array:
 
 
 def checked_window(
-    config: ModelConfig,
-    table: EmbodimentTable,
+    model: HMA,
     frames: Array,
     actions_BTU: Array,
     embodiment_B: Array,
@@ -70,6 +70,7 @@ def checked_window(
     """A recorded window's frames in the type that the model takes. Raises ConfigError, which begins with `subject`, for
     fewer than `shortest` frames, for more than the model's, and for shapes that fit neither the model nor each other;
     as `require_known` for unknown values."""
+    config, table = model.config, model.table
     batch_time, most = frames.shape[:2], config.frames
     wanted = {
         "frames": (*batch_time, *config.frame_shape),

@@ -77,7 +77,6 @@ class HMA(nnx.Module):
         action_hidden_BT: jax.Array | None = None,
         leak: ActionLeak = "none",
         visible: jax.Array | None = None,
-        first: int | jax.Array = 0,
         positions: jax.Array | None = None,
         past: TemporalCache | None = None,
         before: jax.Array | None = None,
@@ -90,18 +89,17 @@ class HMA(nnx.Module):
         `actions_BTU` are raw chunks as `align` arranges them: as released, frame t carries the
         chunk executed after it was seen (reference section 1.3). Where `action_hidden_BT` the model is
         not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
-        instead of actions runs without action tokens and conditioning. The frames stand at window
-        positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T], or with a
-        leading B, defaults to causal: then padding at a window's end is seen by no real frame. `before`,
-        of the shape of `frames`, is the frame that precedes each of them, which `config.recall` reads; by
-        default the one before it here. The cache of the first `cache_frames` frames is returned; frames before
-        `predict_from` get no predictions. Where the parameters hold the slices of some robots only,
-        `robot_row_B` [B] is each example's index into them.
+        instead of actions runs without action tokens and conditioning. The frames stand at window positions
+        `positions` (int [T], default from 0 on); `visible` [T, T_past + T], or with a leading B, defaults to causal:
+        then padding at a window's end is seen by no real frame. `before`, of the shape of `frames`, is the frame that
+        precedes each of them, which `config.recall` reads; by default the one before it here. The cache of the first
+        `cache_frames` frames is returned; frames before `predict_from` get no predictions. Where the parameters hold
+        the slices of some robots only, `robot_row_B` [B] is each example's index into them.
         """
         config = self.config
         count = frames.shape[1]
         if positions is None:
-            positions = first + jnp.arange(count)
+            positions = jnp.arange(count)
         if visible is None:
             visible = causal_mask(count)
         robot_row_B = embodiment_B if robot_row_B is None else robot_row_B
@@ -112,14 +110,13 @@ class HMA(nnx.Module):
         action = None
         if actions_BTU is not None:
             feature = self.stem(self.normalise(actions_BTU, embodiment_B).astype(self.dtype), robot_row_B)
-            from_blocks = (
-                action_hidden_BT if leak == "none" else self._hidden_through_leaks(action_hidden_BT, positions)
-            )
+            from_tokens = from_blocks = action_hidden_BT
+            if leak != "none":
+                from_blocks = self._hidden_through_leaks(action_hidden_BT, positions)
+            if leak == "all":
+                from_tokens = from_blocks
             action = ActionFeature(feature, None if from_blocks is None else ~from_blocks)
             if config.concat:
-                from_tokens = (
-                    action_hidden_BT if leak != "all" else self._hidden_through_leaks(action_hidden_BT, positions)
-                )
                 x = jnp.concatenate([x, self._action_tokens(feature, from_tokens, positions)], axis=2)
         x = shifted(x, jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]])
         if self.norm is not None:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import SamplerConfig, require
-from hma_jax.kernels.random import draw_flat
+from hma_jax.kernels.random import draw_flat, fold_in_each
 from hma_jax.objective.process import Process, multistep
 
 Network = Callable[[jax.Array, jax.Array], jax.Array]
@@ -126,8 +126,8 @@ def sample(
     )
 
     def draw(index: jax.Array | int) -> jax.Array:
-        keys = jax.vmap(lambda k: jax.random.fold_in(k, index))(key.reshape(-1))
-        return draw_flat(jax.random.normal, keys.reshape(key.shape), shape[key.ndim :])
+        keys = fold_in_each(key.reshape(-1), index).reshape(key.shape)
+        return draw_flat(jax.random.normal, keys, shape[key.ndim :])
 
     return run_sampler(network, draw(process.steps), draw, process, sampler, clip)
 

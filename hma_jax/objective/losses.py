@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import MaskingConfig
-from hma_jax.kernels.random import Tag, draw_flat
+from hma_jax.kernels.random import Tag, draw_flat, fold_in_each
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
 from hma_jax.model.teacher_forcing import teacher_forced_pass
@@ -129,7 +129,7 @@ def masked_loss(
                 leak=masking.action_leak,
             )
         if masking.displaced_past:
-            keys = jax.vmap(lambda key: jax.random.fold_in(key, Tag.DISPLACED_PAST))(key_B)
+            keys = fold_in_each(key_B, Tag.DISPLACED_PAST)
             past = displace_patches(past, masking.displaced_past, keys)
         out = teacher_forced_pass(
             model,
@@ -191,7 +191,7 @@ def frame_diffusion_loss(
     x0 = tokens_BTSC.astype(jnp.float32)
 
     def noised_copy(r: int) -> jax.Array:
-        keys = jax.vmap(lambda key: jax.random.fold_in(key, r))(key_B)
+        keys = fold_in_each(key_B, r)
         time, noise = jax.vmap(lambda key: draw_noise(key, x0.shape[1:], config.steps, shift))(keys)
         mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z_BTSD), x0, time, noise, process)
         if cap:
@@ -228,7 +228,7 @@ def action_loss_per_step(
     target = model.normalise(actions_BTU, embodiment_B)
     alive_BTU = jnp.broadcast_to(jnp.asarray(model.table.alive())[embodiment_B][:, None], target.shape)
     if model.config.diffusion:
-        keys = jax.vmap(lambda k: jax.random.fold_in(k, Tag.ACTION_NOISE))(key_B)
+        keys = fold_in_each(key_B, Tag.ACTION_NOISE)
         time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion.steps))(keys)
 
         def network(x: jax.Array, t: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config.training import ActionLeak
+from hma_jax.kernels.random import fold_in_each
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
 from hma_jax.model.readout import choose_sampled
@@ -62,11 +63,10 @@ def draw_own_past(
             leak=leak,
             robot_row_B=robot_row_B,
         )
-        token_outputs = jax.lax.stop_gradient(
-            out.token_outputs[:, :-1]
-        )  # of frames 1 .. T-2; nothing follows the last one
+        # Nothing follows the last frame.
+        token_outputs = jax.lax.stop_gradient(out.token_outputs[:, :-1])
         # The first round draws what it draws where it is the only one.
-        keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B
+        keys = fold_in_each(ids_key_B, number) if number else ids_key_B
         own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, token_outputs), before[:, 1:])
         past = jnp.concatenate([before[:, :1], own], axis=1)
     return past
