@@ -133,34 +133,26 @@ def _stream(
 def rollout_naive(
     model: HMA,
     prompt: jax.Array,
-    actions_BTU: jax.Array | None,
+    actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     key_B: jax.Array,
     decode: DecodeConfig,
     *,
-    frames: int | None = None,
     action_hidden_BT: jax.Array | None = None,
 ) -> jax.Array:
-    """What `rollout` must equal: the whole window again for every pass over a frame.
-
-    Without actions (None) there are neither action tokens nor conditioning, and `frames` says
-    how many to fill up to.
-    """
-    batch = len(prompt)
-    actions_BRTU = jnp.zeros((batch, 1, frames, 0)) if actions_BTU is None else actions_BTU[:, None]
-    prompt, actions_BRTU, action_hidden_BT = _recent(model, prompt, actions_BRTU, action_hidden_BT)
-    frames, count = actions_BRTU.shape[2], prompt.shape[1]
+    """What `rollout` must equal: the whole window again for every pass over a frame."""
+    prompt, actions_BRTU, action_hidden_BT = _recent(model, prompt, actions_BTU[:, None], action_hidden_BT)
+    batch, _, frames, _ = actions_BRTU.shape
+    count = prompt.shape[1]
     size = min(frames, model.config.frames)
     blank = blank_frame(model.config, batch)
     future = [blank.values[:, None].astype(prompt.dtype)] * (frames - count)
 
     def next_frame(known: jax.Array, t: jax.Array):
         first = jnp.maximum(t + 1 - size, 0)
-        aligned = hidden = None
-        if actions_BTU is not None:
-            aligned = model.align(cut(actions_BRTU[:, 0], first, size))
-            recorded = None if action_hidden_BT is None else cut(action_hidden_BT, first, size)
-            hidden = model.align_hidden(recorded, (batch, size))
+        aligned = model.align(cut(actions_BRTU[:, 0], first, size))
+        recorded = None if action_hidden_BT is None else cut(action_hidden_BT, first, size)
+        hidden = model.align_hidden(recorded, (batch, size))
 
         def predict(frame: Frame) -> jax.Array:
             values = cut(known, first, size)

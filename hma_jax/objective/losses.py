@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from hma_jax.config import MaskingConfig
 from hma_jax.kernels.random import Tag, draw_flat, fold_in_each
 from hma_jax.model.frames import factorise
-from hma_jax.model.hma import HMA
+from hma_jax.model.hma import HMA, Outputs
 from hma_jax.model.teacher_forcing import teacher_forced_pass
 from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.displaced import displace_patches
@@ -110,50 +110,8 @@ def masked_loss(
     `training` as for `frame_diffusion_loss`.
     """
     robot_row_B = embodiment_B if robot_row_B is None else robot_row_B
-    all_shown = masking.setting == "forward" and all(model.table.chunks)
-    hidden = None if all_shown else masked.action_hidden_T
-    options = {"leak": masking.action_leak, "robot_row_B": robot_row_B}
-    if masking.teacher_forcing:
-        past = masked.inputs[:, :-1]
-        if masking.own_past:
-            past = draw_own_past(
-                model,
-                past,
-                actions_BTU,
-                embodiment_B,
-                hidden,
-                share=masking.own_past,
-                rounds=masking.own_past_rounds,
-                key_B=key_B,
-                robot_row_B=robot_row_B,
-                leak=masking.action_leak,
-            )
-        if masking.displaced_past:
-            keys = fold_in_each(key_B, Tag.DISPLACED_PAST)
-            past = displace_patches(past, masking.displaced_past, keys)
-        out = teacher_forced_pass(
-            model,
-            past,
-            masked.inputs[:, FIRST_PREDICTED:],
-            masked.masked[:, FIRST_PREDICTED:],
-            actions_BTU,
-            embodiment_B,
-            hidden,
-            **options,
-        )
-    else:
-        out = model(
-            masked.inputs,
-            masked.masked,
-            model.align(actions_BTU),
-            embodiment_B,
-            action_hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
-            visible=bidirectional_mask(tokens.shape[1], real_BT) if masking.setting == "inverse" else None,
-            predict_from=FIRST_PREDICTED,
-            **options,
-        )
-    zero = jnp.zeros(())
-    loss = correct = action_loss = zero
+    out = _masked_pass(model, masked, actions_BTU, embodiment_B, masking, key_B, robot_row_B, real_BT)
+    loss = correct = action_loss = jnp.zeros(())
     if masking.predicts_frames:
         weight, tokens = weigh_tokens(masked, tokens, masking)[:, FIRST_PREDICTED:], tokens[:, FIRST_PREDICTED:]
         if model.config.diffusion:
@@ -168,6 +126,41 @@ def masked_loss(
         per_step = action_loss_per_step(model, out.action_features_BTD, actions_BTU, embodiment_B, robot_row_B, key_B)
         action_loss = jnp.sum(per_step * masked.action_targets_T.astype(per_step.dtype))
     return LossSums(loss, correct, action_loss)
+
+
+def _masked_pass(
+    model: HMA,
+    masked: Masked,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    masking: MaskingConfig,
+    key_B: jax.Array,
+    robot_row_B: jax.Array,
+    real_BT: jax.Array | None,
+) -> Outputs:
+    """The model's outputs for the frames from FIRST_PREDICTED on; arguments are those of `masked_loss`."""
+    all_shown = masking.setting == "forward" and all(model.table.chunks)
+    hidden = None if all_shown else masked.action_hidden_T
+    options = {"leak": masking.action_leak, "robot_row_B": robot_row_B}
+    if not masking.teacher_forcing:
+        return model(
+            masked.inputs,
+            masked.masked,
+            model.align(actions_BTU),
+            embodiment_B,
+            action_hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
+            visible=bidirectional_mask(masked.inputs.shape[1], real_BT) if masking.setting == "inverse" else None,
+            predict_from=FIRST_PREDICTED,
+            **options,
+        )
+    past, given = masked.inputs[:, :-1], (actions_BTU, embodiment_B, hidden)
+    if masking.own_past:
+        share, rounds = masking.own_past, masking.own_past_rounds
+        past = draw_own_past(model, past, *given, share=share, rounds=rounds, key_B=key_B, **options)
+    if masking.displaced_past:
+        past = displace_patches(past, masking.displaced_past, fold_in_each(key_B, Tag.DISPLACED_PAST))
+    inputs, unknown = masked.inputs[:, FIRST_PREDICTED:], masked.masked[:, FIRST_PREDICTED:]
+    return teacher_forced_pass(model, past, inputs, unknown, *given, **options)
 
 
 def bidirectional_mask(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
