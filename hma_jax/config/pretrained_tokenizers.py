@@ -15,27 +15,6 @@ from hma_jax.config.execution import Dtype
 from hma_jax.config.tokenizer import ImageSize, TokenGrid, TokenizerConfig
 
 
-class Ids(TokenGrid):
-    """Tokens are ids of `bits` binary channels, split evenly into `factors`."""
-
-    bits: int
-    factors: int
-
-    @property
-    def token_channels(self) -> int:
-        return 0
-
-    @property
-    def factor_vocab(self) -> int:
-        """V: entries per factor."""
-        return 2 ** (self.bits // self.factors)
-
-    @property
-    def vocab_size(self) -> int:
-        """V^Q."""
-        return 2**self.bits
-
-
 class Latents(TokenGrid):
     """Tokens are `patch` x `patch` cells of `cell_channels` values each, flattened row by row."""
 
@@ -55,11 +34,12 @@ class Latents(TokenGrid):
 
 
 @dataclass(frozen=True)
-class Magvit2Config(Ids):
+class Magvit2Config(TokenGrid):
     """The MAGVIT2 image tokenizer of 1X, and of Open-MAGVIT2 without adaptive normalisation; defaults are the one that
     1X published (2^18 codes).
 
-    Reference appendix A. Every level but the last halves the image.
+    Reference appendix A. Every level but the last halves the image. Tokens are ids of `bits` binary channels, split
+    evenly into `factors`.
     """
 
     kind: Literal["magvit2"] = "magvit2"
@@ -89,6 +69,20 @@ class Magvit2Config(Ids):
     @property
     def token_size(self) -> int:
         return 2 ** (len(self.multipliers) - 1)
+
+    @property
+    def token_channels(self) -> int:
+        return 0
+
+    @property
+    def factor_vocab(self) -> int:
+        """V: entries per factor."""
+        return 2 ** (self.bits // self.factors)
+
+    @property
+    def vocab_size(self) -> int:
+        """V^Q."""
+        return 2**self.bits
 
 
 @dataclass(frozen=True)
