@@ -165,6 +165,11 @@ class ModelConfig:
         return (self.tokens, self.diffusion.token_channels) if self.diffusion else (self.tokens,)
 
     @property
+    def frame_dtype(self) -> Literal["int32", "float32"]:
+        """Type of ids, or of latents."""
+        return "float32" if self.diffusion else "int32"
+
+    @property
     def position_slots(self) -> int:
         """Position embeddings kept per frame. As released there are some for latent cells that
         patches never reach, and for action tokens whether or not there are any."""

@@ -88,9 +88,9 @@ def generate_function(
 
 def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """The inputs after the weights, in order."""
-    b, kind = config.batch, jnp.float32 if model.diffusion else jnp.int32
+    b = config.batch
     return {
-        "prompt": jax.ShapeDtypeStruct((b, config.prompt, *model.frame_shape), kind),
+        "prompt": jax.ShapeDtypeStruct((b, config.prompt, *model.frame_shape), model.frame_dtype),
         "actions": jax.ShapeDtypeStruct((b, config.frames, table.action_width), jnp.float32),
         "embodiment": jax.ShapeDtypeStruct((b,), jnp.int32),
         "key": jax.ShapeDtypeStruct((2,), jnp.uint32),

@@ -31,8 +31,7 @@ class Frame(NamedTuple):
 
 def blank_frame(config: ModelConfig, batch: int) -> Frame:
     """A wholly masked frame."""
-    dtype = jnp.float32 if config.diffusion else jnp.int32
-    return Frame(jnp.zeros((batch, *config.frame_shape), dtype), jnp.ones((batch, config.tokens), bool))
+    return Frame(jnp.zeros((batch, *config.frame_shape), config.frame_dtype), jnp.ones((batch, config.tokens), bool))
 
 
 def cosine_schedule(progress: float) -> float:

@@ -52,9 +52,9 @@ def _has_values(array: Array) -> bool:
 
 def as_frames(config: ModelConfig, frames: Array) -> Array:
     """Ids as int32, latents as float32, as generated frames are. Raises ConfigError for other kinds of numbers."""
-    kind, dtype = (jnp.floating, jnp.float32) if config.diffusion else (jnp.integer, jnp.int32)
-    require(jnp.issubdtype(frames.dtype, kind), f"this model's frames are {dtype.__name__}, got {frames.dtype}")
-    return frames.astype(dtype)
+    kind = jnp.floating if config.diffusion else jnp.integer
+    require(jnp.issubdtype(frames.dtype, kind), f"this model's frames are {config.frame_dtype}, got {frames.dtype}")
+    return frames.astype(config.frame_dtype)
 
 
 def checked_window(

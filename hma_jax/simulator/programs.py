@@ -73,22 +73,20 @@ class Programs:
         def to_images(weights: ProgramParams, tokens: jax.Array) -> jax.Array:
             return tokenizer.decode_uint8_fn(weights.tokenizer, tokens)
 
-        def fresh(weights: ProgramParams, tokens: jax.Array, at: ResetInputs) -> Episodes:
-            chunks, robots = jnp.asarray(at.chunks), jnp.asarray(at.robots)
-            given, counts = jnp.asarray(at.given), jnp.asarray(at.counts)
-            return start_each(declared.merge(weights.model), tokens, chunks, robots, given, counts, hidden=hidden)
+        def fresh(weights: ProgramParams, at: ResetInputs) -> Episodes:
+            hma = declared.merge(weights.model)
+            return start_each(hma, at.frames, at.chunks, at.robots, at.given, at.counts, hidden=hidden)
 
         def reset_from_tokens(weights: ProgramParams, state: Episodes, at: ResetInputs) -> tuple[Episodes, jax.Array]:
-            tokens = jnp.asarray(at.frames)
-            newest = jnp.take_along_axis(tokens, at.given.reshape(-1, *(1,) * (tokens.ndim - 1)) - 1, axis=1)[:, 0]
-            return put(state, at.rows, fresh(weights, tokens, at)), to_images(weights, newest)
+            last = at.given.reshape(-1, *(1,) * (at.frames.ndim - 1)) - 1
+            newest = jnp.take_along_axis(at.frames, last, axis=1)[:, 0]
+            return put(state, at.rows, fresh(weights, at)), to_images(weights, newest)
 
         def reset_from_images(
             weights: ProgramParams, state: Episodes, at: ResetInputs
         ) -> tuple[Episodes, jax.Array, jax.Array]:
-            images = jnp.asarray(at.frames)
-            tokens = tokenizer.encode_fn(weights.tokenizer, images.reshape(-1, *images.shape[2:]))
-            tokens = tokens.reshape(*images.shape[:2], *tokens.shape[1:])
+            tokens = tokenizer.encode_fn(weights.tokenizer, at.frames.reshape(-1, *at.frames.shape[2:]))
+            tokens = tokens.reshape(*at.frames.shape[:2], *tokens.shape[1:])
             state, seen = reset_from_tokens(weights, state, at._replace(frames=tokens))
             return state, tokens, seen
 
@@ -105,15 +103,9 @@ class Programs:
         self.reset_from_tokens = jax.jit(reset_from_tokens, donate_argnums=1)
         self.advance = jax.jit(advance, donate_argnums=1)
         self.take = jax.jit(take)  # of all rows in order: a copy
-        self.token_shape = (tokenizer.tokens, tokenizer.channels) if tokenizer.channels else (tokenizer.tokens,)
-        described = jax.ShapeDtypeStruct
-        empty = ResetInputs(
-            described((episodes,), jnp.int32),
-            described((episodes, capacity, *self.token_shape), jnp.float32 if tokenizer.channels else jnp.int32),
-            described((episodes, capacity - 1, model.table.action_width), jnp.float32),
-            *[described((episodes,), jnp.int32)] * 3,
-        )
-        self._shapes = jax.eval_shape(lambda weights, at: fresh(weights, at.frames, at), self.weights, empty)
+        frame = model.config.frame_shape, model.config.frame_dtype
+        blank = ResetInputs.empty(range(episodes), capacity, model.table.action_width, *frame)
+        self._shapes = jax.eval_shape(fresh, self.weights, blank)
 
     def empty(self) -> Episodes:
         """The state before any episode has begun, on the device of the weights: programs return it there, and would be

@@ -364,7 +364,7 @@ class Simulator:
         which = chosen_episodes(episodes, len(self))
         if not which:
             return self.images
-        at = self._reset_inputs(which, self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
+        at = self._reset_inputs(which, self.model.config.frame_shape, self.model.config.frame_dtype)
         new: dict[int, Episode] = {}
         for b in which:
             max_rewind = self.max_rewind(b)

@@ -103,7 +103,7 @@ def test_what_advances_any_number_of_episodes_was_compiled_before(monkeypatch):
 
     def recorded(weights, state, rows_n, chunk_nU, seed_n):
         asked.add((rows_n is None, len(chunk_nU)))
-        frames = np.zeros((len(chunk_nU), *sim._programs.token_shape), np.int32)
+        frames = np.zeros((len(chunk_nU), *sim.model.config.frame_shape), np.int32)
         return state, frames, np.zeros((len(chunk_nU), *sim.images.shape[1:]), np.uint8)
 
     monkeypatch.setattr(sim._programs, "advance", recorded)
