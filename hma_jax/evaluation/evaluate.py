@@ -33,7 +33,7 @@ from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh, mesh_sizes
 from hma_jax.runtime.processes import broadcast_from_writer, compiled_by_all
 from hma_jax.runtime.rows import lay_out
-from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain, replicated
+from hma_jax.runtime.sharding import BATCH, batch_sharding, batch_ways, constrain, replicated
 
 T = TypeVar("T")
 REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
@@ -113,7 +113,7 @@ def evaluate(
             missing = [name for name in (*REQUIRED_ARRAYS, "dataset", "valid") if name not in batch]
             require(not missing, f"a batch to evaluate lacks {', '.join(missing)}")
             require_known(model, table, *(np.asarray(batch[name]) for name in ("tokens", "actions", "embodiment")))
-            groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, devices_per_batch(mesh))
+            groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, batch_ways(mesh))
             _check_lengths(batch, config, setting)
             robots = np.asarray(batch["embodiment"])
             given = {"action_mean": means[robots], "action_std": stds[robots]} | batch
@@ -193,7 +193,7 @@ def make_evaluator(
         return metrics | compared | {"finite": metrics["finite"] & compared["finite"]}, predicted
 
     def evaluate_batch(params: Params, metric_params: MetricParams, units: ActionUnits, batch: dict[str, jax.Array]):
-        groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, devices_per_batch(mesh))
+        groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, batch_ways(mesh))
         return in_groups(lambda rows: evaluate_group(params, metric_params, units, rows), batch, groups)
 
     return jax.jit(evaluate_batch, out_shardings=replicated(mesh))
@@ -239,27 +239,17 @@ def _sample(batch: dict[str, Any], predicted: Predicted, row: int) -> Sample:
         # Fetched whole: a row that is picked on the devices would wait for the next batch.
         return hold_last_frame(np.asarray(clips)[row], real)
 
-    return Sample(
-        images=held(batch["images"]),
-        tokens=held(predicted.tokens),
-        random=None if predicted.random is None else held(predicted.random),
-        **(
-            {"other": held(predicted.other), "other_images": held(batch["other_images"])}
-            if predicted.other is not None and batch["other_seen"][row]
-            else {}
-        ),
-    )
+    random = None if predicted.random is None else held(predicted.random)
+    sample = Sample(held(batch["images"]), held(predicted.tokens), random)
+    if predicted.other is None or not batch["other_seen"][row]:
+        return sample
+    return sample._replace(other=held(predicted.other), other_images=held(batch["other_images"]))
 
 
 def hold_last_frame(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
     """The last n frames of a window of len(real) frames, [n, ...], with padding replaced by the last real frame."""
     first = len(real) - len(clip)
     return clip[np.minimum(np.arange(len(clip)), int(real.sum()) - 1 - first)]
-
-
-def devices_per_batch(mesh: Mesh) -> int:
-    """How many devices a batch is split over."""
-    return int(np.prod([mesh.shape[axis] for axis in BATCH]))
 
 
 def plan_groups(rows: int, at_once: int, ways: int) -> tuple[int, int]:
@@ -294,7 +284,7 @@ def _on_each_device(function: Callable[..., Any], mesh: Mesh) -> Callable[..., A
 
     The compiler would not split loops over pieces of a batch by itself.
     """
-    if devices_per_batch(mesh) == 1:
+    if batch_ways(mesh) == 1:
         return function
     whole, rows = PartitionSpec(), PartitionSpec(BATCH)
     return jax.shard_map(function, mesh=mesh, in_specs=(whole, rows, rows), out_specs=rows)

@@ -164,7 +164,7 @@ def _free_batch_axes(storage: PartitionSpec) -> tuple[str, ...]:
 
 
 def _few(robots: int, robot_row_B: jax.Array) -> bool:
-    return robots * batch_ways() <= len(robot_row_B)
+    return robots * batch_ways(jax.sharding.get_abstract_mesh()) <= len(robot_row_B)
 
 
 CHUNK = 32

@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from hma_jax.config import MeshConfig, require
 from hma_jax.runtime.mesh import make_mesh
-from hma_jax.runtime.sharding import batch_sharding, place
+from hma_jax.runtime.sharding import batch_sharding, batch_ways, place
 
 
 def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:
@@ -22,7 +22,7 @@ def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:
     mesh = make_mesh(mesh) if isinstance(mesh, MeshConfig) else mesh
     if jax.process_count() == 1:
         return np.arange(batch)
-    ways = mesh.shape["data"] * mesh.shape["fsdp"]
+    ways = batch_ways(mesh)
     require(
         batch % ways == 0,
         f"loader.batch {batch} cannot be divided over the {ways} devices of mesh.data x mesh.fsdp; change one of them",
