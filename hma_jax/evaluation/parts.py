@@ -17,7 +17,7 @@ import numpy as np
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.images import Sample
-from hma_jax.evaluation.windows import WindowTable
+from hma_jax.evaluation.windows import COLUMNS, WindowTable
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.runtime.files import write_file
 
@@ -43,15 +43,9 @@ class Parts:
     else are removed.
     """
 
-    def __init__(
-        self,
-        directory: Path,
-        made_from: Callable[[], Any],
-        every: float = SAVE_SECONDS,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        self.directory, self._every, self._clock = directory, every, clock
-        self._made_from, self._waiting, self._saved = made_from, dict[int, Part](), clock()
+    def __init__(self, directory: Path, made_from: Callable[[], Any], every: float = SAVE_SECONDS):
+        self.directory, self._every, self._made_from = directory, every, made_from
+        self._waiting, self._saved = dict[int, Part](), time.monotonic()
         if directory.exists() and self._stamp() != stable_hash(made_from()):
             self.remove()
 
@@ -70,12 +64,12 @@ class Parts:
     def add(self, n: int, part: Part) -> None:
         """Keeps what batch n gave. Raises OSError if it cannot be written."""
         self._waiting[n] = part
-        if self._clock() - self._saved >= self._every:
+        if time.monotonic() - self._saved >= self._every:
             self.directory.mkdir(parents=True, exist_ok=True)
             write_file(self.directory / STAMP, stable_hash(self._made_from()))
             for number, waiting in self._waiting.items():
                 write_arrays(self.directory / f"{number}.npz", _to_arrays(waiting))
-            self._waiting, self._saved = {}, self._clock()
+            self._waiting, self._saved = {}, time.monotonic()
 
     def remove(self) -> None:
         shutil.rmtree(self.directory, ignore_errors=True)
@@ -85,9 +79,6 @@ class Parts:
             return (self.directory / STAMP).read_text()
         except OSError:
             return ""
-
-
-COLUMNS = ("dataset", "episode", "start", "frames")
 
 
 def _to_arrays(part: Part) -> dict[str, np.ndarray]:

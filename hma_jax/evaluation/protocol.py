@@ -268,11 +268,10 @@ def _likelihood(
     """Per window [B]: how well the predictions `out` fit the true tokens, and whether the loss is `finite`. DIFFERS:
     accuracy is that of the likeliest ids of the wholly masked frame; the release's is that of the ids after all
     unmasking steps (reference section 6.3)."""
+    loss = window_loss(model, out, truth, key_B, real_BT)
     if model.config.diffusion:
-        loss = window_loss(model, out, truth, key_B, real_BT)
         return {"diffusion_loss": loss, "finite": jnp.isfinite(loss)}
     guess = compose(model.frame_head.decode_factors(out, choose_likeliest)[0], model.config.factor_vocab)
-    loss = window_loss(model, out, truth, None, real_BT)
     accuracy = mean_over_frames((guess == truth).astype(jnp.float32), real_BT)
     return {"cross_entropy": loss, "accuracy": accuracy, "finite": jnp.isfinite(loss)}
 

@@ -36,6 +36,9 @@ FILE = "windows.parquet"
 LEGACY_FILE = "windows.csv.gz"
 """What earlier versions wrote."""
 
+COLUMNS = ("dataset", "episode", "start", "frames")
+"""Fields of a `WindowTable` besides its metrics."""
+
 
 @dataclass(frozen=True)
 class WindowTable:
@@ -48,8 +51,7 @@ class WindowTable:
     metrics: Mapping[str, np.ndarray]  # float64
 
     def __post_init__(self):
-        named = (self.dataset, self.episode, self.start, self.frames)
-        lengths = {len(column) for column in (*named, *self.metrics.values())}
+        lengths = {len(column) for column in (*(getattr(self, name) for name in COLUMNS), *self.metrics.values())}
         require(len(lengths) == 1, f"the columns of a table of windows differ in length: {sorted(lengths)}")
 
     def __len__(self) -> int:
@@ -83,7 +85,7 @@ class WindowTable:
 
     def rows(self, index: np.ndarray) -> WindowTable:
         metrics = {name: column[index] for name, column in self.metrics.items()}
-        return WindowTable(self.dataset[index], self.episode[index], self.start[index], self.frames[index], metrics)
+        return WindowTable(*(getattr(self, name)[index] for name in COLUMNS), metrics)
 
     def has_windows_of(self, other: WindowTable) -> bool:
         """Whether it has exactly the windows of `other`, in the same order, and none twice."""
@@ -207,6 +209,6 @@ def _first_twice(names: Sequence[tuple[str, int, int]]) -> tuple[str, int, int] 
 def join(tables: Sequence[WindowTable]) -> WindowTable:
     """One table after the other. Raises ConfigError if there is none."""
     require(len(tables) > 0, "the evaluation has no windows; freeze windows of other datasets")
-    columns = (np.concatenate([getattr(t, name) for t in tables]) for name in ("dataset", "episode", "start", "frames"))
+    columns = (np.concatenate([getattr(t, name) for t in tables]) for name in COLUMNS)
     metrics = {m: np.concatenate([t.metrics[m] for t in tables]) for m in tables[0].metrics}
     return WindowTable(*columns, metrics)

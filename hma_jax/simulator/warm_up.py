@@ -38,14 +38,13 @@ def warm_up(
 def warm_up_more(
     simulator: Simulator,
     above: int,
-    most: int | None = None,
     ended: Callable[[], bool] = lambda: False,
     reached: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Compiles advancing more than `above` episodes at once, up to `most` (default: all), until `ended()`; from any
-    thread. Calls `reached` with each number that is ready."""
+    """Compiles advancing more than `above` episodes at once, up to all, until `ended()`; from any thread. Calls
+    `reached` with each number that is ready."""
     for together in sizes(len(simulator)):
-        if above < together <= (most or len(simulator)) and not ended():
+        if above < together and not ended():
             simulator.compile(together)
             reached(together)
 

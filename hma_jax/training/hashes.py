@@ -46,7 +46,7 @@ class ReadError(OSError):
         )
 
 
-def hash_files(checkpoint: Path, chosen: Chosen = lambda name: True) -> list[Row]:
+def hash_files(checkpoint: Path, chosen: Chosen) -> list[Row]:
     """A row for each of the `chosen` files under `checkpoint`."""
     files = [(name, path) for name, path in _files(checkpoint) if chosen(name)]
     return _in_threads(lambda file: [file[0], file[1].stat().st_size, _sha256(file[1])], files)
