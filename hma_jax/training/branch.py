@@ -109,7 +109,7 @@ def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
 
 def read_branchings(run_dir: Path) -> list[dict[str, Any]]:
     """The branchings that led to a run, the last one last; empty for a run that was not branched. Raises ConfigError
-    for a damaged file."""
+    for a damaged file, and for a branch without a checkpoint."""
     path = run_dir / FILE
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -120,4 +120,9 @@ def read_branchings(run_dir: Path) -> list[dict[str, Any]]:
         return []
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(f"{path} is damaged ({error}); remove the run and branch it again") from error
+    require(
+        not found or has_checkpoint(run_dir),
+        f"{run_dir} was branched from another run, but its copy of a checkpoint is not complete or was removed; "
+        "remove the directory, and branch again",
+    )
     return found

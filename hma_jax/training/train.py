@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -91,24 +91,11 @@ def train_model(
 
     branched = branch.read_branchings(Path(run_dir))
     if branched:
-        require(
-            branch.has_checkpoint(Path(run_dir)),
-            f"{run_dir} was branched from another run, but its copy of a checkpoint is not complete or was removed; "
-            "remove the directory, and branch again",
-        )
         provenance = provenance | {"branched": branched}
 
     with jax.set_mesh(device_mesh):
         step = _jitted_step(make_train_step, model, program_table, replace(config, seed=0), execution, device_mesh)
         seed = jax.device_put(jax.random.key_data(key_of(config.seed)), replicated(device_mesh))
-
-        def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
-            """A run may be resumed with more or fewer steps from a step at which the learning rate did not depend on
-            their number, unless it has taken more already; a branch, at the step of its branching, with much else."""
-            if branched and step == branched[-1]["step"] <= config.steps:
-                return branch.MAY_CHANGE
-            same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
-            return ("train.steps",) if step <= min(same, config.steps) else ()
 
         def load(checkpoint: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
             if not config.only:
@@ -128,12 +115,24 @@ def train_model(
                 options,
                 flops_per_step=train_flops_per_step(model, table, config),
                 peak_flops=peak_flops(execution.dtype),
-                may_change=extendable,
+                may_change=partial(_may_change, config, branched),
             ),
             validation=validation
             and make_validation_hook(validation, model, program_table, config.masking, execution, put),
             progress=progress,
         )
+
+
+def _may_change(
+    config: TrainConfig, branched: list[dict[str, Any]], saved: dict[str, Any], step: int
+) -> tuple[str, ...]:
+    """What may differ when a run resumes, as `LoopOptions.may_change`: more or fewer steps from a step at which the
+    learning rate did not depend on their number, unless it has taken more already; for a branch, at the step of its
+    branching, much else."""
+    if branched and step == branched[-1]["step"] <= config.steps:
+        return branch.MAY_CHANGE
+    same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
+    return ("train.steps",) if step <= min(same, config.steps) else ()
 
 
 def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, table: EmbodimentTable) -> None:
