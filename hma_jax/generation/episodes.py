@@ -6,7 +6,6 @@ the others. The computation is `session`'s for one example, under `jax.vmap`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TypeVar
 
 import jax
@@ -45,17 +44,12 @@ def start_each(
         capacity = session.cache.capacity
         # Attention is causal: no frame that is kept attended to the arbitrary ones after it.
         cache = session.cache._replace(valid=jnp.arange(capacity) < given - 1)
-        # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it.
-        turned = [jnp.roll(x, count - given, axis=axis) for x, axis in _slots(cache)]
-        cache = jax.tree.unflatten(jax.tree.structure(cache), turned)
+        # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it. `valid` is [T - 1], the other
+        # arrays are [N, B, T - 1, ...].
+        cache = jax.tree.map(lambda x: jnp.roll(x, count - given, axis=0 if x.ndim == 1 else 2), cache)
         return session._replace(cache=cache, count=count)
 
     return jax.vmap(one)(frames, chunks_BTU, embodiment_B, given_B, count_B)
-
-
-def _slots(cache: object) -> Sequence[tuple[jax.Array, int]]:
-    """Every array of a cache and its axis of slots: `valid` is [capacity], the others are [N, B, capacity, ...]."""
-    return [(x, 0 if x.ndim == 1 else 2) for x in jax.tree.leaves(cache)]
 
 
 def advance_each(

@@ -28,7 +28,7 @@ class Stem(nnx.Module):
         def first_layer(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
             # Each robot's slice has the fan-in of its own chunk. Rows of padding are zero and
             # stay so, because padded inputs are zero.
-            chunk_E = np.array([entry.chunk for entry in table.entries])[:, None, None]
+            chunk_E = table.chunks[:, None, None]
             own = np.arange(shape[1])[:, None] < chunk_E
             bound = config.stem_gain * np.sqrt(6 / (chunk_E + input_fan_out(config)))
             return uniform(rng, shape, np.where(own, bound, 0.0))
