@@ -32,7 +32,7 @@ from hma_jax.model.params import Params, inference_params, require_params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh, mesh_sizes
 from hma_jax.runtime.processes import broadcast_from_writer, compiled_by_all
-from hma_jax.runtime.rows import lay_out
+from hma_jax.runtime.rows import lay_out, split_rows
 from hma_jax.runtime.sharding import BATCH, batch_sharding, batch_ways, constrain, replicated
 
 T = TypeVar("T")
@@ -259,14 +259,11 @@ def plan_groups(rows: int, at_once: int, ways: int) -> tuple[int, int]:
 
 
 def in_groups(function: Callable[[Any], Any], batch: Any, groups: int) -> Any:
-    """`function`, which maps rows to rows, over groups of a batch's rows, one group after the other.
-
-    Group g has rows g, g + groups, ...: every device keeps the rows it has.
-    """
+    """`function`, which maps rows to rows, over groups of a batch's rows (`split_rows`), one group after the other."""
     if groups == 1:
         return function(batch)
-    split = jax.tree.map(lambda x: rearrange(x, "(b g) ... -> g b ...", g=groups), batch)
-    return jax.tree.map(lambda x: rearrange(x, "g b ... -> (b g) ..."), jax.lax.map(function, split))
+    found = jax.lax.map(function, split_rows(batch, groups))
+    return jax.tree.map(lambda x: rearrange(x, "g b ... -> (b g) ..."), found)
 
 
 def one_ahead(items: Iterable[T]) -> Iterator[T]:

@@ -70,11 +70,9 @@ class Window(NamedTuple):
         """The cache of finished frames [B, T', S (, C)] at the first positions, with `capacity` slots in all."""
         batch, count = frames.shape[:2]
         cache = self.empty(batch, capacity)
-        return (
-            cache.write(self._pass(frames, None, 0, cache_frames=count, predict_from=count).cache, 0)
-            if count
-            else cache
-        )
+        if not count:
+            return cache
+        return cache.write(self._pass(frames, None, 0, cache_frames=count, predict_from=count).cache, 0)
 
     def query(self, cache: FrameCache, last: jax.Array, frame: Frame, at: int | jax.Array) -> jax.Array:
         """Predictions [B, S, ...] for a partly masked frame at position `at`, after frame `last` [B, S (, C)]."""

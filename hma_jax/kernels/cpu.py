@@ -52,8 +52,7 @@ def _backward(scale: float, saved: tuple[jax.Array, ...], dy: jax.Array) -> tupl
     qkv, y, log_sum = saved
     # Mean of each row of dweights weighted by its attention weights, which equals dy.y.
     delta = jnp.swapaxes(sum_over(dy.astype(jnp.float32) * y.astype(jnp.float32), -1)[..., 0], -1, -2)
-    flat = (qkv, dy, delta)
-    frames, dy, delta = (x.reshape(-1, *x.shape[2:]) for x in flat)
+    frames, dy, delta = (x.reshape(-1, *x.shape[2:]) for x in (qkv, dy, delta))
     dqkv = jax.lax.map(partial(_in_head_groups, partial(_attend_backward, scale)), (frames, dy, log_sum, delta))
     return (dqkv.reshape(qkv.shape),)
 

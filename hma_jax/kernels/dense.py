@@ -24,12 +24,6 @@ def contract(x: jax.Array, w: jax.Array, axes: int = 1, dtype: jnp.dtype | None 
     return jnp.tensordot(x, w, axes, preferred_element_type=dtype)
 
 
-def _contract_forward(
-    x: jax.Array, w: jax.Array, axes: int, dtype: jnp.dtype | None
-) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return contract(x, w, axes, dtype), (x, w)
-
-
 def _contract_backward(
     axes: int, dtype: jnp.dtype | None, saved: tuple[jax.Array, jax.Array], dy: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -45,7 +39,7 @@ def _contract_backward(
     return dx, dw.reshape(w.shape)
 
 
-contract.defvjp(_contract_forward, _contract_backward)
+contract.defvjp(lambda *args: (contract(*args), args[:2]), _contract_backward)
 
 
 def _product_over_rows(x: jax.Array, dy: jax.Array) -> jax.Array:
@@ -98,7 +92,7 @@ def per_robot(x: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layou
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _per_robot(x_Bni: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+def _per_robot(x_Bni: jax.Array, w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None) -> jax.Array:
     return jnp.einsum("bri,bio->bro", x_Bni, _to_examples(w, robot_row_B, layouts))
 
 
@@ -115,7 +109,7 @@ _per_robot.defvjp(lambda *args: (_per_robot(*args), args[:3]), _per_robot_backwa
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
-def take_by_robot(w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+def take_by_robot(w: jax.Array, robot_row_B: jax.Array, layouts: Layouts | None) -> jax.Array:
     """w [E, ...] -> [B, ...]: each example's own slice. `layouts` are those of w on a mesh."""
     return _to_examples(w, robot_row_B, layouts)
 

@@ -1,4 +1,5 @@
-"""Which rows of a global batch a process holds, and host arrays laid out over devices of many processes."""
+"""Which rows of a global batch a process holds, how rows are split, and host arrays laid out over devices of many
+processes."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from einops import rearrange
 from jax.sharding import Mesh
 
 from hma_jax.config import MeshConfig, require
@@ -29,6 +31,12 @@ def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:
     )
     parts = batch_sharding(mesh).addressable_devices_indices_map((batch,)).values()
     return np.unique(np.concatenate([np.arange(batch)[index] for index in parts]))
+
+
+def split_rows(batch: Any, parts: int) -> Any:
+    """Rows [B, ...] of each array as [n, B / n, ...]: part i takes rows i, i + n, ..., so that every device keeps the
+    rows it has."""
+    return jax.tree.map(lambda x: rearrange(x, "(b n) ... -> n b ...", n=parts), batch)
 
 
 def lay_out(tree: Any, shardings: Any) -> Any:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from einops import rearrange
 
 from hma_jax.config import MaskingConfig, ModelConfig, TrainConfig, check_micro_batches, check_objective, require
 from hma_jax.config.training import ActionLeak
@@ -18,6 +16,7 @@ from hma_jax.model.hma import HMA
 from hma_jax.model.params import Declared, Params, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import Masked, mask_batch
+from hma_jax.runtime.rows import split_rows
 from hma_jax.training import active_robots
 from hma_jax.training.average import update_average
 from hma_jax.training.optimizer import (
@@ -131,7 +130,7 @@ def make_gradient(
     def gradient(params: Params, rows: Batch, counts: TargetCounts) -> tuple[Params, LossSums]:
         if accumulate == 1:
             return one_pass(params, rows, counts)
-        micro = micro_batches(rows, accumulate)
+        micro = split_rows(rows, accumulate)
         zero = jax.tree.map(jnp.zeros_like, params)
 
         def body(carry: tuple[Params, LossSums], one: Batch) -> tuple[tuple[Params, LossSums], None]:
@@ -158,12 +157,6 @@ def check_step(
     check_targets(learning, config.masking)
     if config.only:
         check_own(learning, config.masking)
-
-
-def micro_batches(batch: Any, accumulate: int) -> Any:
-    """Rows [B, ...] as [A, B / A, ...]: micro-batch a takes rows a, a + A, ..., so that every device keeps the rows it
-    has."""
-    return jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=accumulate), batch)
 
 
 def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:

@@ -20,10 +20,11 @@ from hma_jax.model.params import Declared, Params
 from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
 from hma_jax.runtime.processes import compiled_by_all
+from hma_jax.runtime.rows import split_rows
 from hma_jax.runtime.sharding import replicated
 from hma_jax.training.loop import ValidationHook
 from hma_jax.training.state import TrainState
-from hma_jax.training.step import TRAINING_ARRAYS, micro_batches
+from hma_jax.training.step import TRAINING_ARRAYS
 
 SEED = 0
 """Seed of masks and noise, the same for every run, so that runs with the same masking can be compared."""
@@ -126,7 +127,7 @@ def make_sums(
             found = of_rows(rows)
         else:
             check_micro_batches(len(valid_B), accumulate)
-            found = jax.tree.map(jnp.sum, jax.lax.map(of_rows, micro_batches(rows, accumulate)))
+            found = jax.tree.map(jnp.sum, jax.lax.map(of_rows, split_rows(rows, accumulate)))
         return found, TargetCounts(jnp.sum(masked.targets_TS), jnp.sum(masked.action_targets_T))
 
     return sums
