@@ -44,27 +44,18 @@ def window_keys(
     return jax.vmap(one)(name_E[embodiment_B], episode_B, start_B)
 
 
-def random_actions(
-    key_B: jax.Array,
-    embodiment_B: jax.Array,
-    table: EmbodimentTable,
-    draws: int,
-    frames: int,
-    statistics: tuple[jax.Array, jax.Array] | None = None,
-) -> jax.Array:
-    """[B, draws, T = frames, U]: N(mean, std) of each robot's own actions; 0 in the padding.
+def random_actions(key_B: jax.Array, statistics: tuple[jax.Array, jax.Array], draws: int, frames: int) -> jax.Array:
+    """[B, draws, T = frames, U]: N(mean, std) by `statistics` (mean, std), float32 [B, U] each, both 0 in the padding.
 
-    `statistics` (mean, std), float32 [B, U] each, should be of all recorded actions: a table's may be of the training
-    subset only. None: the table's.
+    They should be of all recorded actions: a table's may be of the training subset only.
 
     Every value of a chunk has a key of its own: a wider robot in the table adds keys and changes none.
     Bit for bit the same in batches of any shape.
     """
-
+    mean_BU, std_BU = statistics
     of_window = jax.vmap(jax.random.fold_in, (None, 0))
-    key_BU = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
+    key_BU = jax.vmap(of_window, (0, None))(key_B, jnp.arange(mean_BU.shape[1]))
     noise = jnp.moveaxis(draw_flat(_normal, key_BU, (draws, frames)), 1, -1)
-    mean_BU, std_BU = statistics or table_statistics(embodiment_B, table)
     # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
     from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)
     return mean_BU[:, None, None] + from_mean

@@ -101,8 +101,7 @@ def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) 
     which differ from them from the first chunk that leads to a predicted frame."""
     actions, frames, first_free = batch["actions"], batch["actions"].shape[1], config.first_predicted - 1
     key_B = keys_of(batch, "actions", table, config)
-    statistics = action_statistics(batch, table)
-    other = random_actions(key_B, batch["embodiment"], table, config.random_actions, frames, statistics)
+    other = random_actions(key_B, action_statistics(batch, table), config.random_actions, frames)
     other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
     decoding_B = keys_of(batch, "decoding", table, config)
     return jnp.concatenate([actions[:, None], other], axis=1), decoding_B
@@ -160,14 +159,13 @@ def make_predictor(
         if predicts_frames(setting):
             metrics, predicted = _frame_metrics(hma, window, batch, table, config, setting)
         if predicts_actions(model, setting):
-            statistics = action_statistics(batch, table)
             errors = _policy_errors(
                 hma,
                 window,
                 keys_of(batch, "policy", table, config),
                 config,
                 causally=setting != "inverse",
-                statistics=statistics,
+                statistics=action_statistics(batch, table),
                 real_BT=real_window,
             )
             metrics |= errors | {"finite": metrics["finite"] & errors["finite"]}

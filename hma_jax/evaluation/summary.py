@@ -12,7 +12,6 @@ import numpy as np
 from hma_jax.config import require
 from hma_jax.evaluation.controllability import OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import (
-    Clusters,
     Estimate,
     Stat,
     clusters_of,
@@ -70,7 +69,7 @@ def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
         own = windows.of(name)
         clusters = clusters_of(own.episode)
         found[name] = {m: stat_of(e, clusters) for m, e in _estimates(own, perplexity_group).items()}
-        found[name] |= _of_some(own, own.metrics, clusters)
+        found[name] |= _of_some(own, own.metrics)
     return Summary(found)
 
 
@@ -92,7 +91,7 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
             m: stat_of(e.minus(estimates_b[m]), clusters) for m, e in estimates_a.items() if m in estimates_b
         }
         both = [m for m in OPTIONAL_METRICS if m in own_a.metrics and m in own_b.metrics]
-        found[name] |= _of_some(own_a, {m: own_a.metrics[m] - own_b.metrics[m] for m in both}, clusters)
+        found[name] |= _of_some(own_a, {m: own_a.metrics[m] - own_b.metrics[m] for m in both})
     return Summary(found)
 
 
@@ -107,14 +106,7 @@ def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimat
     return estimates
 
 
-def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray], clusters: Clusters) -> dict[str, Stat]:
-    """Means of the optional metrics in `columns`, of the windows that have them; `clusters` are those of all
-    windows."""
-    found = {}
-    for metric, column in ((m, columns[m]) for m in OPTIONAL_METRICS if m in columns):
-        there = ~np.isnan(column)
-        if there.all():
-            found[metric] = stat_of(estimate_mean(column), clusters)
-        elif there.any():
-            found[metric] = mean_and_sem(column[there], windows.episode[there])
-    return found
+def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray]) -> dict[str, Stat]:
+    """Means of the optional metrics in `columns`, of the windows that have them."""
+    there = {metric: ~np.isnan(columns[metric]) for metric in OPTIONAL_METRICS if metric in columns}
+    return {m: mean_and_sem(columns[m][some], windows.episode[some]) for m, some in there.items() if some.any()}

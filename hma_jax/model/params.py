@@ -91,8 +91,8 @@ def param(
     No array is made here: `Declared.init` makes them all.
     """
     require(len(shape) == len(axes), f"a parameter of shape {shape} needs {len(shape)} axes, got {axes}")
-    about = {"axes": axes, "init": init, "role": role, "decay": decay, "use": "always", "precise": precise}
-    return nnx.Param(jax.ShapeDtypeStruct(shape, jnp.float32), **about, matrix=matrix)
+    about = {"axes": axes, "init": init, "role": role, "decay": decay, "precise": precise, "matrix": matrix}
+    return nnx.Param(jax.ShapeDtypeStruct(shape, jnp.float32), use="always", **about)
 
 
 def bias(shape: tuple[int, ...], axes: tuple[str | None, ...], precise: bool = False) -> nnx.Param:
@@ -288,7 +288,5 @@ def path_name(path: tuple[Any, ...]) -> str:
     return "/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path)
 
 
-def _spec(variable: nnx.Param) -> ParamSpec:
-    shape = tuple(variable.get_value().shape)
-    v = variable
-    return ParamSpec(shape, tuple(v.axes), v.role, v.decay, v.init, v.use, v.precise, v.matrix)
+def _spec(v: nnx.Param) -> ParamSpec:
+    return ParamSpec(v.get_value().shape, v.axes, v.role, v.decay, v.init, v.use, v.precise, v.matrix)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.evaluation.draws import random_actions, window_keys
+from hma_jax.evaluation.draws import random_actions, table_statistics, window_keys
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from tests.tiny import TABLE
 
@@ -16,7 +16,7 @@ def draw(table, robot, episodes, draws=3, frames=6, seed=0):
     def inside(episode):
         robots = jnp.full(len(episode), robot)
         keys = window_keys(seed, "actions", table, robots, episode, jnp.zeros_like(episode))
-        return random_actions(keys, robots, table, draws, frames)
+        return random_actions(keys, table_statistics(robots, table), draws, frames)
 
     return np.asarray(jax.jit(inside)(jnp.asarray(episodes)))
 

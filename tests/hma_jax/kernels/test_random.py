@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import MaskingConfig
-from hma_jax.evaluation.draws import random_actions, window_keys
+from hma_jax.evaluation.draws import random_actions, table_statistics, window_keys
 from hma_jax.kernels.random import draw_flat, key_of
 from hma_jax.objective.losses import draw_noise
 from hma_jax.objective.masking import hide_actions, mask_batch
@@ -36,7 +36,7 @@ def draws() -> list[jax.Array]:
         *masked,
         hide_actions(key, 64, MaskingConfig("policy")),
         *draw_noise(key, (64, 4), 1000),
-        random_actions(windows, batch["embodiment"], TABLE, 2, 3),
+        random_actions(windows, table_statistics(batch["embodiment"], TABLE), 2, 3),
     ]
 
 
