@@ -125,11 +125,16 @@ def is_continuous(config: Mapping[str, Any]) -> bool:
     return any(config.get(name) not in (None, False) for name in ("Diffusion", "diffloss_w", "vae_embed_dim"))
 
 
+def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
+    """With the release's defaults for absent fields."""
+    return {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
+
+
 def _complete(config: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """With the release's defaults for absent fields. Raises ConfigError for those it has none for."""
+    """`_with_defaults`. Raises ConfigError for absent fields that have none, and for counts and lists that are none."""
     missing = [name for name in REQUIRED if config.get(name) is None]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
-    full = {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
+    full = _with_defaults(config)
     for name in ("S", "d_model", *(["patch_size"] if is_continuous(config) else [])):
         require(_is_count(full[name]), f"{where}: {name} must be a positive integer, got {full[name]!r}")
     for name, good in (("action_domains", lambda x: isinstance(x, str)), ("d_actions", _is_count)):
@@ -184,7 +189,7 @@ def _root(vocab: int | None, factors: int, where: str) -> int:
 def read_masking(config: Mapping[str, Any]) -> MaskingConfig:
     """How the release would go on training, but for the hidden actions of the continuous variant
     (`masking.hide_actions`). Raises ConfigError where it would train nothing."""
-    full = {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
+    full = _with_defaults(config)
     fields = {field: full[official] for official, field in MASKING_FIELDS.items()}
     states, actions = (bool(full[f"jointly_predict_{what}"]) for what in ("states", "actions"))
     require(

@@ -99,13 +99,12 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     diffusion = model.config.diffusion
     if diffusion:
         record("conditions", out.token_outputs)
-    else:
-        record("logits", model.logits(out.token_outputs, batch["tokens"]))
-    if diffusion:
         key = key_of(0)
         time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)
         _record_outputs(model.denoiser, "condition", lambda y: record("denoiser condition", y))
         record("denoiser", model.denoiser(noise, time, out.token_outputs))
+    else:
+        record("logits", model.logits(out.token_outputs, batch["tokens"]))
     if model.action_head is not None and out.action_features_BTD is not None:
         args = draw_noise(key, batch["actions"].shape, diffusion.steps)[::-1] if diffusion else ()
         record("actions", model.action_head(*args, out.action_features_BTD, embodiment_B))

@@ -36,17 +36,18 @@ from hma_jax.runtime.rows import lay_out, split_rows
 from hma_jax.runtime.sharding import BATCH, batch_sharding, batch_ways, constrain, replicated
 
 T = TypeVar("T")
+
 REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
 """Arrays of a batch that go to the devices."""
-
-WHOLE = 1 / 8
-"""Parameters that take at most this share of a device's memory are not split along `fsdp` (`evaluation_mesh`)."""
 
 STATISTICS = ("action_mean", "action_std")
 """Further ones, by default the table's."""
 
 OPTIONAL_ARRAYS = ("real", "other_actions", "other_valid", "other_images", "other_seen")
 """Further ones, where a batch has them."""
+
+WHOLE = 1 / 8
+"""Parameters that take at most this share of a device's memory are not split along `fsdp` (`evaluation_mesh`)."""
 
 MetricParams = tuple[Params, Params | None]
 """Parameters that metrics need: of the tokenizer, which decodes tokens to images, and of `lpips` where it is asked

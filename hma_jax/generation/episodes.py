@@ -44,8 +44,8 @@ def start_each(
         capacity = session.cache.capacity
         # Attention is causal: no frame that is kept attended to the arbitrary ones after it.
         cache = session.cache._replace(valid=jnp.arange(capacity) < given - 1)
-        # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it. `valid` is [T - 1], the other
-        # arrays are [N, B, T - 1, ...].
+        # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it. Slots are the only axis of
+        # `valid`, and the third one of all other arrays.
         cache = jax.tree.map(lambda x: jnp.roll(x, count - given, axis=0 if x.ndim == 1 else 2), cache)
         return session._replace(cache=cache, count=count)
 

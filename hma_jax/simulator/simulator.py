@@ -272,13 +272,18 @@ class Simulator:
                 "%s: %s; such actions are clipped (this is said once)", robot.name, robot.describe(beyond, actions)
             )
 
+    def _advance_inputs(self, which: list[int]) -> tuple[list[int], np.ndarray | None, np.ndarray]:
+        """(rows, rows_n, chunk_nU) of the program that advances the episodes `which`: their numbers, padded; the same
+        as its argument, None for all episodes; their chunks, still zeros."""
+        rows = padded(which, len(self))
+        rows_n = None if len(which) == len(self) else np.array(rows, np.int32)
+        return rows, rows_n, np.zeros((len(rows), self.model.table.action_width), np.float32)
+
     def _advance(self, chunks: Mapping[int, np.ndarray]) -> np.ndarray:
-        rows = padded(list(chunks), len(self))
-        chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
+        rows, rows_n, chunk_nU = self._advance_inputs(list(chunks))
         for i, b in enumerate(rows):
             chunk_nU[i, : chunks[b].size] = chunks[b].ravel()
         seeds = np.array([self._running_episode(b).seed for b in rows], np.uint32)
-        rows_n = None if len(chunks) == len(self) else np.array(rows, np.int32)
         with self._donating_state():
             state, tokens, seen = self._programs.advance(self._programs.weights, self._state, rows_n, chunk_nU, seeds)
             tokens, seen = np.asarray(tokens), np.asarray(seen)
@@ -309,9 +314,7 @@ class Simulator:
         require(
             1 <= together <= len(self), f"between 1 and {len(self)} episodes can be stepped together, got {together}"
         )
-        rows = padded(list(range(together)), len(self))
-        rows_n = None if together == len(self) else np.array(rows, np.int32)
-        chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
+        rows, rows_n, chunk_nU = self._advance_inputs(list(range(together)))
         seeds, state = np.zeros(len(rows), np.uint32), self._programs.empty()
         jax.block_until_ready(self._programs.advance(self._programs.weights, state, rows_n, chunk_nU, seeds))
 
