@@ -107,21 +107,10 @@ def make_gradient(
     declared: Declared[HMA], masking: MaskingConfig, accumulate: int
 ) -> Callable[[Params, Batch, TargetCounts], tuple[Params, LossSums]]:
     """gradient(params, rows, counts) -> (gradient of the loss, loss sums) over rows in so many micro-batches; `counts`
-    are the targets of all rows, which are a batch with `masked`, `key` and `slice` as `masked_loss` takes them."""
+    are the targets of all rows, which are as `loss_of_rows` takes them."""
 
     def sums(params: Params, rows: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
-        result = masked_loss(
-            declared.merge(params),
-            rows["masked"],
-            rows["tokens"],
-            rows["actions"],
-            rows["embodiment"],
-            masking,
-            rows["key"],
-            rows["slice"],
-            rows.get("real"),
-            training=True,
-        )
+        result = loss_of_rows(declared.merge(params), rows, masking, training=True)
         loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
         return loss, result
 
@@ -140,6 +129,15 @@ def make_gradient(
         return grads, total
 
     return gradient
+
+
+def loss_of_rows(model: HMA, rows: Batch, masking: MaskingConfig, *, training: bool) -> LossSums:
+    """`masked_loss` of a batch that has `masked`, `key` (`noise_keys`) and, where the parameters are those of some
+    robots only, `slice` (`robot_row_B`)."""
+    return masked_loss(
+        model, rows["masked"], rows["tokens"], rows["actions"], rows["embodiment"], masking, rows["key"],
+        rows.get("slice"), rows.get("real"), training=training,
+    )  # fmt: skip
 
 
 def check_step(

@@ -17,14 +17,14 @@ from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Declared, Params
-from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
+from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, noise_keys
 from hma_jax.objective.masking import mask_batch
 from hma_jax.runtime.processes import compiled_by_all
 from hma_jax.runtime.rows import split_rows
 from hma_jax.runtime.sharding import replicated
 from hma_jax.training.loop import ValidationHook
 from hma_jax.training.state import TrainState
-from hma_jax.training.step import TRAINING_ARRAYS
+from hma_jax.training.step import TRAINING_ARRAYS, loss_of_rows
 
 SEED = 0
 """Seed of masks and noise, the same for every run, so that runs with the same masking can be compared."""
@@ -117,11 +117,8 @@ def make_sums(
         rows = {name: batch[name] for name in TRAINING_ARRAYS if name in batch}
         rows |= {"masked": masked, "key": noise_keys(key, len(valid_B))}
 
-        def of_rows(one: Mapping[str, Any]) -> LossSums:
-            return masked_loss(
-                declared.merge(params), one["masked"], one["tokens"], one["actions"], one["embodiment"], masking,
-                one["key"], real_BT=one.get("real"), training=False,
-            )  # fmt: skip
+        def of_rows(one: dict[str, Any]) -> LossSums:
+            return loss_of_rows(declared.merge(params), one, masking, training=False)
 
         if accumulate == 1:
             found = of_rows(rows)
