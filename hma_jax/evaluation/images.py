@@ -74,9 +74,8 @@ def image_metrics(
     # What copying shows: the last image that the model was given.
     before = images[:, first - 1 : -1] if config.context == "recorded" else images[:, first - 1 : first]
     # Under recorded actions and random ones in one array: equal images get equal numbers, to the last bit.
-    shown_last = last_frames(shown, real)[:, None]
-    of_last = psnr(jnp.concatenate([shown_last, random_last], axis=1), _repeated(last, 1 + random_last.shape[1]))
-    of_last = jax.lax.optimization_barrier(of_last)
+    made_last = jnp.concatenate([last_frames(shown, real)[:, None], random_last], axis=1)
+    of_last = jax.lax.optimization_barrier(psnr(made_last, jnp.broadcast_to(last[:, None], made_last.shape)))
     psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
     copied = jnp.broadcast_to(before, future.shape)
     found = {
@@ -102,11 +101,6 @@ def _finite(tokens: jax.Array, real_BT: jax.Array | None) -> jax.Array:
     """bool [B]: whether all tokens of real frames are finite."""
     finite = jnp.isfinite(tokens).all(tuple(range(2, tokens.ndim)))
     return (finite if real_BT is None else finite | ~real_BT).all(1)
-
-
-def _repeated(images: jax.Array, count: int) -> jax.Array:
-    """[B, ...] -> [B, count, ...]"""
-    return jnp.broadcast_to(images[:, None], (len(images), count, *images.shape[1:]))
 
 
 def decode_in_pieces(to_images: ToImages, piece: int, params: Params, tokens: jax.Array) -> jax.Array:

@@ -18,6 +18,7 @@ other datasets there are. Within a metric, rows stand in the order of the frozen
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -100,7 +101,8 @@ class WindowTable:
         own, wanted = self.names, other.names
         at = {name: i for i, name in enumerate(own)}
         for names in (own, wanted):
-            require(len(set(names)) == len(names), f"an evaluation contains a window twice: {_first_twice(names)}")
+            twice = next((name for name, times in Counter(names).items() if times > 1), None)
+            require(twice is None, f"an evaluation contains a window twice: {twice}")
         unmatched = sorted(set(own) ^ set(wanted))
         require(
             not unmatched,
@@ -199,11 +201,6 @@ def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
     if whole.null_count or len(set(names)) < len(names):
         raise ValueError("a name is missing, or is twice in the list of names")
     return names, whole.indices.to_numpy()
-
-
-def _first_twice(names: Sequence[tuple[str, int, int]]) -> tuple[str, int, int] | None:
-    seen: set[tuple[str, int, int]] = set()
-    return next((name for name in names if name in seen or seen.add(name)), None)
 
 
 def join(tables: Sequence[WindowTable]) -> WindowTable:
