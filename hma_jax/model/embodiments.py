@@ -46,8 +46,10 @@ class Embodiment:
     layout: str = ""  # a hash of the names and order of its action values; "": unknown
 
     def __post_init__(self):
-        for name in ("mean", "std", "low", "high"):  # lists and arrays are as good, but have no hash
-            object.__setattr__(self, name, _as_tuple(getattr(self, name)))
+        for name in ("mean", "std", "low", "high"):
+            values = getattr(self, name)
+            if not isinstance(values, tuple):  # lists and arrays are as good, but have no hash
+                object.__setattr__(self, name, tuple(np.asarray(values).tolist()))
         require(
             len(self.mean) == len(self.std) == self.action_dim,
             f"embodiment {self.name!r}: mean and std must have {self.action_dim} entries, "
@@ -84,10 +86,6 @@ class Embodiment:
     def chunk(self) -> int:
         """Values in one frame's action chunk: stride x action_dim."""
         return self.stride * self.action_dim
-
-
-def _as_tuple(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
-    return values if isinstance(values, tuple) else tuple(np.asarray(values).tolist())
 
 
 class ActionUnits(NamedTuple):

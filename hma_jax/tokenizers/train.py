@@ -18,7 +18,7 @@ import optax
 from hma_jax.config import TokenizerConfig, TokenizerTrainConfig
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.kernels.random import key_of
-from hma_jax.model.params import Declared, Params
+from hma_jax.model.params import Declared, Params, is_spec
 from hma_jax.runtime.devices import default_device
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
 from hma_jax.tokenizers.base import require_images
@@ -97,7 +97,7 @@ def make_optimizer(train: TokenizerTrainConfig, declared: Declared) -> optax.Gra
     # A run shorter than its warm-up still reaches the end of its cosine.
     warmup = min(train.warmup_steps, train.steps // 2)
     schedule = optax.warmup_cosine_decay_schedule(0.0, rate, warmup, train.steps, rate * train.final_fraction)
-    decay = jax.tree.map(lambda spec: spec.decay, declared.specs, is_leaf=lambda s: hasattr(s, "decay"))
+    decay = jax.tree.map(lambda spec: spec.decay, declared.specs, is_leaf=is_spec)
     return optax.chain(
         optax.clip_by_global_norm(train.clip_norm),
         optax.adamw(schedule, b2=0.99, weight_decay=train.weight_decay, mask=decay),
