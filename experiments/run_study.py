@@ -26,7 +26,7 @@ from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import LOCK, Record, Workspace, find_record, save_record
 from experiments.study import Study
-from experiments.study_setup import StudySetup
+from experiments.study_setup import StudySetup, count_again
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from experiments.terminal.program import PROGRAM
@@ -88,6 +88,9 @@ def run_study(
         planned = plan_sweeps(study, tuple(every.values()))
         say_unplanned(workspace, planned)
         provenance = prepare_apart(setup, replace)
+        if setup.data:
+            study = _count_again(setup, sweeps)
+            sweeps, planned = plan_asked(study, axes, workspace.root), plan_sweeps(study, tuple(every.values()))
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and (changes := diff(earlier.provenance, provenance)):
             say(f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again")
@@ -108,6 +111,16 @@ def run_study(
         states = run_jobs(jobs, workspace, launcher, lock, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again, accept_code)
+
+
+def _count_again(setup: StudySetup, sweeps: Sequence[Sweep]) -> Study:
+    """The study as its tokens let it be, once they are made; says which points of `sweeps` it then has not."""
+    from experiments.dry_run.notes import say_points
+
+    counted = count_again(setup)
+    if counted.study != setup.study:
+        say_points(counted, sweeps)
+    return counted.study
 
 
 def await_lease(workspace: Workspace) -> None:

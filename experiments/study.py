@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from data_pipelines.registry import DatasetSpec, find_spec
+from data_pipelines.registry import find_spec
 from data_pipelines.sampling.splits import HeldOut
+from experiments.data_size import size_by_entry, size_of
 from hma_jax.config import (
     AnyTokenizerConfig,
     EvalConfig,
@@ -286,30 +287,23 @@ def on_user_data(study: Study, names: Sequence[str]) -> Study:
     return replace(study, datasets=tuple(names), dataset_counts=counts, unseen=())
 
 
-def without_equal_caps(study: Study) -> Study:
-    """The same study without those of its `trajectory_counts`, but for the last, that no dataset exceeds: a trial there
-    would be trained on the same data as one at the last."""
+def without_equal_caps(study: Study, by_entries: bool = False) -> Study:
+    """The same study, where of numbers of trajectories that no dataset has to train on only the last is left: with the
+    others a trial would be trained on the same. `by_entries`: as `most_trajectories`."""
     *caps, last = study.trajectory_counts
-    most = most_trajectories(study) or last
+    most = most_trajectories(study, by_entries) or last
     return replace(study, trajectory_counts=(*(cap for cap in caps if cap < most), last))
 
 
-def most_trajectories(study: Study) -> int | None:
-    """Training trajectories of the largest dataset by the registry; of a dataset whose held-out ones it does not count,
-    all. None unless it has a number for every dataset."""
-
+def most_trajectories(study: Study, by_entries: bool = False) -> int | None:
+    """Training trajectories of the largest dataset, with those that were left out as damaged, since no other takes
+    their place in a subset; where nothing says how many are held out, with those. None where it is not known of all.
+    `by_entries`: as the registry alone says."""
+    find_size = size_by_entry if by_entries else size_of
     specs = [find_spec(name) for name in study.dataset_names()]
-    counts = [count_trained_on(spec, study.store) or spec.episodes if spec else 0 for spec in specs]
+    sizes = [spec and find_size(spec, study.store.held_out) for spec in specs]
+    counts = [size.skipped + (size.trained or size.episodes) if size else 0 for size in sizes]
     return max(counts) if all(counts) else None
-
-
-def count_trained_on(spec: DatasetSpec, settings: StoreConfig) -> int | None:
-    """Training trajectories of a dataset by the registry: its number of episodes less those held out by hash. Damaged
-    episodes count, and joined datasets are taken for one. None without that number, and where a split is held out,
-    whose size no entry says."""
-    if not spec.episodes or spec.val_split:
-        return None
-    return spec.episodes - settings.held_out.count(spec.episodes)
 
 
 def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:

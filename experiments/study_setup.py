@@ -18,6 +18,7 @@ from tyro.conf import UseAppendAction, arg
 
 from data_pipelines.registry import all_specs, find_spec, register
 from data_pipelines.registry.mixtures import get_mixture
+from experiments.data_size import are_counted, sizes_by_tokens, use_sizes
 from experiments.presets import get_preset
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace, find_record
@@ -114,6 +115,7 @@ class StudySetup:
     study: Study
     data: tuple[str, ...]  # directories of datasets; () for the suite
     workspace: Workspace
+    asked_counts: tuple[int, ...]  # trajectory_counts as asked for; those of `study` may be fewer
 
     @property
     def tokenizer(self) -> Path | None:
@@ -145,9 +147,9 @@ def command_words(*arguments: str | Path) -> str:
 
 
 def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> StudySetup:
-    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. On the user's data,
-    numbers of trajectories beyond what there is are left out (`without_equal_caps`), unless the study in the directory
-    has them.
+    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. Of its numbers of
+    trajectories those that would be trained on the same are left out, but for points of the study in the directory.
+    Says where the files of the data have other numbers of episodes than the registry.
 
     `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that
     are no datasets.
@@ -173,25 +175,48 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
 
         study = on_tokenizer(study, load_config(arguments.tokenizer))
     study = override(study, arguments.set, model)
-    if (data or arguments.mixture) and "trajectory_counts" not in arguments.chosen():
-        study = _with_earlier_caps(without_equal_caps(study), workspace)
+    use_sizes({})
+    if data:
+        from experiments.preparing.sizes import find_sizes
+
+        use_sizes(find_sizes(data, study.store.held_out, workspace))
+    asked = study.trajectory_counts
+    if data or arguments.mixture:
+        study = _without_equal_caps(study, arguments, workspace)
     say_unmatched(arguments.registry, study.all_names())
     if arguments.mesh is not None:
         sizes = dict(zip(("data", "fsdp", "tensor"), arguments.mesh, strict=True))
         mesh = replace(study.execution.mesh, **sizes)
         study = replace(study, execution=replace(study.execution, mesh=mesh))
-    return StudySetup(arguments, study, data, workspace)
+    return StudySetup(arguments, study, data, workspace, asked)
 
 
-def _with_earlier_caps(study: Study, workspace: Workspace) -> Study:
-    """`study` with the `trajectory_counts` of the study in `workspace`, if they differ only in those that
-    `without_equal_caps` leaves out. Earlier versions planned them, and that study could not go on without them."""
+def count_again(setup: StudySetup) -> StudySetup:
+    """The same on the user's data once tokens are made of it, which say how many trajectories have windows."""
+    use_sizes(sizes_by_tokens(setup.workspace.data_summary))
+    asked = replace(setup.study, trajectory_counts=setup.asked_counts)
+    return replace(setup, study=_without_equal_caps(asked, setup.arguments, setup.workspace))
+
+
+def _without_equal_caps(study: Study, arguments: StudyArguments, workspace: Workspace) -> Study:
+    """The same study, less the numbers of trajectories that would be trained on the same; those that the user chose are
+    left out only if the data, not the registry, say so. It keeps the numbers of the study in `workspace`, as an earlier
+    version planned it, if they differ only in such as no dataset has to train on, or follow from the registry: or that
+    study could not go on."""
+    chosen = "trajectory_counts" in arguments.chosen()
+    if chosen and not are_counted(study.dataset_names()):
+        return study
+    planned = without_equal_caps(study)
     try:
         earlier = find_record(workspace)
     except ConfigError:  # who goes on with it says so
-        return study
-    before = replace(study, trajectory_counts=earlier.study.trajectory_counts) if earlier else study
-    return before if without_equal_caps(before) == study else study
+        return planned
+    if earlier is None:
+        return planned
+    before = replace(study, trajectory_counts=earlier.study.trajectory_counts)
+    if chosen:
+        return study if before == study else planned
+    return before if planned == without_equal_caps(before) or before == without_equal_caps(study, True) else planned
 
 
 def use_entries(registry: Path | None) -> None:

@@ -20,6 +20,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
 from data_pipelines.sources.robomimic import read_environment
 from data_pipelines.sources.robomimic_dataset import RobomimicDataset, robomimic_name
+from data_pipelines.sources.size import SourceSize, lerobot_size, rlds_size, robomimic_size
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
 
@@ -28,20 +29,25 @@ if TYPE_CHECKING:
 
 
 class Format(NamedTuple):
-    """How a format is read: its episodes; its name and its rate in Hz (None: not said) without a look at these."""
+    """How a format is read: its episodes; its name, its rate in Hz and its size (None: not said) without a look at
+    these."""
 
     source: Callable[..., EpisodeSource]
     name: Callable[[Location], str]
     hz: Callable[[Location], float | None]
+    size: Callable[[Location, str], SourceSize | None]
 
 
 FORMATS = {
-    "rlds": Format(RldsDataset, schema.dataset_name, lambda place: schema.read_rate(schema.resolve_version(place))),
-    "lerobot": Format(LeRobotDataset, lerobot_name, lambda place: float(read_info(place)["fps"])),
+    "rlds": Format(
+        RldsDataset, schema.dataset_name, lambda place: schema.read_rate(schema.resolve_version(place)), rlds_size
+    ),
+    "lerobot": Format(LeRobotDataset, lerobot_name, lambda place: float(read_info(place)["fps"]), lerobot_size),
     "robomimic": Format(
         RobomimicDataset,
         lambda place: robomimic_name(read_environment(place)[0]),
         lambda place: read_environment(place)[1],
+        robomimic_size,
     ),
 }
 
@@ -134,6 +140,13 @@ def read_rate(location: Location | Parts) -> float | None:
     places = location.places if isinstance(location, Parts) else (location,)
     rates = (FORMATS[find_format(place)].hz(place) for place in places)
     return next((hz for hz in rates if hz is not None), None)
+
+
+def read_size(location: str | Location, split: str) -> SourceSize | None:
+    """The size of one split of the dataset at `location`, or of several as "train+val"; None where its files do not say
+    it. Raises DataError for a location that is no dataset and for damaged metadata, ConfigError for a library that is
+    missing."""
+    return FORMATS[find_format(location)].size(locate(location), split)
 
 
 def source_name(location: str | Location) -> str:

@@ -170,6 +170,15 @@ def read_environment(path: Path) -> tuple[str, float | None]:
         return _environment(path, file)
 
 
+def read_totals(path: Path, split: str) -> tuple[int, int | None]:
+    """(demonstrations of `split`, steps of all of them or None), without a look at them. Raises DataError for another
+    file, ConfigError for an unknown mask."""
+    with _open_file(path) as file, damage_as(str(path), DataError):
+        whole = split == "train"
+        steps = file["data"].attrs.get("total") if whole else None
+        return len(_demonstrations(path, file, None if whole else split)), None if steps is None else int(steps)
+
+
 def _environment(path: Path, file: Any) -> tuple[str, float | None]:
     if "data" not in file:
         raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")

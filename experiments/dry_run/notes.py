@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from data_pipelines.registry import get_spec
+from experiments.data_size import are_counted, size_of
 from experiments.dry_run.cost import count_parameters
-from experiments.presets import ON_ACCELERATORS, get_preset
+from experiments.presets import ON_ACCELERATORS
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.slots import find_accelerators
 from experiments.running.trial import Trial
-from experiments.study import Study, count_trained_on, most_trajectories
+from experiments.study import Study, most_trajectories
 from experiments.study_setup import StudySetup
 from experiments.sweeps.sweep import Sweep
 from experiments.terminal.progress import say
@@ -25,7 +26,8 @@ def say_notes(setup: StudySetup, sweeps: Sequence[Sweep], launcher_options: Laun
     if setup.data:
         say_scale(setup, trials)
         _say_unused(setup.study)
-        _say_points(setup, sweeps)
+        say_points(setup, sweeps)
+        _say_one_point(setup, sweeps)
     say_average(trial.train for trial in trials)
     _say_prepared_here(setup, launcher_options)
 
@@ -80,20 +82,24 @@ def _say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> 
         )
 
 
-def _say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
-    """A line on the axis trajectories where it has fewer points on the user's datasets than in the preset, and on the
-    axis datasets where it has only one; none where the user chose them."""
-    study, planned = setup.study, {sweep.name for sweep in sweeps}
-    chosen = setup.arguments.chosen()
-    caps, names, most = study.trajectory_counts, study.dataset_names(), most_trajectories(study)
-    dropped = [cap for cap in get_preset(setup.arguments.preset).trajectory_counts if cap not in caps]
-    if "trajectories" in planned and "trajectory_counts" not in chosen and dropped and most:
+def say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
+    """A line on the axis trajectories where it has fewer points on the user's datasets than were asked for."""
+    caps, most = setup.study.trajectory_counts, most_trajectories(setup.study)
+    dropped = [cap for cap in setup.asked_counts if cap not in caps]
+    if "trajectories" in {sweep.name for sweep in sweeps} and dropped and most:
+        by = "" if are_counted(setup.study.dataset_names()) else "by the registry "
         others = f"; for other points: --set trajectory_counts={_parts(most)}" if most > 1 else ""
         say(
-            f"note: by the registry no dataset has more than {most:,} trajectories to train on, so the axis trajectories has "
+            f"note: {by}no dataset has more than {most:,} trajectories to train on, so the axis trajectories has "
             f"{_listed(caps)}, without {_listed(dropped)}, which would train on the same{others}"
         )
-    if "datasets" in planned and "dataset_counts" not in chosen and len(study.dataset_counts) == 1 and len(names) > 1:
+
+
+def _say_one_point(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
+    """A line on the axis datasets where it has only one point of several datasets, which the user did not choose."""
+    names, alone = setup.study.dataset_names(), len(setup.study.dataset_counts) == 1
+    chosen = "dataset_counts" in setup.arguments.chosen()
+    if "datasets" in {sweep.name for sweep in sweeps} and not chosen and alone and len(names) > 1:
         points = _parts(len(names))
         fewest = counted(int(points.partition(",")[0]), "dataset")
         say(
@@ -113,15 +119,10 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _say_unused(study: Study) -> None:
-    """A line on datasets that have more trajectories to train on than a trial takes, as far as the registry says how
-    many."""
-
-    counts, specs = study.trajectory_counts, [get_spec(name) for name in study.dataset_names()]
-    larger = {
-        spec.name: spec.episodes
-        for spec in specs
-        if (count_trained_on(spec, study.store) or spec.episodes) > counts[-1]
-    }
+    """A line on datasets that have more trajectories to train on than a trial takes, as far as it is known how many."""
+    counts, names = study.trajectory_counts, study.dataset_names()
+    sizes = {name: size_of(get_spec(name), study.store.held_out) for name in names}
+    larger = {name: size.episodes for name, size in sizes.items() if (size.trained or size.episodes) > counts[-1]}
     if larger:
         having = few([f"{name} has {have:,}" for name, have in larger.items()])
         every = ",".join(map(str, (*counts, max(larger.values()))))

@@ -1,7 +1,8 @@
 """What is made before the first trial of a study will cost: simulating, the tokenizer, tokens, and starting up.
 
 By formula and by what was measured on two cores of the machine that the `cpu` preset is meant for; nothing is made and
-no data is read. What the registry does not say of a dataset (episodes, length) is not counted, and named.
+no data is read. A dataset of which neither its files nor the registry say how many frames it has is not counted, and
+named.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import math
 from dataclasses import dataclass
 
 from data_pipelines.registry import get_spec
+from experiments.data_size import size_of
 from experiments.preparing.tokenizer import QUALITY_FRAMES
 from experiments.study import Study
-from experiments.terminal.words import duration
+from experiments.terminal.words import duration, few
 from hma_jax.config import AnyTokenizerConfig, TokenizerConfig
 
 SIMULATED = 3000.0
@@ -35,7 +37,7 @@ class PreparingCost:
     simulating: float = 0.0
     tokenizer: float = 0.0
     tokens: float = 0.0
-    unknown: tuple[str, ...] = ()  # datasets whose number of frames the registry does not have
+    unknown: tuple[str, ...] = ()  # datasets of which nothing says how many frames they have
     datasets: int = 0  # those too
 
     @property
@@ -74,7 +76,7 @@ def estimate_preparing(
 
 
 def count_frames(study: Study, name: str) -> Frames | None:
-    """Number of frames of all episodes of a dataset, held-out ones included; None where the registry does not say
+    """Number of frames of all episodes of a dataset, held-out ones included; None where nothing says
     it."""
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
@@ -86,10 +88,11 @@ def count_frames(study: Study, name: str) -> Frames | None:
         seconds = (high - low) / math.log(high / low) if high > low else low  # lengths are uniform in the logarithm
         count = episode_count(robot, study.suite.scale, study.suite.fewest) + study.suite.validation
         native = count * seconds * robot.hz
-    elif spec.episodes and (spec.median_steps or spec.mean_steps):
-        native = spec.episodes * (spec.mean_steps or spec.median_steps)
     else:
-        return None
+        size = size_of(spec, study.store.held_out)
+        native = size.episodes * (size.mean_steps or spec.mean_steps or spec.median_steps)
+        if not native:
+            return None
     every = study.store.frame_step or spec.stride_at(study.rate)
     return Frames(native, native / every, robot is not None)
 
@@ -130,7 +133,7 @@ def describe(cost: PreparingCost) -> str:
         return text
     known = cost.datasets - len(cost.unknown)
     without = (
-        f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, because the registry does not have their "
-        "number of frames"
+        f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, because nothing says how many frames they have "
+        f"({few(cost.unknown)})"
     )
     return f"{without}; {duration(cost.seconds)} with the other {known} alone ({text})" if known else without

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from data_pipelines.registry import DatasetSpec, find_reader, get_spec
+from experiments.data_size import size_of
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
 from experiments.terminal.progress import say
@@ -123,21 +124,29 @@ def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
 
 
 def say_short_episodes(study: Study, sources: Sequence[Source]) -> None:
-    """Names the datasets most of whose episodes, by their entries, are too short for a window to evaluate on: how long
-    each is may be known only when it is tokenised, after a tokenizer was trained."""
+    """Names the datasets of which, as far as their files or else their entries say, few episodes or none give a window
+    to evaluate on: how long each is may be known only when it is tokenised, after a tokenizer was trained."""
     from data_pipelines.windows.windows import least_judged, settings_for_short
 
     least, short, stride = least_judged(study.eval.prompt_frames, study.model.frames), [], 1
+    parts = []  # of which the entry describes other episodes
     for spec, _ in sources:
-        steps, needed = spec.median_steps or spec.mean_steps, least * spec.stride_at(study.rate)
+        size, needed = size_of(spec, study.store.held_out), least * spec.stride_at(study.rate)
+        steps = size.mean_steps or spec.median_steps or spec.mean_steps
         if 0 < steps < needed:
-            short.append(f"{spec.name} (about {steps:g} steps an episode; {needed} are needed)")
+            short.append(f"{spec.name} (about {steps:.3g} steps an episode; {needed} are needed)")
             stride = max(stride, spec.stride_at(study.rate))
+            if not size.mean_steps and spec.episodes not in (0, size.episodes):
+                parts.append(spec.name)
     if short:
         settings = settings_for_short(stride, least)
+        advice = f". To use them, set {settings}" if settings else ""
+        doubt = (
+            f". The entry of {few(parts)} is of other episodes: `hma data inspect DIR` measures yours" if parts else ""
+        )
         say(
-            "note: by what entries say, many or all episodes are too short for a window to evaluate on: "
-            f"{few(short)}{settings and f'. To use them, set {settings}'}"
+            "note: by what files and entries say, many or all episodes are too short for a window to evaluate on: "
+            f"{few(short)}{advice}{doubt}"
         )
 
 

@@ -39,10 +39,10 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.analysis.growth import Growth, find_growth
     from experiments.analysis.optima import Optimum, find_optima
     from experiments.analysis.rows import collect, place_rows, read_rows, write_csv, write_rows
+    from experiments.data_size import count_usable
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers, find_fewer, find_other_x
     from experiments.report.page import write_report
-    from experiments.report.robots import count_usable
     from experiments.report.sweeps import AxisStatistics
     from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
@@ -63,7 +63,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
             f"note: trained on fewer trajectories than were asked for, since damaged ones are not replaced: {few(fewer)}"
         )
     if other := find_other_x(sweeps, provenance, numbers.results, available):
-        say(f"note: x of the axis episodes is by the registry's entries, not by what was trained on: {few(other)}")
+        say(f"note: x of the axis episodes is what the datasets have, not what was trained on: {few(other)}")
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
     others = write_tables(workspace, record, sweeps, states, numbers.results)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +11,11 @@ from pathlib import Path
 
 from experiments.analysis.controllability import Controllability, controllability, count_following, expected_by_chance
 from experiments.analysis.rows import OVERALL, CurvePoint, Row, curve, of_sweep
+from experiments.data_size import read_data
 from experiments.report.pieces import pm, table
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.sweep import POINT, Sweep
-from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
@@ -104,28 +103,6 @@ def _ahead(rows: Sequence[Row], sweep: Sweep, name: str, tables: Sequence[Window
 
 def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) -> CurvePoint | None:
     return next((p for p in curve(rows, sweep.name, metric, scope=scope) if p.x == sweep.reference_x), None)
-
-
-def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
-    """{robot: its counts of episodes, windows, ...}; {} without the file. Raises ConfigError for a damaged file."""
-    try:
-        facts_by_robot = {name: {**facts} for name, facts in json.loads(data_summary.read_text()).items()}
-        require(
-            all(isinstance(facts["episodes"], int) for facts in facts_by_robot.values()), "episodes that are no number"
-        )
-        return facts_by_robot
-    except FileNotFoundError:
-        return {}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(
-            f"{data_summary} does not say how much there is of each robot ({error}); remove it, the study's command "
-            "writes it again"
-        ) from error
-
-
-def count_usable(data_summary: Path) -> dict[str, int]:
-    """{robot: training trajectories that have windows}. Raises what `read_data` raises."""
-    return {name: facts["episodes"] - facts.get("too_short", 0) for name, facts in read_data(data_summary).items()}
 
 
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:

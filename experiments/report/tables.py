@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments.analysis.controllability import Controllability, controllability
 from experiments.analysis.rows import write_csv
-from experiments.report.robots import count_usable
+from experiments.data_size import count_usable
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.trial import trial_id

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from data_pipelines.registry import register
+from experiments.data_size import sizes_by_tokens, use_sizes
 from experiments.running.migration import migrate
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
@@ -174,8 +175,9 @@ def find_record(workspace: Workspace) -> Record | None:
 
 
 def load_record(workspace: Workspace) -> Record:
-    """The study that lives there, whose own registry entries are added to the registry for the rest of this process:
-    its axes are planned with them. Raises ConfigError if there is none, or one that does not say what its axes are."""
+    """The study that lives there. For the rest of this process its own registry entries are added to the registry, and
+    the sizes of its datasets are those that its tokens say: its axes are planned with them. Raises
+    ConfigError if there is none, or one that does not say what its axes are."""
     record = find_record(workspace)
     if record is None:
         names = sorted(place.parent.name for place in workspace.root.glob(f"*/{CHECKPOINTS}"))
@@ -198,4 +200,5 @@ def load_record(workspace: Workspace) -> Record:
         from data_pipelines.registry.toml_file import load_entries
 
         register(load_entries(workspace.registry))
+    use_sizes(sizes_by_tokens(workspace.data_summary) if record.data else {})
     return record

@@ -14,7 +14,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from data_pipelines.registry import get_spec
-from experiments.study import Study, count_trained_on
+from experiments.data_size import size_of
+from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
 from experiments.terminal.program import run_sweep
 from experiments.terminal.words import counted, few
@@ -59,13 +60,14 @@ def plan(study: Study) -> Sweep:
 
 def count_episodes(study: Study, cap: int | None) -> int:
     """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly, of others as
-    `count_trained_on` says. Raises ConfigError where it says nothing."""
+    `size_of` says. Raises ConfigError where it says nothing."""
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
     episodes = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
     given = [get_spec(name) for name in study.dataset_names() if name not in episodes]
-    known = {spec.name: count for spec in given if (count := count_trained_on(spec, study.store)) is not None}
+    trained = {spec.name: size_of(spec, study.store.held_out).trained for spec in given}
+    known = {name: count for name, count in trained.items() if count is not None}
     unknown = [spec for spec in given if spec.name not in known]
     split = [spec.name for spec in unknown if spec.val_split]
     require(

@@ -272,7 +272,7 @@ def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     assert words.startswith("unknown for 38 of 40 datasets")
     assert f"{duration(before.seconds)} with the other 2 alone" in words
     assert describe(replace(before, unknown=("a", "b"), datasets=2)) == (
-        "unknown for 2 of 2 datasets, because the registry does not have their number of frames"
+        "unknown for 2 of 2 datasets, because nothing says how many frames they have (a, b)"
     )
     assert main(["sweep", "width", "--preset", "paper", "--dry-run"]) == 0
     said = " ".join(capsys.readouterr().out.split())

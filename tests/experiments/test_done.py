@@ -24,7 +24,7 @@ def setup(tmp_path) -> StudySetup:
     """Of a study all of whose trials are finished."""
     workspace = fakes.finished_study(tmp_path, STUDY)
     save_record(workspace, fakes.record_of(STUDY))
-    return StudySetup(StudyArguments(out=tmp_path), STUDY, (), workspace)
+    return StudySetup(StudyArguments(out=tmp_path), STUDY, (), workspace, STUDY.trajectory_counts)
 
 
 def test_finished_trials_are_not_priced_again_and_begun_ones_from_their_step(setup):

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
 from experiments.dry_run.cost import count_parameters
 from experiments.dry_run.notes import say_scale
+from experiments.dry_run.preparing_cost import count_frames, estimate_preparing
 from experiments.presets import ON_ACCELERATORS, PRESETS
 from experiments.running.slots import Accelerators
-from experiments.running.workspace import Workspace
+from experiments.running.workspace import Record, Workspace, save_record
 from experiments.study import on_user_data
-from experiments.study_setup import StudyArguments, StudySetup
+from experiments.study_setup import StudyArguments, StudySetup, count_again, make_setup
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import make_spec, write_rlds
+from tests.experiments.fakes import PROVENANCE
 
 
 @pytest.fixture(autouse=True)
@@ -28,13 +32,20 @@ def registered(monkeypatch):
     monkeypatch.setattr(registry_table, "_registered", {})
 
 
+def declare(directory: Path, episodes: int) -> None:
+    """Has an RLDS directory say that it holds so many."""
+    info = json.loads((directory / "dataset_info.json").read_text())
+    info["splits"][0]["shardLengths"] = [str(episodes)]
+    (directory / "dataset_info.json").write_text(json.dumps(info))
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    """A dataset of four episodes whose entry says that it has 95,000, and one that does not say it."""
+    """A dataset of four episodes whose files say that it has 95,000, and one of which they say four."""
     root, specs = tmp_path_factory.mktemp("data"), [make_spec("large"), make_spec("small")]
     places = [str(write_rlds(root, spec, [30] * 4)) for spec in specs]
-    large = replace(specs[0], episodes=95_000)
-    (root / "my.toml").write_text(to_toml(large) + to_toml(specs[1]))
+    declare(Path(places[0]), 95_000)
+    (root / "my.toml").write_text("".join(map(to_toml, specs)))
     return ["--data", *places, "--registry", str(root / "my.toml")]
 
 
@@ -103,7 +114,7 @@ def test_a_dry_run_refuses_an_entry_that_cannot_read_the_data(command, wrong, me
 
 
 def test_held_out_trajectories_are_not_called_unused(data, capsys, tmp_path):
-    """Of the 95,000 that the entry declares, 200 are held out."""
+    """Of the 95,000 that there are, 200 are held out."""
     words = ("sweep", "width", "--dry-run", *data, "--out", str(tmp_path), "--set")
     assert len(said_by(capsys, *words, "trajectory_counts=94800")) == 1
     assert len(said_by(capsys, *words, "trajectory_counts=94799")) == 2
@@ -125,7 +136,7 @@ def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):
     words = ("study", "--dry-run", *data, "--out", str(tmp_path / "out"))
     caps, counts = said_by(capsys, *words)[1:]
     assert caps == (
-        "note: by the registry no dataset has more than 6 trajectories to train on, so the axis trajectories has 4 and "
+        "note: no dataset has more than 6 trajectories to train on, so the axis trajectories has 4 and "
         "500, without 32, which would train on the same; for other points: --set trajectory_counts=2,3,6"
     )
     assert counts == (
@@ -134,7 +145,61 @@ def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):
     )
     assert len(said_by(capsys, *words, "--set", "axes=width")) == 1
     assert len(said_by(capsys, *words, "--set", "trajectory_counts=2,4,8", "--set", "dataset_counts=1,2")) == 1
-    assert len(said_by(capsys, *words, "--set", "trajectory_counts=4,32,500", "--set", "dataset_counts=2")) == 1
+    _, chosen = said_by(capsys, *words, "--set", "trajectory_counts=4,32,500", "--set", "dataset_counts=2")
+    assert chosen == caps
+
+
+@pytest.mark.parametrize("name", ["fractal20220817_data", "language_table"])
+def test_plans_count_the_episodes_of_the_files_not_those_that_were_published(name, capsys, tmp_path):
+    """Points were planned, and trained, for 87,212 trajectories where there were nine."""
+    spec = replace(get_spec(name), image_key="observation/image", action_keys=("action",), action_dims=(3,))
+    directory, file, out = write_rlds(tmp_path, spec, [40] * 12), tmp_path / "my.toml", tmp_path / "out"
+    file.write_text(to_toml(spec))
+    words = ("--data", str(directory), "--registry", str(file), "--out", str(out), "--preset", "smoke")
+    assert (
+        main(
+            [
+                "sweep",
+                "trajectories",
+                "--dry-run",
+                *words,
+                "--set",
+                "trajectory_counts=4,8,9,100,500",
+                "--set",
+                "rate=1",
+            ]
+        )
+        == 0
+    )
+    plan = capsys.readouterr().out
+    said = " ".join(plan.split())
+    assert f"not of the registry's entries: {name} has 12 (not {spec.episodes:,})" in said
+    assert said.count(f"{spec.episodes:,}") == 1 and "to use all" not in said
+    assert "no dataset has more than 10 trajectories to train on, so the axis trajectories has 4, 8, 9 and 500" in said
+    short = "The entry of language_table is of other episodes: `hma data inspect DIR` measures yours"
+    assert (short in said) == (name == "language_table")
+    found = make_setup(StudyArguments("smoke", out, (str(directory),), file))
+    cost = estimate_preparing(found.study)
+    frames = count_frames(found.study, name)
+    assert frames.native == 12 * spec.mean_steps and cost.tokens < 1
+
+
+def test_points_that_are_the_same_trial_run_once(capsys, tmp_path):
+    """Which ones are, the tokens say at last: some episodes are too short for a window."""
+    spec, file, out = make_spec("mine"), tmp_path / "my.toml", tmp_path / "out"
+    directory = write_rlds(tmp_path, spec, [30] * 9 + [2] * 3)
+    file.write_text(to_toml(spec))
+    where = StudyArguments("smoke", out, (str(directory),), file, set=("trajectory_counts=4,7,9,100",))
+    setup = make_setup(where)
+    assert setup.study.trajectory_counts == (4, 7, 9, 100)  # ten are not held out, by the files
+    out.mkdir()
+    (out / "data.json").write_text(json.dumps({"mine": {"episodes": 9, "too_short": 2, "held_out": 3, "skipped": 0}}))
+    assert count_again(setup).study.trajectory_counts == make_setup(where).study.trajectory_counts == (4, 100)
+    save_record(setup.workspace, Record(setup.study, provenance=PROVENANCE))  # of an earlier version, which goes on
+    assert make_setup(where).study.trajectory_counts == (4, 7, 9, 100)
+    declare(directory, 30)  # more were added since, of which no tokens were made
+    (out / "study.json").unlink()
+    assert make_setup(where).study.trajectory_counts == (4, 7, 9, 100)
 
 
 def test_what_is_made_for_an_accelerator_names_no_other(data, capsys, tmp_path, monkeypatch):
@@ -204,7 +269,7 @@ def test_presets_for_a_processor_name_one_that_is_larger():
 
 
 def test_of_trials_of_different_lengths_the_longest_is_named(capsys, tmp_path):
-    setup = StudySetup(StudyArguments("cpu"), PRESETS["cpu"], (), Workspace(tmp_path))
+    setup = StudySetup(StudyArguments("cpu"), PRESETS["cpu"], (), Workspace(tmp_path), PRESETS["cpu"].trajectory_counts)
     short = reference_trial(PRESETS["cpu"], 0)
     long = replace(short, train=replace(short.train, steps=32_000))
     say_scale(setup, [short, long])

@@ -410,8 +410,8 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
 
     def run(arguments, study, axis, step=None):
         run_study.run_study(
-            StudySetup(arguments, study, ("somewhere",), workspace), (axis,), again="", launcher_options=LauncherOptions(),
-            retry_failed=False, accept_code=False, replace=step,
+            StudySetup(arguments, study, ("somewhere",), workspace, study.trajectory_counts), (axis,), again="",
+            launcher_options=LauncherOptions(), retry_failed=False, accept_code=False, replace=step,
         )  # fmt: skip
 
     run(arguments, study, "episodes")

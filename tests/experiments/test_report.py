@@ -12,6 +12,7 @@ from experiments.analysis.changes import find_changes
 from experiments.analysis.optima import find_optima
 from experiments.analysis.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.analysis.scaling import curves_of, fit_curve, trunk_parameters
+from experiments.data_size import read_data
 from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
@@ -21,7 +22,7 @@ from experiments.report.pieces import picture, pm
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import ONE_SEED, LogTicks, count, drawn_curve, save
-from experiments.report.robots import describe_robots, read_data, robots_of
+from experiments.report.robots import describe_robots, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import AxisStatistics, describe
 from experiments.report.validity import Check, check_study

@@ -91,7 +91,8 @@ def anything_goes(monkeypatch):
 
     def study_of(where: StudyArguments) -> StudySetup:
         arguments = where.anywhere()
-        return StudySetup(arguments, study_setup.get_preset(arguments.preset), (), study_setup.Workspace(arguments.out))
+        study = study_setup.get_preset(arguments.preset)
+        return StudySetup(arguments, study, (), study_setup.Workspace(arguments.out), study.trajectory_counts)
 
     for module in ("study", "tokenize", "train", "evaluate", "tokenizer"):
         monkeypatch.setattr(f"experiments.cli.{module}.make_setup", study_of)
@@ -135,7 +136,7 @@ def test_the_study_is_the_same_too(where, world, monkeypatch):
 def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkeypatch, tmp_path):
     """It was refused as another study, since caps that no dataset reaches in training came to count as equal."""
     monkeypatch.chdir(world)
-    monkeypatch.setattr("experiments.study.most_trajectories", lambda study: 100)
+    monkeypatch.setattr("experiments.study.most_trajectories", lambda *_: 100)
     where = StudyArguments("accelerator", tmp_path, (f"bridge/{ARM.name}",))
     setup = make_setup(where)
     caps = setup.study.trajectory_counts

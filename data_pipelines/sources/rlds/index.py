@@ -110,11 +110,11 @@ def load_index(directory: Location, split: str, shards: Sequence[Location], scan
     """
     listing = list_files(directory)
     path = index_path(directory, split)
-    known = _read(path)
+    known = read_index(path)
     if known is not None and _is_current(known, shards, listing):
         return known
     with exclusive_lock(path):
-        known = _read(path)  # another process may have made it meanwhile
+        known = read_index(path)  # another process may have made it meanwhile
         if known is not None and _is_current(known, shards, listing):
             return known
         return _make(path, shards, listing, known, scan)
@@ -224,7 +224,7 @@ def _check_not_swapped(
 # --- its file --------------------------------------------------------------------------------------
 
 
-def _read(path: Path) -> RecordIndex | None:
+def read_index(path: Path) -> RecordIndex | None:
     """The cached index; None if there is none, or it is damaged."""
     try:
         columns = Columns(path)
@@ -254,7 +254,7 @@ def _write(
             stacklevel=2,
         )
         return index
-    return _read(path) or index  # memory-mapped, so that it takes no memory of this process
+    return read_index(path) or index  # memory-mapped, so that it takes no memory of this process
 
 
 def _is_current(index: RecordIndex, shards: Sequence[Location], listing: Mapping[str, tuple[int, str]]) -> bool:

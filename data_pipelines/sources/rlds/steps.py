@@ -8,12 +8,27 @@ from __future__ import annotations
 import hashlib
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from data_pipelines.columns import Columns, write_columns
 from data_pipelines.errors import DataError
-from data_pipelines.sources.rlds.index import RecordIndex, exclusive_lock
+from data_pipelines.sources.rlds.index import RecordIndex, exclusive_lock, index_path, read_index
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.rlds.location import Location
+
+
+def known_mean_steps(directory: Location, split: str, episodes: int) -> float:
+    """Mean steps of the episodes whose records were read before, on this machine; 0 if there are none, or if the index
+    is of another number of `episodes`. No shard is looked at."""
+    path = index_path(directory, split)
+    index = read_index(path)
+    if index is None or len(index) != episodes:
+        return 0.0
+    steps = load_steps(path, index)
+    return float(steps[steps >= 0].mean()) if (steps >= 0).any() else 0.0
 
 
 def load_steps(path: Path, index: RecordIndex) -> np.ndarray:

@@ -26,10 +26,11 @@ from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources import lerobot_dataset, lerobot_meta
 from data_pipelines.sources.joined import JoinedSource
 from data_pipelines.sources.lerobot import LeRobotSource
-from data_pipelines.sources.open import find_format, open_source, read_rate, source_name
+from data_pipelines.sources.open import find_format, open_source, read_rate, read_size, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.robomimic import RobomimicSource
+from data_pipelines.sources.size import SourceSize
 from data_pipelines.sources.video import open_video
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
@@ -200,6 +201,23 @@ def test_the_meta_folder_is_read_again_only_where_it_changed(tmp_path, monkeypat
 def test_the_name_and_the_rate_of_a_robomimic_file_need_no_demonstration(tmp_path):
     path = write_robomimic(tmp_path / "image.hdf5", images=False)
     assert (source_name(path), read_rate(path)) == ("robomimic_lift", 20)
+
+
+@pytest.mark.parametrize("layout", ["v2.1", "v3.0", "rlds", "robomimic"])
+def test_how_many_episodes_there_are_needs_none_of_them(tmp_path, layout, monkeypatch):
+    """Plans are made before anything is read; how long they are, not every format says."""
+    if layout == "rlds":
+        place = write_rlds(tmp_path, make_spec(), [5, 7, 4], shards=2)
+    elif layout == "robomimic":
+        place = write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4), images=False)
+        assert read_size(place, "train+valid").episodes == 3 and read_size(place, "valid").episodes == 1
+    else:
+        place = write_lerobot(tmp_path / "toy-arm", layout, lengths=(5, 7, 4), camera="image")
+        info = json.loads((place / "meta" / "info.json").read_text())
+        (place / "meta" / "info.json").write_text(json.dumps(info | {"total_frames": 16}))
+    monkeypatch.setattr("data_pipelines.sources.rlds.dataset.load_index", lambda *_: pytest.fail("shards were read"))
+    expected = SourceSize(3) if layout == "rlds" else SourceSize(3, 16 / 3)
+    assert read_size(place, "train") == expected
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])

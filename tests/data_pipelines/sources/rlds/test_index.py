@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, UnreachableError
+from data_pipelines.sources.open import read_size
 from data_pipelines.sources.rlds import dataset as dataset_module
 from data_pipelines.sources.rlds import index as index_module
 from data_pipelines.sources.rlds import location
@@ -18,6 +19,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.frame_spans import FrameSpanCache
 from data_pipelines.sources.rlds.index import index_path
 from data_pipelines.sources.rlds.tfrecord import scan_shard
+from data_pipelines.sources.size import SourceSize
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.data_pipelines.shards import index_shard
 
@@ -192,6 +194,7 @@ def test_steps_are_known_once_an_episode_was_read(directory):
     other.frames(5, SPEC.image_key, lambda n: [0])
     other.save_steps()
     assert RldsDataset(directory).steps().tolist() == [-1, -1, -1, 8, -1, 10, -1, -1]
+    assert read_size(directory, "train") == SourceSize(8, 9.0) and read_size(directory, "train+val") is None
     shards(directory)[0].write_bytes(b"")
     assert set(RldsDataset(directory, corrupt="skip").steps().tolist()) == {-1}
 

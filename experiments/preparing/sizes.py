@@ -1,0 +1,62 @@
+"""Finds how many trajectories the user's datasets have, and says where the registry says something else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from data_pipelines.errors import DataError
+from data_pipelines.registry import DatasetSpec, find_spec
+from data_pipelines.sampling.splits import HeldOut
+from experiments.data_size import DataSize, sizes_by_tokens
+from experiments.preparing.sources import group_by_dataset
+from experiments.running.workspace import Workspace
+from experiments.terminal.progress import say
+from experiments.terminal.words import few
+from hma_jax.config import ConfigError
+
+
+def find_sizes(data: Sequence[str], held_out: HeldOut, workspace: Workspace) -> dict[str, DataSize]:
+    """The sizes of the datasets at these locations whose files say how many episodes there are, or whose tokens are in
+    `workspace`: tokens that were made of as many episodes. What cannot be read is left out: who reads it says why."""
+    try:
+        datasets = group_by_dataset(data)
+    except (DataError, ConfigError):
+        return {}
+    by_tokens, sizes, others = sizes_by_tokens(workspace.data_summary), {}, []
+    for name, places in datasets.items():
+        spec, tokens = find_spec(name), by_tokens.get(name)
+        files = spec and size_by_files(spec, places, held_out)
+        if files and spec.episodes not in (0, files.episodes):
+            others.append(f"{name} has {files.episodes:,} (not {spec.episodes:,})")
+        if files and tokens and files.episodes == tokens.episodes:
+            tokens = replace(tokens, mean_steps=files.mean_steps)
+        elif files:
+            tokens = None
+        if known := tokens or files:
+            sizes[name] = known
+    if others:
+        say(f"note: numbers of episodes are those of your files, not of the registry's entries: {few(others)}")
+    return sizes
+
+
+def size_by_files(spec: DatasetSpec, places: Mapping[str, str], held_out: HeldOut) -> DataSize | None:
+    """The size of the dataset whose parts lie at `places`. None where its files do not say it: who reads them says what
+    is damaged there."""
+    from data_pipelines.sources.open import read_size
+
+    try:
+        parts = [read_size(place, spec.split) for place in places.values()]
+        val = [spec.val_split and read_size(place, spec.val_split) for place in places.values()]
+    except (DataError, ConfigError):
+        return None
+    if not all(parts):
+        return None
+    episodes = sum(part.episodes for part in parts)
+    trained = None
+    if not spec.val_split:
+        trained = episodes - sum(held_out.count(part.episodes) for part in parts)
+    elif all(val):
+        trained = episodes - sum(one.episodes for one in val)
+    steps = sum(part.episodes * part.mean_steps for part in parts) if all(part.mean_steps for part in parts) else 0
+    return DataSize(episodes, trained, mean_steps=steps / episodes)
