@@ -40,24 +40,27 @@ def test_the_abstract_state_has_the_shapes_of_a_real_one():
     assert batch["tokens"].shape == (train.batch, config.frames, config.tokens)
 
 
-def test_a_step_that_fits_is_reported_with_its_memory_and_parameters():
-    config, train = model_config(layers=1), train_config()
-    plan = make_plan(config, TABLE, train, ExecutionConfig(), jax.devices()[:1])
-    assert plan.parameters == declare_model(config, TABLE).count() and plan.devices == 1
+def plan_of(**train):
+    return make_plan(model_config(**SMALLER), TABLE, train_config(**train), ExecutionConfig(), jax.devices()[:1])
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return plan_of()
+
+
+def test_a_step_that_fits_is_reported_with_its_memory_and_parameters(plan):
+    assert plan.parameters == declare_model(model_config(**SMALLER), TABLE).count() and plan.devices == 1
     assert plan.stored == 4 * plan.parameters
     assert plan.arguments > 3 * plan.stored  # weights and two moments
     assert plan.peak == plan.arguments + plan.temporary > plan.temporary > 0
     assert not plan.refusal and not plan.collectives
 
 
-def test_what_is_frozen_is_planned_without_moments():
-    config = model_config(**SMALLER)
-    plans = [
-        make_plan(config, TABLE, train_config(only=o), ExecutionConfig(), jax.devices()[:1]) for o in ((), ("arm",))
-    ]
-    everything, one = plans
-    assert everything.moments == 2 * everything.stored == 2 * one.stored
-    assert everything.arguments - one.arguments == everything.moments - one.moments > one.stored
+def test_what_is_frozen_is_planned_without_moments(plan):
+    one = plan_of(only=("arm",))
+    assert plan.moments == 2 * plan.stored == 2 * one.stored
+    assert plan.arguments - one.arguments == plan.moments - one.moments > one.stored
 
 
 def test_a_mesh_that_does_not_suit_the_devices_is_refused():
