@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
-from experiments.analysis.changes import METRICS
+from experiments.analysis.changes import CHANGED
 from experiments.analysis.compare import lacks_numbers
 from experiments.analysis.intervals import HELD_OUT_LOSS
 from experiments.analysis.paired import NotComparable, agree, require_same_windows
@@ -81,7 +81,7 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
     tried = {steps for tables in seeds.values() for steps in tables}
     edge = "edge" if {min(tried), max(tried)} & chosen.keys() else ""
     rows = []
-    for metric in METRICS:
+    for metric in CHANGED:
         if not all(metric in t.metrics for t in composed.values()):
             continue
         panel = make_panel([composed], metric, sweep.scope)

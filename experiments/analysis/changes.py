@@ -23,7 +23,7 @@ from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.evaluation.windows import WindowTable
 
-METRICS = ("cross_entropy", "action_nats", "delta_psnr")
+CHANGED = ("cross_entropy", "action_nats", "delta_psnr")
 OF_VARIANTS = ("cross_entropy", "diffusion_loss", "delta_psnr", "action_error")
 
 
@@ -55,7 +55,7 @@ def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mappi
         for series in dict.fromkeys(p.series for p in points):
             trials = finished_by_x((p for p in points if p.series == series), provenance, windows)
             if len(trials) > 1:
-                found += _changes(sweep, series, {x: trials[x] for x in (min(trials), max(trials))}, METRICS)
+                found += _changes(sweep, series, {x: trials[x] for x in (min(trials), max(trials))}, CHANGED)
     return found
 
 

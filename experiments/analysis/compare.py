@@ -13,13 +13,10 @@ import numpy as np
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel
 from experiments.analysis.intervals import NATS, OVERALL, Interval, interval_of, nats_first, overall
-from experiments.analysis.paired import OF_TOKENS, TRUTH, NoNumbers, NotComparable, require_same_windows
-from hma_jax.evaluation.controllability import OPTIONAL_METRICS
+from experiments.analysis.paired import NoNumbers, NotComparable, require_same_windows
+from hma_jax.evaluation.measures import OF_TOKENS, OF_WINDOWS, OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
-
-NOT_OF_MODELS = (TRUTH, "lpips_copy", "counterfactual_copy", "retrieval_chance")
-"""Metrics that depend on the windows alone, not on the model."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ def compare(a: Side, b: Side) -> list[Difference]:
     if not all(_same_chance(*pair, robots) for pair in pairs):
         foreign |= {m for m in shared if m.startswith("retrieval")}
     found = []
-    for metric in nats_first(m for m in shared if m not in (*foreign, *NOT_OF_MODELS)):
+    for metric in nats_first(m for m in shared if m not in (*foreign, *OF_WINDOWS)):
         found += _of_metric(metric, *_panels((a, b), pairs, metric, robots))
     return found
 

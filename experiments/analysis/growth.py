@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from experiments.analysis.changes import METRICS, finished_by_x
+from experiments.analysis.changes import CHANGED, finished_by_x
 from experiments.analysis.compare import Side, overall_difference
 from experiments.analysis.paired import NoNumbers
 from experiments.running.provenance import Provenance
@@ -95,7 +95,7 @@ def _along(
         }
         b, a = (Side(f"{sweep.axis} {x:g}", {s: trials[x][s][1] for s in sorted(seeds)}, "") for x in (first, last))
         for data, robots in groups.items():
-            for metric in METRICS if robots else ():
+            for metric in CHANGED if robots else ():
                 try:
                     d = overall_difference(a, b, metric, robots)
                 except NoNumbers:  # as in `changes`

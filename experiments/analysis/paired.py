@@ -18,9 +18,6 @@ TRUTH = "psnr_copy"
 SAME = 1e-3
 """dB by which two programs may differ on equal images."""
 
-OF_TOKENS = ("cross_entropy", "diffusion_loss", "accuracy", "action_nats", "perplexity", "perplexity_corpus")
-"""Metrics that are comparable within one tokenizer alone."""
-
 
 class NotComparable(ConfigError):
     """Two trials were judged on different windows."""

@@ -19,7 +19,7 @@ from experiments.analysis.rows import OVERALL, Row, curve, difference
 from experiments.sweeps.registry import AXES
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.config import ConfigError, require
-from hma_jax.evaluation.summary import METRICS
+from hma_jax.evaluation.measures import METRICS
 
 FILE = "preregistered.csv"
 """In the folder of predictions, beside the sealed ones of fits."""

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from experiments.terminal.progress import console, tidy_table, wrote
 from experiments.terminal.words import few, plus_minus
 from hma_jax.config import require
+from hma_jax.evaluation.measures import METRICS, OF_TOKENS, OF_WINDOWS
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
@@ -21,12 +22,6 @@ if TYPE_CHECKING:
     from experiments.analysis.compare import Difference, Side
 
 DEFAULT = Path("comparison.csv")
-
-SHOWN = (
-    "cross_entropy", "diffusion_loss", "action_nats", "psnr", "lpips", "delta_psnr", "counterfactual_gain",
-    "action_error",
-)  # fmt: skip
-"""Metrics in the table, as far as both have them; the CSV has all."""
 
 
 def compare(
@@ -68,8 +63,11 @@ def compare(
 
 
 def _table(rows: list[Difference], a: Side, b: Side) -> Table:
-    """A line per scope, overall first; differences of the shown metrics with their standard errors."""
-    metrics = [m for m in SHOWN if any(row.metric == m for row in rows)]
+    """A line per scope, overall first; differences of the metrics that are shown with their standard errors."""
+    from experiments.analysis.intervals import nats_first
+
+    measured = {row.metric for row in rows}
+    metrics = nats_first(name for name, metric in METRICS.items() if metric.compared and name in measured)
     found = {(row.scope, row.metric): row for row in rows}
     ratio = "cross_entropy" in metrics
     columns = ["robot", *(_heading(m, ids=ratio) for m in metrics), *["perplexity"] * ratio]
@@ -84,8 +82,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
 
 def _caption(rows: list[Difference], a: Side, b: Side) -> str:
     """What the errors count, whose training differs, and which seeds, robots and metrics were not compared."""
-    from experiments.analysis.compare import NOT_OF_MODELS, other_sequences
-    from experiments.analysis.paired import OF_TOKENS
+    from experiments.analysis.compare import other_sequences
 
     seeds = max((row.seeds for row in rows), default=1)
     over = f" and over {seeds} seeds" if seeds > 1 else ""
@@ -120,7 +117,7 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
             f" Action-nats are over other numbers of sequences: for each window {of_a} of {escape(a.name)}, {of_b} of "
             f"{escape(b.name)}, the longer list beginning with the shorter one."
         )
-    explained = {row.metric for row in rows} | set(NOT_OF_MODELS)
+    explained = {row.metric for row in rows} | set(OF_WINDOWS)
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
         caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
         explained |= set(OF_TOKENS)
@@ -134,9 +131,9 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
 
 def _heading(metric: str, ids: bool) -> str:
     """A metric with its unit, if it has one. Where tokens are latents, and not `ids`, action-nats are of the loss."""
-    units = {"cross_entropy": "nats", "diffusion_loss": "loss", "action_nats": "nats" if ids else "loss"}
-    units |= {"lpips": "", "action_error": ""}
-    unit = units.get(metric, "dB")
+    from experiments.analysis.intervals import NATS
+
+    unit = ("nats" if ids else "loss") if metric in NATS else METRICS[metric].unit
     return f"{metric} ({unit})" if unit else metric
 
 

@@ -20,6 +20,7 @@ from experiments.terminal.progress import TidyTable, console, say, short, step, 
 from experiments.terminal.words import few, plus_minus
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict, to_dict, to_strict_json
+from hma_jax.evaluation.measures import METRICS
 from hma_jax.evaluation.windows import FILE
 from hma_jax.runtime.files import write_file
 from hma_jax.training.run_lock import CHECKPOINTS, EVALUATION, locked_run
@@ -33,13 +34,6 @@ if TYPE_CHECKING:
 
 MEANS = "evaluation.json"
 """Every metric's mean per dataset, with its error."""
-
-SHOWN = (
-    "perplexity", "accuracy", "diffusion_loss", "psnr", "psnr_last", "psnr_copy", "ssim", "lpips", "lpips_copy",
-    "delta_psnr", "action_nats", "retrieval", "counterfactual_gain", "action_error", "action_gain",
-)  # fmt: skip
-"""Metrics in the table of `hma evaluate`, where a model has them, beside what a copied frame has; evaluation.json
-holds all, and windows.parquet those of every window."""
 
 
 def evaluate(
@@ -160,8 +154,8 @@ def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) ->
 
 
 def table_of(summary: Summary, title: str) -> TidyTable:
-    """What is `SHOWN` of every dataset, and of all."""
-    metrics = [m for m in SHOWN if m in summary.overall]
+    """The metrics that are shown of every dataset, and of all."""
+    metrics = [name for name, metric in METRICS.items() if metric.evaluated and name in summary.overall]
     table = tidy_table(title, "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
         table.add_row(name, *(plus_minus(stats[m].mean, stats[m].sem) if m in stats else "" for m in metrics))

@@ -19,12 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from experiments.analysis.changes import CHANGED
 from experiments.analysis.preregistered import ExpectationOutcome, count_inside
 from experiments.report.fits import VERDICTS
 from experiments.report.pieces import pm, section, table
-from experiments.report.sweeps import CHANGED
 from experiments.sweeps.sweep import Sweep
 from hma_jax.config import ConfigError
+from hma_jax.evaluation.measures import METRICS
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
         predicted = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
         observed = c.lacks if c.observed is None else pm(c.observed, c.seed_sem)
         curve = [html.escape(e.series)] if sweep.has_series else []
-        metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
+        metric, seeds = METRICS[e.metric].heading if e.metric in CHANGED else e.metric, f"{c.seeds} of {c.planned}"
         lines.append([*curve, html.escape(where), metric, predicted, observed, VERDICTS[c.inside], seeds])
     inside, ran = count_inside(own)
     outcome = f"{inside} of {ran} intervals contain the outcome." if ran else "None has an outcome yet."

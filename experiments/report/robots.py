@@ -16,18 +16,15 @@ from experiments.report.pieces import pm, table
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.sweep import POINT, Sweep
+from hma_jax.evaluation.measures import METRICS
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
-COLUMNS = {
-    "perplexity": "perplexity", "diffusion_loss": "diffusion loss", "accuracy": "accuracy", "psnr": "PSNR (dB)",
-    "psnr_copy": "copying (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips_copy": "LPIPS of copying",
-    "action_error": "error of actions (variances)", "action_error_of_mean": "of the mean action",
-}  # fmt: skip
-FOLLOWS = {
-    "action_nats": "action-nats", "retrieval": "retrieval", "delta_psnr": "ΔPSNR (dB)",
-    "counterfactual_gain": "counterfactual (dB)",
-}  # fmt: skip
+COLUMNS = (
+    "perplexity", "diffusion_loss", "accuracy", "psnr", "psnr_copy", "ssim", "lpips", "lpips_copy", "action_error",
+    "action_error_of_mean",
+)  # fmt: skip
+FOLLOWS = ("action_nats", "retrieval", "delta_psnr", "counterfactual_gain")
 ORDER = ("action_nats", "delta_psnr")
 """Controllability: by the first that was measured."""
 
@@ -126,10 +123,10 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
         columns["explained by actions"] = (lambda r: f"{shares[r.name]:.0%}" if r.name in shares else "–", "")
     if are_sorted(robots):
         columns["s.e. above zero"] = (lambda r: _errors(r.errors), "")
-    columns |= {FOLLOWS[m]: (partial(followed, metric=m), cell(OVERALL, m)) for m in follows}
+    columns |= {METRICS[m].heading: (partial(followed, metric=m), cell(OVERALL, m)) for m in follows}
     if not all(math.isnan(robot.ahead) for robot in robots):
         columns["ahead of copying (dB)"] = (_ahead_words, "")
-    columns |= {COLUMNS[m]: (lambda r, m=m: cell(r.name, m), cell(OVERALL, m)) for m in metrics}
+    columns |= {METRICS[m].heading: (lambda r, m=m: cell(r.name, m), cell(OVERALL, m)) for m in metrics}
     columns |= {
         key: (lambda r, key=key: str(data.get(r.name, {}).get(key, "–")), "") for key in ("episodes", "windows")
     }
@@ -152,9 +149,9 @@ def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames
     def counted(metric: str) -> str:
         (more, of), chance = count_following(lines, metric), expected_by_chance(lines, metric)
         beside = "" if chance is None else f" (by chance {chance:.1f})"
-        return f"{FOLLOWS[metric].split(' (')[0]} of {more} of {of} robots{beside}"
+        return f"{METRICS[metric].label} of {more} of {of} robots{beside}"
 
-    order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
+    order = next((METRICS[m].label for m in ORDER if m in follows), "")
     text = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
     if follows:
         parts = "; ".join(map(counted, follows))

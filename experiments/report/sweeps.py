@@ -19,16 +19,13 @@ from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import OVER, USUAL, choose_metrics
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.terminal.words import counted
+from hma_jax.evaluation.measures import METRICS
 
-HEADINGS = {
-    HELD_OUT_LOSS: "nats per token", "perplexity": "perplexity", "diffusion_loss": "diffusion loss",
-    "delta_psnr": "ΔPSNR (dB)", "action_error": "error of actions (variances)",
-}  # fmt: skip
+COLUMNS = (HELD_OUT_LOSS, "perplexity", "diffusion_loss", "delta_psnr", "action_error")
 TWO_PERPLEXITIES = (
     "<p>Perplexity is drawn as exp of the mean nats over robots. That of the tables is the release's, a mean of "
     "exponentials: a few hard robots make most of it, so it may rank models otherwise than nats do.</p>"
 )
-CHANGED = {"cross_entropy": "nats per token", "action_nats": "action-nats", "delta_psnr": "ΔPSNR (dB)"}
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
 
@@ -76,7 +73,7 @@ def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
         any_of = next(iter(by_metric.values()))
         chosen = any_of.chosen + (" (an end of the grid)" if any_of.edge else "")
         lines.append([f"{x:,}", *cells, str(any_of.seeds), chosen])
-    head = [sweep.axis, *(CHANGED[m] for m in metrics), "seeds", "steps chosen, and how often"]
+    head = [sweep.axis, *(METRICS[m].heading for m in metrics), "seeds", "steps chosen, and how often"]
     return (
         "<h4>At the best number of steps for each point</h4>"
         + table(head, lines)
@@ -104,7 +101,7 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
         any_of = next(iter(by_metric.values()))
         whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} with no more"
         lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells, str(any_of.seeds)])
-    head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics), "seeds"]
+    head = ["curve", sweep.axis, "robots", *(METRICS[m].heading for m in metrics), "seeds"]
     return (
         "<h4>Robots whose data grows, and others</h4>"
         + table(head, lines, text=3)
@@ -119,7 +116,7 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
 def _columns(sweep: Sweep, rows: Sequence[Row], role: str = POINT) -> dict[str, dict[float, CurvePoint]]:
     """{metric: {x: point}} of the metrics that there are, as `choose_metrics` says."""
     measured = {r.metric for r in rows if r.sweep == sweep.name}
-    metrics = choose_metrics([m for m in HEADINGS if m in measured], [HELD_OUT_LOSS, *USUAL])
+    metrics = choose_metrics([m for m in COLUMNS if m in measured], [HELD_OUT_LOSS, *USUAL])
     return {m: {p.x: p for p in curve(rows, sweep.name, m, role, robots_vary=sweep.robots_vary)} for m in metrics}
 
 
@@ -146,7 +143,7 @@ def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series:
 
 def _table(sweep: Sweep, rows: Sequence[Row], lines: Sequence[Sequence[str]]) -> str:
     """`lines` of `_lines`."""
-    return _with_parameters([sweep.axis, *(HEADINGS[m] for m in _columns(sweep, rows)), "seeds"], lines)
+    return _with_parameters([sweep.axis, *(METRICS[m].heading for m in _columns(sweep, rows)), "seeds"], lines)
 
 
 def _with_parameters(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
@@ -182,7 +179,7 @@ def _change(changes: Sequence[Change], robots_vary: bool) -> str:
     if not changes:
         return ""
     ends = changes[0]
-    differences = ", ".join(f"{CHANGED[c.metric]} {_with_interval(c, '+', '95 % interval ')}" for c in changes)
+    differences = ", ".join(f"{METRICS[c.metric].heading} {_with_interval(c, '+', '95 % interval ')}" for c in changes)
     over = (
         OVER[robots_vary].replace("seeds", f"seeds ({ends.seeds})")
         if ends.seeds > 1
@@ -226,7 +223,7 @@ def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> 
         lines.append(["default, shuffled actions", *cells, "1", ""])
     head = [sweep.axis]
     for metric in columns:
-        head += [HEADINGS[metric], *["minus the default"] * (metric != "perplexity")]
+        head += [METRICS[metric].heading, *["minus the default"] * (metric != "perplexity")]
     unequal = any(own != seeds.get(sweep.reference_x, own) for own in seeds.values())
     shared = (
         " Where a variant and the default have different seeds (column seeds), the difference is over the seeds that both "

@@ -28,7 +28,7 @@ from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 from experiments.terminal.words import counted
 from hma_jax.config.json import stable_hash
-from hma_jax.evaluation.controllability import OPTIONAL_METRICS
+from hma_jax.evaluation.measures import METRICS, OPTIONAL_METRICS
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable
 
@@ -41,7 +41,7 @@ SEEDS = 3
 EACH, MEAN = 3.0, 2.0
 """Standard errors that each control, and their mean, may be from zero."""
 
-CONTROLLED = {"delta_psnr": "ΔPSNR", "action_nats": "action-nats"}
+CONTROLLED = ("delta_psnr", "action_nats")
 """What has to vanish for a model trained on shuffled actions."""
 
 EXACT = 1e-6
@@ -216,7 +216,7 @@ def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
 
 def _controls(rows: Sequence[Row], metric: str) -> Check:
     """Trials on shuffled actions, each once: their mean has the error of independent ones."""
-    label = CONTROLLED[metric]
+    label = METRICS[metric].label
     name = f"Trained without true actions, {label} is zero."
     controls: dict[str, Row] = {}
     for r in rows:  # a trial that stands on several axes is tested over the most windows

@@ -23,21 +23,6 @@ import jax.numpy as jnp
 
 from hma_jax.evaluation.metrics import difference, mean_over_frames, psnr
 
-OPTIONAL_METRICS = (
-    "action_nats",
-    "retrieval",
-    "retrieval_rank",
-    "retrieval_chance",
-    "counterfactual_psnr",
-    "counterfactual_copy",
-    "counterfactual_gain",
-    "action_error",
-    "action_error_of_mean",
-    "action_gain",
-)
-"""Metrics that are nan for some windows: there is no other episode, no simulator of the robot, or it has no actions to
-predict."""
-
 
 def for_each_sequence(
     evaluate: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BOTU: jax.Array

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import require
-from hma_jax.evaluation.controllability import OPTIONAL_METRICS
+from hma_jax.evaluation.measures import OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import (
     Estimate,
     Stat,
@@ -23,13 +23,6 @@ from hma_jax.evaluation.statistics import (
     stratified,
 )
 from hma_jax.evaluation.windows import WindowTable
-
-METRICS = (
-    "cross_entropy", "perplexity", "perplexity_corpus", "accuracy", "diffusion_loss",
-    "psnr", "psnr_last", "psnr_copy", "psnr_random", "delta_psnr", "ssim", "lpips", "lpips_copy",
-    *OPTIONAL_METRICS,
-)  # fmt: skip
-"""All that an evaluation may measure; which ones depends on the model, its training and the evaluation's settings."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,7 @@ class Summary:
 def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
     """Means over the windows of each dataset, and its perplexities; errors clustered by episode.
 
-    Metrics that some windows lack (`controllability.OPTIONAL_METRICS`) are averaged over the windows that have them; a
+    Metrics that some windows lack (`OPTIONAL_METRICS`) are averaged over the windows that have them; a
     dataset where no window has one lacks the metric.
     `perplexity_group` is the number of windows per exp(mean loss) of the official perplexity.
     """

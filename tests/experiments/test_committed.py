@@ -20,7 +20,7 @@ from experiments.report.draw import draw_again
 from experiments.running.ledger import FINISHED
 from experiments.running.result_file import read_result
 from experiments.running.workspace import Workspace
-from hma_jax.evaluation.summary import METRICS
+from hma_jax.evaluation.measures import METRICS
 from hma_jax.training.runs import load_run
 from tests.experiments.committed_findings import rows_of
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from hma_jax.config import DecodeConfig, EvalConfig, SamplerConfig
-from hma_jax.evaluation.controllability import OPTIONAL_METRICS, action_metrics, counterfactual, for_each_sequence
+from hma_jax.evaluation.controllability import action_metrics, counterfactual, for_each_sequence
 from hma_jax.evaluation.evaluate import Evaluation, evaluate
+from hma_jax.evaluation.measures import OPTIONAL_METRICS
 from hma_jax.evaluation.metrics import MAX_PSNR, psnr
 from hma_jax.evaluation.summary import paired_difference
 from tests.hma_jax.evaluation.fakes import GreyTokenizer, make_batches

@@ -13,6 +13,7 @@ from hma_jax.evaluation import evaluate as module
 from hma_jax.evaluation import protocol
 from hma_jax.evaluation.evaluate import Evaluation, evaluate, in_groups, make_evaluator, one_ahead, plan_groups
 from hma_jax.evaluation.images import decode_in_pieces
+from hma_jax.evaluation.measures import METRICS
 from hma_jax.evaluation.metrics import factored_cross_entropy, psnr, ssim
 from hma_jax.evaluation.protocol import evaluation_inputs
 from hma_jax.evaluation.summary import summarise
@@ -41,7 +42,10 @@ def params():
 
 def run(params, config=CONFIG, settings=EVAL, execution=ExecutionConfig(), **kwargs) -> Evaluation:
     batches = make_batches(config, **kwargs)
-    return evaluate(params, config, TABLE, TOKENIZER, batches, settings, execution=execution)
+    result = evaluate(params, config, TABLE, TOKENIZER, batches, settings, execution=execution)
+    measured = {*result.windows.metrics, *result.summary.overall}
+    assert measured <= METRICS.keys(), "add what is measured to hma_jax/evaluation/measures.py"
+    return result
 
 
 def test_metrics_cover_the_valid_windows_of_each_dataset(params):

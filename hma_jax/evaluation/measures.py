@@ -1,0 +1,59 @@
+"""The metrics of an evaluation: what each is called and what it may be compared with. What they mean is in `protocol`,
+`images` and `controllability`, and in docs/results.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Metric:
+    label: str  # in headings
+    unit: str = ""  # beside the label, or the name; "": none, or the label says it
+    of_tokens: bool = False  # comparable between models on the same tokens alone
+    of_windows: bool = False  # depends on the windows alone, not on the model
+    optional: bool = False  # nan for some windows: see OPTIONAL_METRICS
+    evaluated: bool = False  # in the table of `hma evaluate`; its files hold all
+    compared: bool = False  # in the table of `hma compare`; its file holds all
+
+    @property
+    def heading(self) -> str:
+        return f"{self.label} ({self.unit})" if self.unit else self.label
+
+
+METRICS = {
+    "cross_entropy": Metric("nats per token", of_tokens=True, compared=True),
+    "perplexity": Metric("perplexity", of_tokens=True, evaluated=True),
+    "perplexity_corpus": Metric("perplexity of all windows", of_tokens=True),
+    "accuracy": Metric("accuracy", of_tokens=True, evaluated=True),
+    "diffusion_loss": Metric("diffusion loss", of_tokens=True, evaluated=True, compared=True),
+    "psnr": Metric("PSNR", "dB", evaluated=True, compared=True),
+    "psnr_last": Metric("PSNR of the last frame", "dB", evaluated=True),
+    "psnr_copy": Metric("copying", "dB", of_windows=True, evaluated=True),
+    "psnr_random": Metric("PSNR of the last frame, random actions", "dB"),
+    "ssim": Metric("SSIM", evaluated=True),
+    "lpips": Metric("LPIPS", evaluated=True, compared=True),
+    "lpips_copy": Metric("LPIPS of copying", of_windows=True, evaluated=True),
+    "delta_psnr": Metric("ΔPSNR", "dB", evaluated=True, compared=True),
+    "action_nats": Metric("action-nats", of_tokens=True, optional=True, evaluated=True, compared=True),
+    "retrieval": Metric("retrieval", optional=True, evaluated=True),
+    "retrieval_rank": Metric("rank of the true actions", optional=True),
+    "retrieval_chance": Metric("retrieval by chance", optional=True, of_windows=True),
+    "counterfactual_psnr": Metric("PSNR under other actions", "dB", optional=True),
+    "counterfactual_copy": Metric("copying under other actions", "dB", optional=True, of_windows=True),
+    "counterfactual_gain": Metric("counterfactual", "dB", optional=True, evaluated=True, compared=True),
+    "action_error": Metric("error of actions", "variances", optional=True, evaluated=True, compared=True),
+    "action_error_of_mean": Metric("of the mean action", optional=True),
+    "action_gain": Metric("gain over the mean action", optional=True, evaluated=True),
+}
+"""All that an evaluation may measure, in the order of tables; which ones depends on the model, its training and the
+evaluation's settings."""
+
+OPTIONAL_METRICS = tuple(name for name, metric in METRICS.items() if metric.optional)
+"""Metrics that are nan for some windows: there is no other episode, no simulator of the robot, or it has no actions to
+predict."""
+
+OF_TOKENS = tuple(name for name, metric in METRICS.items() if metric.of_tokens)
+
+OF_WINDOWS = tuple(name for name, metric in METRICS.items() if metric.of_windows)
