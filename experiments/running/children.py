@@ -13,6 +13,8 @@ import signal
 import socket
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from experiments.running.slots import Slot
@@ -26,6 +28,9 @@ _PARENT, _CORES, _ACCELERATOR = "HMA_PARENT_PID", "HMA_CORES", "HMA_ACCELERATOR"
 CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
 """Variables of a slot that the user's environment overrides. Which accelerators a slot has is not among them: they are
 some of those that the user allows."""
+
+LOGGERS = ("hma_jax", "data_pipelines", "experiments")
+"""Parents of all loggers of this project."""
 
 
 class NoAccelerator(ConfigError):
@@ -98,6 +103,23 @@ def silence_background() -> None:
     sys.unraisablehook = _say_nothing
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+
+
+@contextmanager
+def plain_messages() -> Iterator[None]:
+    """What this project logs is a line on standard error, while the block runs, also after a library has called
+    `logging.basicConfig`, which would begin it with a level and a module."""
+    handler, loggers = logging.StreamHandler(), [logging.getLogger(name) for name in LOGGERS]
+    handler.setLevel(logging.WARNING)
+    for logger in loggers:
+        logger.addHandler(handler)
+        logger.propagate = False
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+            logger.propagate = True
 
 
 def background_is_silent() -> bool:

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
-from experiments.running.children import background_is_silent, enter_child, silence_background
+from experiments.running.children import background_is_silent, enter_child, plain_messages, silence_background
 from experiments.running.launchers.base import GRACE_SECONDS
 from hma_jax.runtime.exits import Terminated, sigterm_as_interrupt
 
@@ -94,7 +94,7 @@ def _answer(
         enter_child(parent)
         if silent:
             silence_background()
-        with sigterm_as_interrupt():
+        with sigterm_as_interrupt(), plain_messages():
             answer = True, function(*arguments)
     except BaseException as error:  # also what ends a process: the parent raises it
         answer = False, _portable(error)

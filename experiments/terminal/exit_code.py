@@ -6,11 +6,11 @@ import os
 import select
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 from data_pipelines.errors import DataError, EpisodeError
 from experiments.run_study import TrialsFailed
-from experiments.running.children import silence_background
+from experiments.running.children import plain_messages, silence_background
 from experiments.terminal.progress import errors
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
@@ -43,7 +43,7 @@ def exit_code_of(
     if own_process and not debug:
         silence_background()
     try:
-        with sigterm_as_interrupt():
+        with sigterm_as_interrupt(), plain_messages() if own_process else nullcontext():
             try:
                 _require_utf8(sys.argv[1:] if arguments is None else arguments)
                 work()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 
 import jax
@@ -55,6 +56,18 @@ def test_a_disk_that_does_not_answer_is_worth_another_start_and_a_full_one_is_no
         raise SaveError("the checkpoint of step 4 could not be written", passing)
 
     assert exit_code_of(work) == code
+
+
+def test_a_message_is_the_same_line_whatever_libraries_have_done_to_the_log(capsys):
+    """It began with WARNING:hma_jax.tokenizers.python: in some commands."""
+    other = logging.StreamHandler()
+    other.setFormatter(logging.Formatter(logging.BASIC_FORMAT))
+    logging.root.addHandler(other)
+    try:
+        assert exit_code_of(lambda: logging.getLogger("hma_jax.x").warning("the tokenizer runs code")) == Exit.DONE
+    finally:
+        logging.root.removeHandler(other)
+    assert capsys.readouterr().err == "the tokenizer runs code\n"
 
 
 def test_every_program_refuses_a_path_that_is_not_utf8_before_its_work(monkeypatch, capsys):
