@@ -61,19 +61,26 @@ def adopt_tokenizer(
     source: Path, study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
 ) -> None:
     """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already. Notes say of
-    which `sources` it may know held-out frames, and which unseen robots it was trained on. The stamp of the copy says
-    what was known of the training.
+    which `sources` it may know held-out frames, or that this is not known, and which unseen robots it was trained on.
+    The stamp of the copy says what was known of the training.
 
     Raises ConfigError if it is not the kind that the study is made for, or if another one is there, unless
     `replace` allows it.
     """
     from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
+    from hma_jax.tokenizers.pixels import PixelTokenizer
 
     tokenizer = load_tokenizer(source, expect=study.tokenizer)
     if _adopted(tokenizer, source, workspace, replace):
         return
     training = _training(read_stamp(source))
-    _say_what_it_may_know(training, study, sources)
+    if "data" in training.inputs:
+        _say_what_it_may_know(training, study, sources)
+    elif tokenizer.kind != PixelTokenizer.kind:
+        say(
+            "note: it is not written down on which frames the tokenizer was trained. If on datasets of this study, it may "
+            "know frames that are held out here, and its PSNR of them, like that of models of its tokens, is too high"
+        )
     aside = workspace.root / "tokenizer.adopted"
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
@@ -145,7 +152,7 @@ def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[So
     the study with fewer episodes held out (those are among these) or with others, on datasets before they grew (the
     hold-out is drawn among all episodes of a dataset), or on robots that no model of the study is trained on."""
     trained_with = training.inputs.get("store", {})
-    data = {name: facts for name, facts in training.inputs.get("data", {}).items() if name in study.all_names()}
+    data = {name: facts for name, facts in training.inputs["data"].items() if name in study.all_names()}
     more = [
         f"store.{name}: {trained_with[name]} -> {value}"
         for name, value in to_dict(study.store.held_out).items()

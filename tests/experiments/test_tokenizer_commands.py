@@ -87,7 +87,7 @@ def test_released_model_is_evaluated_on_ids_of_an_imported_tokenizer(arm, tmp_pa
 
 
 @pytest.mark.parametrize("kind", ["svd-vae", "pixels"])
-def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind, arm, tmp_path):
+def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind, arm, tmp_path, capsys):
     if kind == "pixels":
         tokenizer = tmp_path / "tokenizer"
         assert hma("tokenizer", "pixels", "--out", tokenizer, "--image-size", 16, "--patch", 4) == 0
@@ -95,6 +95,8 @@ def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind,
         tokenizer = imported(tmp_path, kind)
     common = ("--preset", "smoke-continuous", "--out", tmp_path / "out", "--data", arm)
     assert hma("tokenize", *common, "--tokenizer", tokenizer) == 0
+    unknown = "note: it is not written down on which frames the tokenizer was trained"  # pixels are of no training
+    assert capsys.readouterr().out.count(unknown) == (kind != "pixels")
     prepared = open_prepared_data(Workspace(tmp_path / "out"))
     assert prepared.tokenizer.identity == load_tokenizer(tokenizer).identity
     table = prepared.store.embodiment_table([ARM.name], rate=2.0)
