@@ -23,6 +23,7 @@ from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_pending_stop, sigterm_as_interrupt
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
+from hma_jax.runtime.user_code import raising_as_called
 
 POLL_SECONDS = 30.0
 """Seconds between two checks that the trial is still ours."""
@@ -81,17 +82,18 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
 
     report = _ProgressFile(directory / PROGRESS, lost)
     try:
-        require_accelerator()
-        (trial, execution, shared), inputs = read_job(job), inputs_of(job["provenance"])
-        record_start(directory, inputs, closure)
-        if branched_from := begin_shared(directory, shared.before):
-            print(f"goes on from step {branched_from[1]} of trial {branched_from[0]}", flush=True)
-        begin = None
-        if trial.source:
-            source = directory.parent / trial_id(trial.source, inputs) / RUN
-            begin = partial(initial_from_trial, trial, source)
-        workspace = Workspace(directory.parent.parent)
-        run_trial(trial, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report)
+        with raising_as_called():
+            require_accelerator()
+            (trial, execution, shared), inputs = read_job(job), inputs_of(job["provenance"])
+            record_start(directory, inputs, closure)
+            if branched_from := begin_shared(directory, shared.before):
+                print(f"goes on from step {branched_from[1]} of trial {branched_from[0]}", flush=True)
+            begin = None
+            if trial.source:
+                source = directory.parent / trial_id(trial.source, inputs) / RUN
+                begin = partial(initial_from_trial, trial, source)
+            workspace = Workspace(directory.parent.parent)
+            run_trial(trial, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report)
         return Exit.DONE
     except Interrupted as request:
         return request.exit

@@ -14,6 +14,7 @@ from experiments.running.children import plain_messages, silence_background
 from experiments.terminal.progress import errors
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
+from hma_jax.runtime.user_code import raising_as_called
 
 OUT_OF_MEMORY = (
     "(The memory of a device is too small for this. Training needs less with --set execution.remat=everything, "
@@ -46,7 +47,8 @@ def exit_code_of(
         with sigterm_as_interrupt(), plain_messages() if own_process else nullcontext():
             try:
                 _require_utf8(sys.argv[1:] if arguments is None else arguments)
-                work()
+                with raising_as_called():
+                    work()
             except SystemExit:  # of --help
                 sys.stdout.flush()
                 raise

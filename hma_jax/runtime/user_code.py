@@ -1,4 +1,4 @@
-"""Python code of the user: which is run at all, and errors that name its line."""
+"""Python code of the user: which is run at all, and errors that name its line, also from within compiled programs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from pathlib import Path
 
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.files import cache_directory
+
+_raised: list[BaseException] = []
+"""The last exception that ended a call from a compiled program."""
 
 
 @contextmanager
@@ -30,6 +33,31 @@ def naming_line(path: Path, page: str, *others: type[Exception]) -> Iterator[Non
         raise ConfigError(
             f"{where}: {words}; correct the file ({page}), or add --debug to see the traceback"
         ) from error
+
+
+@contextmanager
+def called_from_program() -> Iterator[None]:
+    """Around what a compiled program calls on the host: keeps the exception that it raises, of which JAX tells no more
+    than the text."""
+    try:
+        yield
+    except BaseException as error:  # an interrupt by the user too
+        _raised[:] = [error]
+        raise
+
+
+@contextmanager
+def raising_as_called() -> Iterator[None]:
+    """Around compiled programs: raises the exception of a call on the host, in place of JAX's, which has its traceback
+    for a text."""
+    try:
+        yield
+    except Exception as error:
+        for original in _raised:
+            if original is not error and (str(original) or type(original).__name__) in str(error):
+                _raised.clear()
+                raise original from original.__cause__  # the traceback in the code itself
+        raise
 
 
 def trust(identity: str) -> None:

@@ -30,7 +30,7 @@ from jax.experimental.buffer_callback import Buffer, ExecutionContext, buffer_ca
 from hma_jax.config import PythonConfig, require
 from hma_jax.config.json import from_dict, identity_of
 from hma_jax.model.params import Declared, Params, declare
-from hma_jax.runtime.user_code import naming_line
+from hma_jax.runtime.user_code import called_from_program, naming_line
 from hma_jax.tokenizers.base import Tokenizer, fitting_piece, in_pieces
 
 FILE, FUNCTION = "tokenizer.py", "make_tokenizer"
@@ -167,11 +167,15 @@ def _call_host(
     it keeps busy. A buffer is read in place.
     """
 
+    def on_host(x: Any) -> np.ndarray:
+        with called_from_program():
+            return function(np.asarray(x))
+
     def in_place(_: ExecutionContext, out: Buffer, buffer: Buffer) -> None:
-        np.asarray(out)[...] = function(np.asarray(buffer))
+        np.asarray(out)[...] = on_host(buffer)
 
     def copied(x: jax.Array) -> jax.Array:
-        return jax.pure_callback(lambda x: function(np.asarray(x)), described, x)
+        return jax.pure_callback(on_host, described, x)
 
     return jax.lax.platform_dependent(x, cpu=buffer_callback(in_place, described), default=copied)
 

@@ -10,7 +10,9 @@ import pytest
 
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console
+from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit
+from hma_jax.runtime.user_code import called_from_program
 from hma_jax.training.checkpoints import SaveError
 
 
@@ -48,6 +50,29 @@ def test_another_error_of_the_runtime_is_a_bug():
 
     with pytest.raises(jax.errors.JaxRuntimeError):
         exit_code_of(work)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (ConfigError("no number"), Exit.REFUSED, "error: no number\n"),
+        (KeyboardInterrupt(), Exit.INTERRUPTED, "interrupt"),
+    ],
+)
+def test_an_error_on_the_host_within_a_compiled_program_is_what_it_is_elsewhere(error, code, said, capsys):
+    """It was JAX's, a bug with its traceback."""
+
+    def fail(x):
+        with called_from_program():
+            raise error
+
+    def work() -> None:
+        jax.block_until_ready(jax.pure_callback(fail, jax.ShapeDtypeStruct((), "float32"), 1.0))
+
+    assert exit_code_of(work) == code
+    assert capsys.readouterr().err.startswith(said)
+    with pytest.raises(ZeroDivisionError):  # it has been said
+        exit_code_of(lambda: 1 / 0)
 
 
 @pytest.mark.parametrize(("passing", "code"), [(True, Exit.LOST), (False, Exit.FAILED)])

@@ -15,6 +15,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import jax
 import pytest
 from jax.errors import JaxRuntimeError
 
@@ -31,6 +32,7 @@ from hma_jax.config import ConfigError
 from hma_jax.runtime import locks
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely
+from hma_jax.runtime.user_code import called_from_program
 from tests.experiments import fake_trial
 
 
@@ -266,6 +268,23 @@ def test_a_device_that_fails_is_no_fault_of_the_trial(says, of_device):
     assert trial_main._is_of_device(JaxRuntimeError(says)) == of_device and not trial_main._is_of_device(
         ValueError(says)
     )
+
+
+def test_a_user_s_code_that_fails_within_a_compiled_program_is_no_fault_of_a_device(
+    tmp_path, monkeypatch, in_this_process
+):
+    """The trial was tried again, on one place after another."""
+
+    def fail(_):
+        with called_from_program():
+            raise ConfigError("no number")
+
+    program = lambda: jax.block_until_ready(jax.pure_callback(fail, jax.ShapeDtypeStruct((), "float32"), 1.0))
+    monkeypatch.setattr(trial_main, "require_accelerator", program)
+    (tmp_path / "job.json").write_text("{}")
+    assert trial_main.main(tmp_path) == Exit.FAILED
+    state = outcome(tmp_path, AttemptEnd(Exit.FAILED))
+    assert (state.event, state.message) == ("failed", "no number")
 
 
 def test_the_reason_is_kept_of_a_trial_that_is_lost_before_it_has_begun(tmp_path):
