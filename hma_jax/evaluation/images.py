@@ -109,7 +109,7 @@ def decode_in_pieces(to_images: ToImages, piece: int, params: Params, tokens: ja
     if count <= piece:
         return to_images(params, tokens)
     missing = -count % piece
-    padded = jnp.pad(tokens, [(0, missing)] + [(0, 0)] * (tokens.ndim - 1))
+    padded = jnp.pad(tokens, [(0, missing)] + [(0, 0)] * (tokens.ndim - 1), mode="edge")  # as `in_pieces`
     images = jax.lax.map(lambda x: to_images(params, x), padded.reshape(-1, piece, *tokens.shape[1:]))
     return images.reshape(-1, *images.shape[2:])[:count]
 

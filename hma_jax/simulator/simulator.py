@@ -41,8 +41,8 @@ class Simulator:
     decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
     frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
     says. A model trained on passive video ignores actions. ConfigError is raised
-    for whatever cannot be done; nothing has changed then. After a fault of the device every episode may have to begin
-    again (`counts` is 0 then).
+    for whatever cannot be done; nothing has changed then. After a fault of the device, and where a tokenizer or a model
+    makes what are no tokens (NaN, say), every episode may have to begin again (`counts` is 0 then).
     """
 
     made_in: ClassVar[int | None] = None
@@ -196,6 +196,7 @@ class Simulator:
         with self._donating_state():
             state, *made = self._programs.reset_from_images(self._programs.weights, self._state, at)
             tokens, seen = map(np.asarray, made)
+            self.tokenizer.require_tokens(tokens, "encoding the start", "; correct the tokenizer")
             self._state = state
         for i, (b, episode) in enumerate(new.items()):
             episode.frames.extend(tokens[i, : at.given[i]])
@@ -287,6 +288,8 @@ class Simulator:
         with self._donating_state():
             state, tokens, seen = self._programs.advance(self._programs.weights, self._state, rows_n, chunk_nU, seeds)
             tokens, seen = np.asarray(tokens), np.asarray(seen)
+            advice = "; did it diverge? `hma branch` makes a run of an earlier checkpoint"
+            self.tokenizer.require_tokens(tokens, "the model", advice)
             self._state = state
         for b, frame, chunk in zip(chunks, tokens, chunk_nU, strict=False):
             episode = self._running_episode(b)

@@ -165,6 +165,14 @@ class Tokenizer(abc.ABC):
         tokens = self._checked(np.asarray(tokens))
         return in_pieces(lambda piece: self._decode(self._device_params, piece), tokens, self.at_once)
 
+    def require_tokens(self, tokens: np.ndarray, what: str, advice: str) -> None:
+        """Raises ConfigError, which begins with `what` made them and ends with `advice`, for values that are no tokens.
+        Compiled programs do not look: what they make is checked where it comes to the host."""
+        low, high = tokens.min(), tokens.max()
+        good = np.isfinite([low, high]).all() if self.channels else 0 <= low <= high < self.vocab_size
+        wanted = "finite numbers" if self.channels else f"in [0, {self.vocab_size})"
+        require(bool(good), f"{what} gives values from {low} to {high}; tokens must be {wanted}{advice}")
+
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         """Pure: `decode` without its checks of the tokens."""
         # DIFFERS: the release truncates, which darkens every image by half a grey level.
@@ -248,7 +256,7 @@ def fitting_piece(image_shape: tuple[int, int]) -> int:
 
 
 def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int) -> np.ndarray:
-    """Applies `function` to consecutive pieces of exactly `size` rows; the last one is padded.
+    """Applies `function` to consecutive pieces of exactly `size` rows; the last one is padded with copies of a row.
 
     One static shape means one compilation, and rounding that does not depend on the number of rows: a latent near zero
     must not change its sign with the batch it came in.
@@ -259,6 +267,7 @@ def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int
         piece = rows[start : start + size]
         missing = size - len(piece)
         if missing:
-            piece = np.concatenate([piece, np.zeros((missing, *piece.shape[1:]), piece.dtype)])
+            # Not with zeros, of which a network that normalises may make no numbers.
+            piece = np.concatenate([piece, np.repeat(piece[-1:], missing, axis=0)])
         results.append(function(piece))  # dispatched asynchronously: the device works while the next is sliced
     return np.concatenate([np.asarray(r) for r in results])[: len(rows)]

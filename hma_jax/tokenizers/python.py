@@ -41,6 +41,9 @@ FACTS = ("image_size", "grid", "vocab_size", "factors", "channels")
 NEIGHBOURS = 0.01
 """Tokens, of all, that may depend on the other images of a batch: rounding turns an id that is all but another one."""
 
+GREY_LEVELS = 1.0
+"""By which, in the mean, an image may depend on how many are decoded: other sums of a network in bfloat16, say."""
+
 log = logging.getLogger(__name__)
 
 
@@ -79,6 +82,8 @@ class PythonTokenizer(Tokenizer):
             self._decode = lambda _, tokens: self._host_decode(tokens)
         else:
             self._set_up(says, jax.tree.map(jnp.asarray, own.params), piece, jax.local_devices())
+            decode = self._jit_over_devices(self.decode_fn)
+            self._decode = lambda params, tokens: self._rounded(np.asarray(decode(params, tokens)), tokens)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), piece=self.piece), (self.config, self.folder)
@@ -95,10 +100,7 @@ class PythonTokenizer(Tokenizer):
     def encode(self, images: np.ndarray) -> np.ndarray:
         """As `Tokenizer.encode`. Raises ConfigError for what are no tokens."""
         tokens = super().encode(images)
-        low, high = tokens.min(), tokens.max()
-        good = np.isfinite([low, high]).all() if self.channels else 0 <= low <= high < self.vocab_size
-        wanted = "finite numbers" if self.channels else f"in [0, {self.vocab_size})"
-        require(bool(good), f"{self._file}: encode gives values from {low} to {high}; tokens must be {wanted}")
+        self._require_encoded(tokens)
         return tokens
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
@@ -118,18 +120,23 @@ class PythonTokenizer(Tokenizer):
             images = self._own.decode(params, tokens)
         return jnp.clip(self._checked_images(images, len(tokens)).astype(jnp.float32), 0, 255)
 
+    def decode_alone(self, tokens: np.ndarray) -> np.ndarray:
+        """Tokens [S] or [S, C] of one image -> uint8 [H, W, 3]: not padded to a piece, as a simulator decodes."""
+        return np.asarray(self._decode(self._device_params, np.stack([tokens] * self._mesh.size)))[0]
+
     # --- On the host -------------------------------------------------------------------------
 
     def _host_encode(self, images: np.ndarray) -> np.ndarray:
         with self._lock, naming_line(self._file, PAGE):  # several devices may call at once
             tokens = np.asarray(self._own.encode(np.array(images)))
-        return self._checked_encoding(tokens, len(images))
+        tokens = self._checked_encoding(tokens, len(images))
+        self._require_encoded(tokens)
+        return tokens
 
     def _host_decode(self, tokens: np.ndarray) -> np.ndarray:
         with self._lock, naming_line(self._file, PAGE):
             images = np.asarray(self._own.decode(np.array(tokens)))
-        images = self._checked_images(images, len(tokens))
-        return images if images.dtype == np.uint8 else np.clip(np.rint(images), 0, 255).astype(np.uint8)
+        return self._rounded(self._checked_images(images, len(tokens)), tokens)
 
     # --- What the code gives back ------------------------------------------------------------
 
@@ -144,6 +151,23 @@ class PythonTokenizer(Tokenizer):
         kinds, words = ("f", "float") if self.channels else ("iu", "integers")
         self._require_shape("encode", tokens, kinds, words, shape)
         return tokens.astype(dtype)
+
+    def _require_encoded(self, tokens: np.ndarray) -> None:
+        self.require_tokens(tokens, f"{self._file}: encode", f" ({PAGE})")
+
+    def _rounded(self, images: np.ndarray, tokens: np.ndarray) -> np.ndarray:
+        """uint8. ConfigError for images that are not finite, unless their tokens are not either: a model made those,
+        and whoever has them says so."""
+        if images.dtype == np.uint8:
+            return images
+        wrong = ~np.isfinite(images).all((1, 2, 3)) & np.isfinite(tokens).reshape(len(tokens), -1).all(1)
+        require(
+            not wrong.any(),
+            f"{self._file}: decode gives values that are not finite in {wrong.sum()} of {len(wrong)} images; floats must "
+            f"be in 0..255 and numbers ({PAGE})",
+        )
+        with np.errstate(invalid="ignore"):
+            return np.clip(np.rint(images), 0, 255).astype(np.uint8)
 
     def _checked_images(self, images: Any, count: int) -> Any:
         self._require_shape("decode", images, "uf", "uint8, or float in 0..255,", (count, *self.image_shape, 3))
@@ -181,20 +205,29 @@ def _call_host(
 
 
 def try_out(tokenizer: PythonTokenizer) -> None:
-    """Encodes and decodes a few images of noise. Raises ConfigError for results of another shape, type or range than
-    the code says, for black images, and if an image's tokens depend on the images beside it."""
-    images = np.random.default_rng(0).integers(0, 256, (3, *tokenizer.image_shape, 3), np.uint8)
+    """Encodes and decodes a few images: of noise, a black and a white one. Raises ConfigError for results of another
+    shape, type or range than the code says, for black images, and if an image's tokens, or what is decoded from them,
+    depend on the images beside it."""
+    file, images = tokenizer.folder / FILE, np.zeros((5, *tokenizer.image_shape, 3), np.uint8)
+    images[:3] = np.random.default_rng(0).integers(0, 256, images[:3].shape, np.uint8)
+    images[4] = 255
     together, alone = tokenizer.encode(images), tokenizer.encode(images[1:2])
     other = (np.abs(together[1:2] - alone.astype(np.float64)) > 1e-2 * np.abs(alone)).mean()
     require(
         other <= NEIGHBOURS,
-        f"{tokenizer.folder / FILE}: an image beside others has other tokens ({other:.0%} of them) than alone; encode "
-        "must be deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
+        f"{file}: an image beside others has other tokens ({other:.0%} of them) than alone; encode must be "
+        "deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
     )
+    decoded = tokenizer.decode(together)
     require(
-        tokenizer.decode(together).max() > 1,
-        f"{tokenizer.folder / FILE}: decode makes black images of noise; floats must be in 0..255 (not in 0..1 or -1..1) "
-        f"and numbers ({PAGE})",
+        decoded.max() > 1,
+        f"{file}: decode makes black images of noise; floats must be in 0..255 (not in 0..1 or -1..1) ({PAGE})",
+    )
+    apart = np.abs(decoded[1].astype(np.float64) - tokenizer.decode_alone(together[1])).mean()
+    require(
+        apart <= GREY_LEVELS,
+        f"{file}: an image decoded beside others is another one (by {apart:.1f} grey levels) than alone; decode must be "
+        "deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
     )
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from hma_jax.config import ConfigError, PixelsConfig, PythonConfig
 from hma_jax.evaluation.images import decode_in_pieces
+from hma_jax.runtime.user_code import raising_as_called
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer, trust_tokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.python import PythonTokenizer, try_out
@@ -43,6 +44,23 @@ class Bright:
 
 
 make_tokenizer = Bright
+"""
+HOST = """
+import numpy as np
+
+
+class Bright:
+    image_size, grid, channels = 8, 2, 3
+
+    def encode(self, images):
+        return np.float32(images.reshape(-1, 2, 4, 2, 4, 3).mean((2, 4)).reshape(-1, 4, 3) / 128)
+
+    def decode(self, latents):
+        return (latents * 128).reshape(-1, 2, 2, 3).repeat(4, 1).repeat(4, 2)
+
+
+def make_tokenizer(folder):
+    return Bright()
 """
 NETWORK = """
 def halves(images):
@@ -175,7 +193,6 @@ def test_two_folders_have_files_of_the_same_name(bright, tmp_path):
     assert (second.encode(images) > first.encode(images)).all()
 
 
-@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -185,18 +202,22 @@ def test_two_folders_have_files_of_the_same_name(bright, tmp_path):
         ("def decode", "def decoded", "returns has no decode; add it"),
         ("vocab_size = LEVELS**3", "width = 3", "ids of a vocab_size of at least 2, or latents"),
         ("vocab_size = LEVELS**3", "vocab_size, factors = 1000, 2", "is no whole number to the power of factors 2"),
-        ("vocab_size = LEVELS**3", "vocab_size = 100", r"encode gives values from 333 to 444; tokens must be in \[0, 100"),
+        ("vocab_size = LEVELS**3", "vocab_size = 100", r"encode gives values from 111 to 555; tokens must be in \[0, 100"),
         (".reshape(len(images), 64)", "", r"encode must give integers \[64, 64\], not int64 \[64, 8, 8\]"),
         ("return colours.repeat(8, 1)", "return colours", r"decode must give uint8, .*\[64, 64, 64, 3\], not uint8 \[64, 8"),
         (".repeat(8, 2)", ".repeat(8, 2) / 255", "decode makes black images of noise; floats must be in 0..255"),
-        (".repeat(8, 2)", ".repeat(8, 2) * np.nan", "decode makes black images of noise; floats must be .* and numbers"),
+        (".repeat(8, 2)", ".repeat(8, 2) * np.r_[[1] * 63, [np.nan]][:, None]", "decode gives values that are not finite in 64"),
+        (".repeat(8, 2)", ".repeat(8, 2) * np.where(ids < 999, 1, np.nan)[:, :1, None, None]", "not finite in 60 of 64"),
+        (".repeat(8, 2)", ".repeat(8, 2) - ids.mean() / 20", r"decoded beside others is another one \(by .* grey levels"),
+        (".repeat(8, 2)", ".repeat(8, 2) + np.random.default_rng().normal(0, 9)", "decode must be deterministic"),
+        ("* LEVELS / 256", "* LEVELS / 255", r"encode gives values from 0 to 1110; tokens must be in \[0, 1000"),
         ("vocab_size = LEVELS**3", "vocab_size, piece = 1000, 8.0", "piece must be a whole number, not 8.0"),
-        ("images.reshape", "(images - images.mean(0)).reshape", "an image beside others has other tokens .* than alone"),
+        ("images.reshape", "(images / 2 + images.mean(0) / 2).reshape", "an image beside others has other tokens .* than alone"),
         ("LEVELS / 256", "LEVELS / none", "line 14: NameError: name 'none' is not defined; correct the file"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(tmp_path, old, new, message):
-    code = COLOURS.replace("images.reshape", "np.clip(images, 30, 150).reshape") if "333" in message else COLOURS
+    code = COLOURS.replace("images.reshape", "np.clip(images, 30, 150).reshape") if "555" in message else COLOURS
     with pytest.raises(ConfigError, match=message):
         try_out(PythonTokenizer(None, write(tmp_path / "mine", code, it=(old, new))))
 
@@ -211,6 +232,38 @@ def test_numbers_of_numpy_are_facts_too(tmp_path):
 def test_a_folder_without_code_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"mine/tokenizer.py: no such file; a tokenizer of your own is a folder with"):
         PythonTokenizer(None, tmp_path / "mine")
+
+
+@pytest.mark.parametrize(
+    ("code", "old", "new", "message"),
+    [
+        (COLOURS, "LEVELS / 256)", "LEVELS / 255)", r"encode gives values from 1110 to 1110; tokens must be in \[0, 1000"),
+        (HOST, "np.float32(", "np.float32(np.inf * ", "encode gives values from inf to inf; tokens must be finite numbers"),
+        (HOST, "(latents * 128)", "(latents * [128, 128, np.nan])", "decode gives values that are not finite in 1 of 1 im"),
+        (HOST, "(latents * 128)", "(latents * wide)", "tokenizer.py, line 12: NameError: name 'wide' is not defined; cor"),
+        (HOST, ".repeat(4, 2)", "", r"decode must give uint8, .*\[1, 8, 8, 3\], not float32 \[1, 8, 2, 3\]"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_compiled_program_is_named_as_on_the_host(tmp_path, code, old, new, message):
+    """NaN became black pixels, and an id that is none went to the model."""
+    tokenizer = PythonTokenizer(None, write(tmp_path / "mine", code, it=(old, new)))
+    white = np.full((1, *tokenizer.image_shape, 3), 255, np.uint8)
+    program = jax.jit(lambda images: tokenizer.decode_fn({}, tokenizer.encode_fn({}, images)))
+    with pytest.raises(ConfigError, match=message), raising_as_called():
+        jax.block_until_ready(program(white))
+
+
+def test_latents_of_a_model_that_are_no_numbers_are_no_fault_of_the_decoder(tmp_path):
+    """Whoever has them says that the model diverged."""
+    tokenizer = PythonTokenizer(None, write(tmp_path / "mine", HOST))
+    latents = np.stack([np.full((4, 3), 1, np.float32), np.full((4, 3), np.nan, np.float32)])
+    assert np.asarray(jax.jit(tokenizer.decode_fn)({}, latents)).mean((1, 2, 3)).tolist() == [128, 0]
+
+
+def test_images_of_jax_code_must_be_numbers(bright):
+    write(bright, JAX, it=('tokens / params["gain"]', 'tokens / params["gain"] * np.float32([1, 1, np.nan])'))
+    with pytest.raises(ConfigError, match="decode gives values that are not finite in 2 of 2 images"):
+        try_out(PythonTokenizer(None, bright))
 
 
 def test_shapes_of_jax_code_are_checked(bright):

@@ -444,6 +444,27 @@ def test_a_program_that_fails_with_the_state_in_its_hands_ends_all_episodes_and_
     np.testing.assert_array_equal(run(sim, plan), made)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("reset_from_images", "encoding the start gives values from -1 "), ("advance", "the model gives values from -1 ")],
+)
+def test_what_a_program_makes_must_be_tokens(monkeypatch, name: str, message: str):
+    """Images of what are none, of NaN say, are images too: black ones."""
+    sim = simulator(episodes=2)
+    sim.reset([start(0, 2), start(1, 2)])
+    program = getattr(sim._programs, name)
+
+    def diverged(*arguments):
+        state, tokens, seen = program(*arguments)
+        return state, tokens.at[0, 0].set(-1), seen
+
+    monkeypatch.setattr(sim, "_programs", copy(sim._programs))
+    monkeypatch.setattr(sim._programs, name, diverged)
+    with pytest.raises(ConfigError, match=message + r"to .*; tokens must be in \[0, 16\); "):
+        DEEDS[name](sim)
+    assert sim.counts == (0, 0)
+
+
 def test_a_program_that_fails_before_it_has_the_state_changes_nothing(monkeypatch):
     sim, plan = simulator(), chunks_of(0, 3)
     sim.reset(start(0, 2))
