@@ -3,6 +3,7 @@
 A default lives here and nowhere else; named instances are `experiments.presets`. `model`, `training`,
 `tokenizer`, `pretrained_tokenizers` and `evaluation` hold what determines a result, `execution` how it is
 computed; paths, clocks and verbosity belong to the code that calls. `json` reads and writes all of them.
+Finished results are named by these fields: one that is added is declared with `base.later`.
 """
 
 from hma_jax.config.base import ConfigError, require

@@ -13,7 +13,7 @@ from hma_jax.evaluation import evaluate as module
 from hma_jax.evaluation import protocol
 from hma_jax.evaluation.evaluate import Evaluation, evaluate, in_groups, make_evaluator, one_ahead, plan_groups
 from hma_jax.evaluation.images import decode_in_pieces
-from hma_jax.evaluation.measures import METRICS
+from hma_jax.evaluation.measures import METRICS, OF_WINDOWS
 from hma_jax.evaluation.metrics import factored_cross_entropy, psnr, ssim
 from hma_jax.evaluation.protocol import evaluation_inputs
 from hma_jax.evaluation.summary import summarise
@@ -59,6 +59,13 @@ def test_metrics_cover_the_valid_windows_of_each_dataset(params):
     assert (result.summary.overall["delta_psnr"].n, result.summary.overall["delta_psnr"].episodes) == (10, 6)
     pusher, arm = (stats[n]["ssim"].mean for n in ("pusher", "arm"))
     assert result.summary.overall["ssim"].mean == pytest.approx((pusher + arm) / 2)
+
+
+def test_what_is_said_to_depend_on_windows_alone_is_the_same_for_every_model(params):
+    tables = [run(own, each=5).windows for own in (params, jax.tree.map(lambda x: -np.asarray(x), params))]
+    a, b = (table.metrics for table in tables)
+    same = {name for name in a if np.array_equal(a[name], b[name], equal_nan=True)}
+    assert same == {"psnr_copy"} == set(a) & set(OF_WINDOWS)
 
 
 @pytest.mark.parametrize(
