@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from data_pipelines.registry import DatasetSpec, find_spec, register
-from experiments.preparing.made_from import Step, require_same
+from experiments.preparing.made_from import Change, Step
 from experiments.presets import get_preset
 from experiments.report.draw import draw
 from experiments.running.attempts import RESULT, RUN, State, newest_step, read_states
@@ -70,7 +70,7 @@ def run_study(
     from experiments.dry_run.notes import say_notes
     from experiments.dry_run.trainable import require_trainable
     from experiments.preparing.suite import require_simulated
-    from experiments.preparing.windows import require_judged, require_same_windows
+    from experiments.preparing.windows import require_judged
 
     study, workspace = setup.study, setup.workspace
     if not setup.data:
@@ -82,8 +82,7 @@ def run_study(
     await_lease(workspace)
     # Without the place every trial would fail, once all is prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
-        require_same_windows(study, workspace, replace)
-        earlier = find_earlier(workspace, study, sweeps, replace)
+        earlier = find_earlier(setup, sweeps, replace)
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
         planned = plan_sweeps(study, tuple(every.values()))
         say_unplanned(workspace, planned)
@@ -230,23 +229,27 @@ def require_agreement(
     require_one_closure(workspace.trials, shown, None if complete else sources, accept_code)
 
 
-def find_earlier(workspace: Workspace, study: Study, asked: Sequence[Sweep], replace: Step | None) -> Record | None:
-    """The record of what was run here before, if `study` goes on with it: its axes then have the same trials under
+def find_earlier(setup: StudySetup, asked: Sequence[Sweep], replace: Step | None) -> Record | None:
+    """The record of what was run here before, if the study goes on with it: its axes then have the same trials under
     both. Where the study is replaced, the record with those of its axes that still have, or are `asked` for again.
 
-    Raises ConfigError for a study of other settings, unless `replace` allows it: its report would be drawn over.
+    Raises ConfigError for a study of other settings, whose report would be drawn over, or of other data, unless
+    `replace` allows it, and for what `require_preparable` refuses.
     """
+    from experiments.preparing.changes import require_preparable
+
+    study, workspace = setup.study, setup.workspace
+    earlier, lines = None, []
     try:
         earlier = find_record(workspace)
-        if earlier is None:
-            return None
-        before, now = (plan_sweeps(s, earlier.axes, workspace.root) for s in (earlier.study, study))
-        lines = diff(earlier.study, study) if before != now else []
+        if earlier is not None:
+            before, now = (plan_sweeps(s, earlier.axes, workspace.root) for s in (earlier.study, study))
+            lines = diff(earlier.study, study) if before != now else []
     except ConfigError as error:  # it cannot be read, or one of its axes does not fit
-        require_same("study", workspace.record, [str(error)], replace)
-        return None
-    require_same("study", workspace.record, lines, replace)
-    if not lines:
+        earlier, lines = None, [str(error)]
+    changed = Change("study", workspace.record, lines)
+    require_preparable(study, workspace, setup.data, setup.tokenizer, replace, [changed])
+    if earlier is None or not lines:
         return earlier
     names = [sweep.name for sweep in asked]
     other = {axis: old.name for axis, old, new in zip(earlier.axes, before, now, strict=True) if old != new}

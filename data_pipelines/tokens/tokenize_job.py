@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -141,6 +141,25 @@ def plan_dataset(
         train=SplitFacts(),
         val=SplitFacts(),
         runs=source.runs,
+        recipe=RECIPE_VERSION,
+    )
+
+
+def plan_again(
+    existing: Manifest,
+    spec: DatasetSpec,
+    held_out: HeldOut,
+    *,
+    rate: float | None,
+    frame_step: int | None = None,
+) -> Manifest:
+    """The plan for an `existing` dataset by its entry and settings of now, of the same recordings by the same
+    tokenizer: no source is opened. Raises ConfigError for settings that cannot work."""
+    joins = existing.spec.joins if spec.joins else ()  # those that are given
+    return replace(
+        existing,
+        spec=replace(spec.facts(), joins=joins),
+        settings=replace(existing.settings, **to_dict(held_out), frame_step=resolve_frame_step(spec, frame_step, rate)),
         recipe=RECIPE_VERSION,
     )
 

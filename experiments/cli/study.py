@@ -13,7 +13,7 @@ from experiments.preparing.made_from import Step
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.study_setup import StudyArguments, StudySetup, make_setup
 from experiments.sweeps.registry import AXES, is_file, plan_asked
-from experiments.terminal.progress import console, say
+from experiments.terminal.progress import console
 from hma_jax.config import ConfigError, require
 
 
@@ -108,7 +108,7 @@ def _dry_run(
 ) -> None:
     """Prints the table of trials, notes on them, and why the command itself would be refused for what is there."""
     from experiments.dry_run.done import find_done
-    from experiments.dry_run.notes import say_notes
+    from experiments.dry_run.notes import refusal_as_note, say_notes
     from experiments.dry_run.plan_table import Devices, plan_table
     from experiments.dry_run.trainable import check_launched
     from experiments.preparing.sources import check_entries
@@ -125,7 +125,5 @@ def _dry_run(
     done = find_done(setup, sweeps, running.retry_failed, running.accept_code)
     console.print(plan_table(study, sweeps, devices, given=given, trained=setup.tokenizer is None, done=done))
     say_notes(setup, sweeps, launcher_options)
-    try:
-        find_earlier(setup.workspace, study, sweeps, replace)
-    except ConfigError as error:
-        say(f"note: without --dry-run this command would be refused: {error}")
+    with refusal_as_note():
+        find_earlier(setup, sweeps, replace)

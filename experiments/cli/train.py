@@ -80,6 +80,8 @@ def train(
         require_known(initial, trained, setup)
         require_other_directory(initial, run)
     if dry_run:
+        from experiments.dry_run.notes import refusal_as_note
+        from experiments.preparing.changes import require_preparable
         from experiments.preparing.sources import check_entries
 
         _check(setup, run, model.trajectories, options, trained)
@@ -88,6 +90,8 @@ def train(
         _print_cost(setup, _single_trial(setup, model.trajectories), run, hosts.count())
         if trained is None:
             _say_scale(setup, model.trajectories)
+        with refusal_as_note():
+            require_preparable(setup.study, setup.workspace, setup.data, setup.tokenizer, replacement.replace)
         return
     train_model(setup, run, options, trajectories=model.trajectories, replace=replacement.replace, initial=trained)
 

@@ -12,8 +12,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from data_pipelines.errors import DataError
-from experiments.preparing.made_from import read_stamp
-from experiments.running.attempts import RUN, newest_step, read_states
+from experiments.preparing.changes import find_changes
+from experiments.preparing.made_from import Step
+from experiments.preparing.suite import suite_is_there
+from experiments.preparing.windows import windows_are_frozen
+from experiments.running.attempts import RESULT, RUN, newest_step, read_states
 from experiments.running.ledger import DIVERGED, FAILED, FINISHED, Ledger
 from experiments.running.provenance import Provenance, trial_closure
 from experiments.running.results_version import RESULTS_VERSION
@@ -41,6 +44,7 @@ class Done:
     finished: frozenset[str] = frozenset()
     left: Mapping[str, str] = field(default_factory=dict)  # that ended without a result and are not run again, and how
     steps: Mapping[str, int] = field(default_factory=dict)  # of trials not finished: made, or gone on from
+    other: int = 0  # finished trials of data that are to be replaced
 
 
 NOTHING = Done()
@@ -57,13 +61,14 @@ def find_done(
     study, workspace = setup.study, setup.workspace
     try:
         record = find_record(workspace)
-        if record is not None and _prepared_by(record.study) != _prepared_by(study):
-            return NOTHING
     except ConfigError:  # it cannot be read, of which the study's own command speaks
         return NOTHING
-    done = find_prepared(setup)
+    other = record is not None and _prepared_by(record.study) != _prepared_by(study)
+    done = NOTHING if other else find_prepared(setup)
     if record is None:
         return done
+    if other or _changed(setup):
+        return dataclasses.replace(done, other=len(list(workspace.trials.glob(f"*/{RESULT}"))))
     provenance = dataclasses.replace(record.provenance, results=RESULTS_VERSION)
     trials = unique_trials(sweeps, provenance)
     former = find_trained(workspace.trials, trials, provenance, None if accept_code else trial_closure())
@@ -71,8 +76,15 @@ def find_done(
 
 
 def find_prepared(setup: StudySetup) -> Done:
-    """What is prepared, of the settings that the study has."""
-    return Done(_suite(setup), _tokenizer(setup), _tokens(setup.study, setup.workspace))
+    """What is prepared, of the settings and entries that the study has: steps before the first that is made again."""
+    changed = _changed(setup)
+    suite = not setup.data and suite_is_there(setup.study, setup.workspace)
+    tokenizer = setup.workspace.tokenizer.exists() and not changed & {"suite", "tokenizer"}
+    return Done(suite, tokenizer, not changed and _frozen(setup.study, setup.workspace))
+
+
+def _changed(setup: StudySetup) -> set[Step]:
+    return {one.step for one in find_changes(setup.study, setup.workspace, setup.data, setup.tokenizer)}
 
 
 def _trials(
@@ -102,24 +114,8 @@ def _prepared_by(study: Study) -> list[Any]:
     ]  # fmt: skip
 
 
-def _suite(setup: StudySetup) -> bool:
-    from experiments.preparing.suite import suite_is_there
-
-    return not setup.data and suite_is_there(setup.study, setup.workspace)
-
-
-def _tokenizer(setup: StudySetup) -> bool:
-    from experiments.preparing.tokenizer import training_settings
-
-    stamp = read_stamp(setup.workspace.tokenizer)
-    return stamp is not None and training_settings(setup.study).items() <= stamp.inputs.items()
-
-
-def _tokens(study: Study, workspace: Workspace) -> bool:
-    from experiments.preparing.windows import require_same_windows, windows_are_frozen
-
+def _frozen(study: Study, workspace: Workspace) -> bool:
     try:
-        require_same_windows(study, workspace, None)
         return windows_are_frozen(study, workspace)
     except (ConfigError, DataError):  # others, or none of some datasets
         return False

@@ -3,7 +3,8 @@ tokenizer is trained, and which setting has no effect in so few steps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 from data_pipelines.registry import get_spec
 from experiments.data_size import are_counted, size_of
@@ -17,7 +18,7 @@ from experiments.study_setup import StudySetup
 from experiments.sweeps.sweep import Sweep
 from experiments.terminal.progress import say
 from experiments.terminal.words import counted, few, in_thousands
-from hma_jax.config import TrainConfig
+from hma_jax.config import ConfigError, TokenizerConfig, TrainConfig
 
 
 def say_notes(setup: StudySetup, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> None:
@@ -30,6 +31,15 @@ def say_notes(setup: StudySetup, sweeps: Sequence[Sweep], launcher_options: Laun
         _say_one_point(setup, sweeps)
     say_average(trial.train for trial in trials)
     _say_prepared_here(setup, launcher_options)
+
+
+@contextmanager
+def refusal_as_note() -> Iterator[None]:
+    """Says in a dry run what the command itself would end with."""
+    try:
+        yield
+    except ConfigError as error:
+        say(f"note: without --dry-run this command would be refused: {error}")
 
 
 def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
@@ -75,6 +85,7 @@ def _say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> 
     others."""
     elsewhere = launcher_options.name != "local" and setup.study.for_accelerators
     made = setup.tokenizer is not None or setup.workspace.tokenizer.exists()
+    made = made or not isinstance(setup.study.tokenizer, TokenizerConfig)  # it cannot be trained
     if elsewhere and not made and find_accelerators() is None:
         say(
             "note: the tokenizer would be trained on this machine, where no accelerator is found, for much longer than a "

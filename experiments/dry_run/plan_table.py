@@ -95,6 +95,8 @@ def _describe_done(done: Done, trials: int) -> str:
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
     parts += [f"{counted(sum(done.steps.values()), 'step')} of training"] if done.steps else []
     text = f"Already done, and not counted: {', '.join(parts)}. " if parts else ""
+    if done.other:
+        text += f"{counted(done.other, 'finished trial')} of other data here: not used. "
     if done.left:
         how = " or ".join(sorted(set(done.left.values())))
         unless = "; --retry-failed runs the failed ones again" if FAILED in done.left.values() else ""

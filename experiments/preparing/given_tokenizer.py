@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +85,7 @@ def adopt_tokenizer(
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
     known = {TRAINED_FROM: training.inputs} if training.inputs else {}
-    dataclasses.replace(training, inputs={ORIGIN: _given(tokenizer)} | known).save(aside)
+    dataclasses.replace(training, inputs={ORIGIN: _given(tokenizer.identity)} | known).save(aside)
     publish(aside, workspace.tokenizer)
 
 
@@ -125,26 +125,37 @@ def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: 
     from hma_jax.tokenizers.io import load_tokenizer
 
     place = workspace.tokenizer
-    if not place.exists():
-        return False
-    existing = read_stamp(place)
-    if existing is not None and existing.inputs.get(ORIGIN) == _given(tokenizer):
-        return True
-    try:
-        identity = load_tokenizer(place).identity
-    except ConfigError as error:
-        lines = [str(error)]
-    else:
-        if identity == tokenizer.identity:  # trained here, or the very directory that is given
-            return True
-        origin = existing.inputs[ORIGIN] if existing else "not written down"
-        lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
+    lines = _of_another(tokenizer.identity, source, place, lambda there: load_tokenizer(there).identity)
     require_same("tokenizer", place, lines, replace)
-    return False
+    return place.exists() and not lines
 
 
-def _given(tokenizer: Tokenizer) -> str:
-    return f"{GIVEN} {tokenizer.identity}"
+def given_changes(source: Path, workspace: Workspace) -> list[str]:
+    """How the tokenizer of the workspace is another one than that in the directory `source`, by what they say of
+    themselves; [] without one."""
+    from hma_jax.tokenizers.io import read_identity
+
+    return _of_another(read_identity(source), source, workspace.tokenizer, read_identity)
+
+
+def _of_another(identity: str, source: Path, place: Path, identify: Callable[[Path], str]) -> list[str]:
+    if not place.exists():
+        return []
+    existing = read_stamp(place)
+    if existing is not None and existing.inputs.get(ORIGIN) == _given(identity):
+        return []
+    try:
+        there = identify(place)
+    except ConfigError as error:
+        return [str(error)]
+    if there == identity:  # trained here, or the very directory that is given
+        return []
+    origin = existing.inputs[ORIGIN] if existing else "not written down"
+    return [f"tokenizer: {there} ({origin}) -> {identity} ({source})"]
+
+
+def _given(identity: str) -> str:
+    return f"{GIVEN} {identity}"
 
 
 def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[Source]) -> None:

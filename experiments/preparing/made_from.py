@@ -117,18 +117,35 @@ def may_replace(step: Step, replace: Step | None) -> bool:
     return replace is not None and order.index(replace) <= order.index(step)
 
 
-def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | None, otherwise: str = "") -> None:
-    """Raises ConfigError if `lines` say how the inputs differ and the user did not ask for a replacement.
+@dataclass(frozen=True)
+class Change:
+    """How what a step made in a `place` differs from what is asked for."""
 
-    `otherwise`: one more way to go on.
-    """
-    if not lines or may_replace(step, replace):
+    step: Step
+    place: Path
+    lines: Sequence[str]  # 'setting: there -> asked for'; (): in nothing
+    otherwise: str = ""  # one more way to go on
+
+
+def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | None, otherwise: str = "") -> None:
+    """`require_unchanged` of one step."""
+    require_unchanged([Change(step, place, lines, otherwise)], replace)
+
+
+def require_unchanged(changes: Sequence[Change], replace: Step | None) -> None:
+    """Raises ConfigError for changes that the user did not ask for, of all steps at once: it names the --replace that
+    allows them all."""
+    refused = [change for change in changes if change.lines and not may_replace(change.step, replace)]
+    if not refused:
         return
+    first, *others = sorted(refused, key=lambda change: get_args(Step).index(change.step))
+    step, more = first.step, [(o, line) for o in others for line in o.lines if line not in first.lines]
     after = [IN_WORDS[s] for s in get_args(Step) if may_replace(s, step) and s != step]
     follows = f", and {', '.join(after)} where they depend on it" if after else ". Finished trials stay"
+    otherwise = first.otherwise + (f" and --replace {others[0].step}" if first.otherwise and others else "")
     raise ConfigError(
-        f"{place} holds {IN_WORDS[step]}, made from other inputs (there -> asked for):\n  "
-        + "\n  ".join(lines)
+        f"{first.place} holds {IN_WORDS[step]}, made from other inputs (there -> asked for):\n  "
+        + "\n  ".join([*first.lines, *(f"{line} ({IN_WORDS[change.step]})" for change, line in more)])
         + "\nNothing was changed. Choose another --out, or use the settings that it was made with"
         + (f", or {otherwise}" if otherwise else "")
         + f"; or add --replace {step}, which makes {IN_WORDS[step]} again, overwriting the existing ones{follows}."

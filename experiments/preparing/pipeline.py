@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.preparing.asked import write_asked
+from experiments.preparing.changes import require_preparable
 from experiments.preparing.counterfactual import make_counterfactual
 from experiments.preparing.given_tokenizer import adopt_tokenizer, judge_tokenizer
 from experiments.preparing.made_from import Step
@@ -19,7 +20,7 @@ from experiments.preparing.sources import find_sources, say_short_episodes
 from experiments.preparing.store import make_store
 from experiments.preparing.suite import make_suite
 from experiments.preparing.tokenizer import make_tokenizer
-from experiments.preparing.windows import freeze_windows, require_same_windows
+from experiments.preparing.windows import freeze_windows
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import Study
@@ -47,7 +48,7 @@ def prepare(
     require_plain(workspace.root)
     if study.eval.lpips:
         require_lpips()  # before all that the evaluation comes after
-    require_same_windows(study, workspace, replace)
+    require_preparable(study, workspace, data, tokenizer, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     write_asked(study, workspace, sources, tokenizer)
     if replace or not workspace.manifest.exists():  # else all is known

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 Source = tuple["DatasetSpec", "Location | Parts"]
 """A dataset: how it is read, and where it lies."""
 
+Unopened = tuple["DatasetSpec", None]
+"""A dataset whose recordings are not looked at."""
+
 
 def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
     """{dataset: {name in its files: location}} of the datasets at these locations; several locations are one dataset

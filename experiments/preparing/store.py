@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_pipelines.errors import DataError, UnreachableError
+from data_pipelines.registry import get_spec
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import (
     Source,
@@ -100,17 +101,42 @@ def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], 
     from data_pipelines.tokens.tokenize_job import plan_dataset
 
     s = study.store
-    found: dict[str, list[str]] = {}
-    for spec, path in sources:
-        if not (workspace.store / spec.name).exists():
-            continue
-        source = open_source((spec, path), s)
-        plan = plan_dataset(
-            spec, source, tokenizer, s.held_out, frame_step=s.frame_step, rate=study.rate,
+    plans = {
+        spec.name: plan_dataset(
+            spec, open_source((spec, path), s), tokenizer, s.held_out, frame_step=s.frame_step, rate=study.rate,
             recorded=recorded_source(workspace.store, spec.name),
-        )  # fmt: skip
+        )
+        for spec, path in sources
+        if (workspace.store / spec.name).exists()
+    }  # fmt: skip
+    return _joined_lines(plans, lambda name: differences(workspace.store, plans[name]))
+
+
+def token_changes(study: Study, workspace: Workspace) -> list[str]:
+    """How the datasets that are in the store were made otherwise, by what is known before one is opened: by their
+    entries and the settings."""
+    from data_pipelines.tokens.dataset_writer import differences
+    from data_pipelines.tokens.manifest import FILE
+    from data_pipelines.tokens.manifest_file import load_manifest
+    from data_pipelines.tokens.tokenize_job import plan_again
+
+    s, root = study.store, workspace.store
+
+    def lines(name: str) -> list[str]:
+        existing = load_manifest(root / name / FILE)
+        return differences(
+            root, plan_again(existing, get_spec(name), s.held_out, frame_step=s.frame_step, rate=study.rate)
+        )
+
+    return _joined_lines([name for name in study.all_names() if (root / name).exists()], lines)
+
+
+def _joined_lines(names: Iterable[str], differences: Callable[[str], list[str]]) -> list[str]:
+    """The `differences` of datasets; a line that holds for several is said once."""
+    found: dict[str, list[str]] = {}
+    for name in names:
         try:
-            lines = differences(workspace.store, plan)
+            lines = differences(name)
         except UnreachableError:  # it may be intact
             raise
         except DataError as error:  # damaged, or of an older format
@@ -118,5 +144,5 @@ def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], 
         for line in lines:
             if line.startswith("settings."):
                 line = f"store.{line.removeprefix('settings.')}"  # as --set calls it
-            found.setdefault(line, []).append(spec.name)
+            found.setdefault(line, []).append(name)
     return [f"{line} ({few(names)})" for line, names in found.items()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from data_pipelines.registry import get_spec
@@ -44,8 +44,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     specs = [get_spec(name) for name in names]  # a mistyped name is refused before any work
     require_simulated(names)
     found = {name: _differences(name, workspace.suite / name / VERSION, study.suite) for name in names}
-    lines = [f"{name}: {line}" for name in names for line in found[name] or ()]
-    require_same("suite", workspace.suite, _shortened(lines), replace)
+    require_same("suite", workspace.suite, _lines(found), replace)
     kept = [] if may_replace("suite", replace) else [name for name in names if found[name] == []]
     with step(f"simulate {len(names)} datasets") as update:
         generate_suite(
@@ -64,6 +63,14 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
             "--replace suite makes them again, and everything that depends on them"
         )
     return [(spec, workspace.suite / spec.name / VERSION) for spec in specs]
+
+
+def suite_changes(study: Study, workspace: Workspace) -> list[str]:
+    """How the simulated datasets that are there were made otherwise than the study would."""
+    from data_pipelines.sources.rlds.writer import VERSION
+
+    places = {name: workspace.suite / name / VERSION for name in study.all_names()}
+    return _lines({name: _differences(name, place, study.suite) for name, place in places.items() if place.exists()})
 
 
 def suite_is_there(study: Study, workspace: Workspace) -> bool:
@@ -98,6 +105,7 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
     return lines if lines or is_complete(directory, made_as) else None
 
 
-def _shortened(lines: Sequence[str]) -> list[str]:
+def _lines(found: Mapping[str, list[str] | None]) -> list[str]:
+    lines = [f"{name}: {line}" for name, own in found.items() for line in own or ()]
     more = len(lines) - MOST_LINES
     return [*lines[:MOST_LINES], f"... and {more} more"] if more > 0 else list(lines)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from data_pipelines.publishing.files import publish
+from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.sampling.order import ORDER_VERSION
 from experiments.preparing.made_from import (
     OLD_STAMP,
@@ -24,7 +25,7 @@ from experiments.preparing.made_from import (
     require_same,
     say_recorded,
 )
-from experiments.preparing.sources import Source, open_source
+from experiments.preparing.sources import Source, Unopened, open_source
 from experiments.running.closure import closure_hash, trace
 from experiments.running.machine import describe_machine
 from experiments.running.run_options import CHECKPOINTS
@@ -32,12 +33,14 @@ from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.terminal.progress import console, step
 from experiments.terminal.words import plus_minus
-from hma_jax.config import TokenizerConfig, require
+from hma_jax.config import AnyTokenizerConfig, TokenizerConfig, require
 from hma_jax.config.json import identity_of
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from data_pipelines.loading.frames import FrameLoader
+    from data_pipelines.sources.joined import Parts
+    from data_pipelines.sources.rlds.location import Location
     from hma_jax.evaluation.statistics import Stat
     from hma_jax.tokenizers.base import Tokenizer
 
@@ -81,15 +84,21 @@ def training_settings(study: Study) -> dict[str, Any]:
     return {name: identity_of(getattr(study, name)) for name in ("tokenizer", "tokenizer_train")}
 
 
-def frames_made_from(study: Study, sources: Sequence[Source], existing: MadeFrom | None) -> dict[str, Any]:
+def frames_made_from(
+    study: Study, sources: Sequence[Source] | Sequence[Unopened], existing: MadeFrom | None
+) -> dict[str, Any]:
     """Inputs of a stamp that say which frames a tokenizer is trained on and judged by. Recordings are named as in an
-    `existing` stamp, which may be of an earlier version."""
+    `existing` stamp, which may be of an earlier version; those that are not opened are taken for the same."""
 
-    settings = study.store
-    known = existing.inputs.get("data", {}) if existing else {}
+    settings, known = study.store, existing.inputs.get("data", {}) if existing else {}
+
+    def shards(spec: DatasetSpec, path: Location | Parts | None) -> str:
+        there = known.get(spec.name, {}).get("shards", "")
+        return there if path is None else open_source((spec, path), settings).fingerprint_as(there)
+
     data = {
         spec.name: {
-            "shards": open_source((spec, path), settings).fingerprint_as(known.get(spec.name, {}).get("shards", "")),
+            "shards": shards(spec, path),
             "image_key": spec.camera_key,
             **{name: getattr(spec, name) for name in OF_FRAMES},
         }
@@ -121,10 +130,7 @@ def make_tokenizer(
     from hma_jax.training.loop import LoopOptions
 
     config, train = study.tokenizer, study.tokenizer_train
-    require(
-        isinstance(config, TokenizerConfig),
-        "the study's tokenizer cannot be trained here; give the directory of an imported one with --tokenizer",
-    )
+    require_trainable_tokenizer(config)
     sources = seen(study, sources)
     made_from = tokenizer_made_from(study, workspace, sources)
     if _in_place(workspace.tokenizer, made_from, replace):
@@ -175,6 +181,26 @@ def require_same_trained(study: Study, workspace: Workspace, sources: Sequence[S
     _in_place(workspace.tokenizer, tokenizer_made_from(study, workspace, seen(study, sources)), None)
 
 
+def require_trainable_tokenizer(config: AnyTokenizerConfig) -> None:
+    """Raises ConfigError for a kind of tokenizer that is only imported or given."""
+    require(
+        isinstance(config, TokenizerConfig),
+        "the study's tokenizer cannot be trained here: make one of published weights with `hma tokenizer import`, and give "
+        "its directory with --tokenizer",
+    )
+
+
+def trained_changes(study: Study, workspace: Workspace) -> list[str]:
+    """How the tokenizer of the workspace was made otherwise than the study would train it, by what is known before a
+    dataset is opened; [] without one."""
+    place, existing = workspace.tokenizer, read_stamp(workspace.tokenizer)
+    if not place.exists():
+        return []
+    unopened: list[Unopened] = [(get_spec(name), None) for name in study.all_names() if name not in study.unseen]
+    inputs = {ORIGIN: TRAINED, **training_settings(study), **frames_made_from(study, unopened, existing)}
+    return _made_otherwise(place, existing, inputs)
+
+
 def seen(study: Study, sources: Sequence[Source]) -> list[Source]:
     """The sources that a tokenizer is trained on and judged by: all but those of unseen robots."""
     return [(spec, path) for spec, path in sources if spec.name not in study.unseen]
@@ -186,16 +212,24 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     if not place.exists():
         return False
     existing = read_stamp(place)
-    if existing is None:
-        lines = ["it is not recorded there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
-    else:
-        lines = differences(existing.inputs, made_from.inputs)
-    require_same("tokenizer", place, lines, replace, f"use it unchanged with --tokenizer {place}")
-    if lines:
+    lines = _made_otherwise(place, existing, made_from.inputs)
+    require_same("tokenizer", place, lines, replace, unchanged(place))
+    if existing is None or lines:
         return False
     say_recorded("the tokenizer", place, {FRAMES: SHRUNK} | existing.recorded, made_from.recorded)
     console.print("[green]done[/] train the tokenizer [dim](before)[/]")
     return True
+
+
+def _made_otherwise(place: Path, existing: MadeFrom | None, inputs: Mapping[str, Any]) -> list[str]:
+    if existing is None:
+        return ["it is not recorded there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
+    return differences(existing.inputs, inputs)
+
+
+def unchanged(place: Path) -> str:
+    """How to go on with a tokenizer of other inputs."""
+    return f"use it unchanged with --tokenizer {place}"
 
 
 def reconstruction_psnr(

@@ -28,10 +28,20 @@ HELD_OUT = 0.25
 
 def require_same_windows(study: Study, workspace: Workspace, replace: Step | None) -> None:
     """Raises ConfigError, before anything is made, if what is known by then differs from the frozen windows."""
-    existing = _frozen(workspace, replace)
-    if existing is not None:
-        lines = _setting_differences(existing, study.model.frames, study.rate, study.eval.seed, study.all_names())
-        require_same("windows", workspace.manifest, lines, replace)
+    require_same("windows", workspace.manifest, window_changes(study, workspace), replace)
+
+
+def window_changes(study: Study, workspace: Workspace) -> list[str]:
+    """How the frozen windows differ from what is known of the study's before tokens are made; [] without any."""
+    from data_pipelines.windows.evalset import EvalManifest
+
+    if not workspace.manifest.exists():
+        return []
+    try:
+        existing = EvalManifest.load(workspace.manifest)
+    except DataError as error:
+        return [str(error)]
+    return _setting_differences(existing, study.model.frames, study.rate, study.eval.seed, study.all_names())
 
 
 def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = None) -> Provenance:

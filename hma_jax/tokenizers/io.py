@@ -139,6 +139,11 @@ def load_config(directory: Path) -> AnyTokenizerConfig:
     return _config(Path(directory), _read_description(Path(directory)))
 
 
+def read_identity(directory: Path) -> str:
+    """What tells the tokenizer in `directory` from others, as its description says; otherwise as `load_config`."""
+    return _read_description(Path(directory))["identity"]
+
+
 def _config(directory: Path, description: dict[str, Any]) -> AnyTokenizerConfig:
     config_class = KINDS[description["kind"]].config_class
     return from_dict(config_class, description["config"], where=f"{directory / DESCRIPTION}: config")

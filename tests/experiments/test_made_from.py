@@ -25,10 +25,13 @@ from experiments.preparing.made_from import (
 )
 from experiments.preparing.sources import find_sources
 from experiments.preparing.windows import _differences
+from experiments.running.attempts import RESULT
 from experiments.running.closure import trace
+from experiments.running.workspace import Record, save_record
 from experiments.study_setup import StudyArguments, make_setup
 from hma_jax.evaluation.statistics import Stat
 from tests.data_pipelines.fakes import write_rlds
+from tests.experiments import fakes
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
 STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
@@ -124,7 +127,7 @@ def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
         (["--set", "eval.windows_per_dataset=1"], "windows", "eval.windows_per_dataset: 2 -> 1"),
         (["--set", "eval.seed=7"], "windows", "eval.seed: 0 -> 7"),
         (["--set", "model.frames=3"], "windows", "model.frames: 4 -> 3"),
-        (["--set", "rate=1", "--set", "store.frame_step=3"], "windows", "rate: 2.0 -> 1.0"),
+        (["--set", "rate=1"], "tokens", "rate: 2.0 -> 1.0 (the evaluation windows)"),
     ],
 )
 @pytest.mark.parametrize("command", ["tokenize", "train"])
@@ -361,6 +364,45 @@ def test_corrected_images_do_not_keep_a_tokenizer_of_others(hma, out, monkeypatc
     code, said = hma("tokenize")
     assert code == 2
     assert f"data of {ARM.name}.image_corrections: [] -> ['rotate_180']" in said and "image_key" not in said
+
+
+@pytest.fixture
+def with_record(out, made):
+    """The study of the directory has run, with one trial."""
+    arguments = StudyArguments("smoke", out, tuple(made[1][1:]), set=("tokenizer_train.steps=5",))
+    setup = make_setup(arguments)
+    save_record(setup.workspace, Record(setup.study, setup.data, ("width",), provenance=fakes.PROVENANCE))
+    (out / "trials" / "a").mkdir(parents=True)
+    (out / "trials" / "a" / RESULT).touch()
+
+
+@pytest.mark.parametrize("command", ["sweep width", "train"])
+def test_a_dry_run_after_an_entry_was_corrected_counts_what_is_made_again(command, with_record, hma, monkeypatch):
+    """It said that all is done, of a command that was refused, or made everything again."""
+    trials, line = command != "train", f"spec.hz: {ARM.hz:.1f} -> {ARM.hz / 2} ({ARM.name})"
+    code, said = hma(command, "--dry-run")
+    assert code == 0 and "would be refused" not in said and "Already done, and not counted: the tokenizer, tok" in said
+    monkeypatch.setattr("data_pipelines.registry.table._registered", {})
+    register([replace(ARM, hz=ARM.hz / 2)])
+    for replacement in ((), ("--replace", "tokens")):
+        code, said = hma(command, "--dry-run", *replacement)
+        assert code == 0 and ("would be refused" in said) == (not replacement) == (line in said)
+        text = " ".join(said.split())
+        assert "Already done, and not counted: the tokenizer. " in text
+        assert ("1 finished trial of other data here: not used." in text) == trials
+
+
+def test_a_dataset_is_added_with_one_replacement_that_the_first_refusal_names(with_record, hma, out, made, tmp_path):
+    new = write_rlds(tmp_path, get_spec("austin_buds_dataset_converted_externally_to_rlds"), LENGTHS)
+    before, more = contents(out), [*made[1], str(new)]
+    code, said = hma("sweep width", data=more)
+    assert code == 2 and said.count("--replace") == 2 and "--replace tokenizer, which" in said
+    assert said.count("datasets: 2 -> 3") == 1 and "(the study's record and report)" in said
+    assert f"--tokenizer {out / 'tokenizer'} and --replace windows; or" in said and contents(out) == before
+    for arguments in ([], ["--replace", "study"]):
+        assert "would be refused" in hma("sweep width", "--dry-run", *arguments, data=more)[1]
+    for arguments in (["--replace", "tokenizer"], ["--tokenizer", str(out / "tokenizer"), "--replace", "windows"]):
+        assert "would be refused" not in hma("sweep width", "--dry-run", *arguments, data=more)[1]
 
 
 def test_tokenizer_and_windows_copied_to_another_place_are_those_of_the_study(hma, out, made, tmp_path):

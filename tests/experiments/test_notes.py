@@ -208,6 +208,19 @@ def test_what_is_made_for_an_accelerator_names_no_other(data, capsys, tmp_path, 
     assert "for 20,000 steps of 64 windows, with at most 1,000 trajectories" in first and first.endswith("each dataset")
 
 
+@pytest.mark.parametrize("command", [("study", "--launcher", "slurm"), ("train",)])
+def test_a_dry_run_without_the_tokenizer_that_its_study_cannot_train_says_so(
+    command, data, capsys, tmp_path, monkeypatch
+):
+    """It advised to train it elsewhere, which is refused."""
+    monkeypatch.setattr("experiments.dry_run.plan_table.plan_table", lambda *_, **__: "")
+    monkeypatch.setattr("experiments.dry_run.notes.find_accelerators", lambda: None)
+    lines = said_by(capsys, *command, "--dry-run", "--preset", "paper", *data, "--out", str(tmp_path / "out"))
+    (refused,) = [line for line in lines if "would be refused" in line]
+    assert "cannot be trained here" in refused and "`hma tokenizer import`" in refused and "--tokenizer" in refused
+    assert not any("no accelerator" in line for line in lines)
+
+
 def test_a_tokenizer_that_would_be_trained_without_the_accelerators_of_the_trials_is_told(
     data, capsys, tmp_path, monkeypatch
 ):

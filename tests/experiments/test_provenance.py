@@ -323,7 +323,6 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
     workspace = finished_study(tmp_path)  # by sources that are not these
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: PROVENANCE)
     monkeypatch.setattr("experiments.preparing.windows.require_judged", lambda *_: None)
-    monkeypatch.setattr("experiments.preparing.windows.require_same_windows", lambda *_: None)
     monkeypatch.setattr("experiments.preparing.suite.require_simulated", lambda *_: None)
     ran = []
     monkeypatch.setattr(study_runs, "run_jobs", lambda jobs, *_, **__: ran.extend(jobs) or {})

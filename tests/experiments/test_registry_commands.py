@@ -394,7 +394,7 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
     entries = tmp_path / "my.toml"
     specs = [replace(make_spec(name, (4,)), episodes=count) for name, count in (("mine", 9), ("yours", 30))]
     entries.write_text("\n".join(map(to_toml, specs)))
-    for name in ("prepare", "require_judged", "require_same_windows"):
+    for name in ("prepare", "require_judged"):
         module = "pipeline" if name == "prepare" else "windows"
         monkeypatch.setattr(f"experiments.preparing.{module}.{name}", lambda *_, **__: PROVENANCE)
     for name in ("run_jobs", "draw", "require_results"):
