@@ -51,11 +51,29 @@ class LoaderConfig:
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """What is drawn of one dataset."""
+
+    trajectories: int  # that windows are drawn of: of a subset, fewer than asked where some were skipped
+    windows: int
+    share: float  # of all windows drawn
+
+    def passes(self, draws: int) -> float:
+        """How often each window is seen, on average, in a training run of so many windows."""
+        return self.share * draws / self.windows if self.windows else 0.0
+
+
+@dataclass(frozen=True)
 class TrainingWindows:
     """The windows a config draws from, and how often."""
 
     sets: dict[str, WindowSet]
     mixture: Mixture
+
+    def drawn(self) -> dict[str, Drawn]:
+        """By dataset, those of which nothing is drawn too."""
+        shares = dict(zip(self.mixture.names, self.mixture.weights, strict=True))
+        return {name: Drawn(len(s.episodes), len(s), shares.get(name, 0.0)) for name, s in self.sets.items()}
 
 
 def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
@@ -75,12 +93,6 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
     # Nothing can be drawn of a dataset whose trajectories under the cap were all skipped, whatever else it has.
     counts = {name: len(weighed[name]) if len(s) else 0 for name, s in sets.items()}
     return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.why_empty() for n, s in sets.items()}))
-
-
-def count_trajectories(store: TokenStore, config: LoaderConfig) -> dict[str, int]:
-    """How many trajectories windows are drawn from, by dataset: fewer than the cap where some were skipped."""
-    names = config.datasets or store.names
-    return {name: len(_windows(store, name, config, config.max_trajectories).episodes) for name in names}
 
 
 def training_table(store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation") -> EmbodimentTable:

@@ -15,6 +15,7 @@ from tyro.conf import arg
 from data_pipelines.errors import MAX_LISTED, without_advice
 from data_pipelines.publishing.output_lock import backoff
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
+from experiments.data_size import read_data
 from experiments.preparing.made_from import Step
 from experiments.running.workspace import Busy, Workspace
 from experiments.study_setup import StudySetup, make_setup
@@ -54,11 +55,11 @@ def prepare_together(setup: StudySetup, batch: int | None, threads: int | None, 
 
     for option, value in (("--batch", batch), ("--threads", threads)):  # before a tokenizer is trained for hours
         require(value is None or value >= 1, f"{option} must be at least 1, got {value}")
+    whole = dataclasses.replace(reference_trial(setup.study, setup.study.seeds[0]), max_trajectories=None)
     if setup.data:
         from experiments.dry_run.notes import say_scale
 
-        whole = reference_trial(setup.study, setup.study.seeds[0])
-        say_scale(setup, [dataclasses.replace(whole, max_trajectories=None)])
+        say_scale(setup, [whole])
     with ExitStack() as stack:
         try:
             stack.enter_context(setup.workspace.locked())
@@ -70,6 +71,11 @@ def prepare_together(setup: StudySetup, batch: int | None, threads: int | None, 
                 replace=replace, batch=batch, threads=threads,
             )  # fmt: skip
     show_store(setup.workspace, setup.study.rate)
+    if any(facts["windows"] for facts in read_data(setup.workspace.data_summary).values()):
+        from data_pipelines.tokens.store import TokenStore
+        from experiments.cli.mixture import show_mixture
+
+        show_mixture(TokenStore(setup.workspace.store), whole)
     wrote(setup.workspace.store, setup.workspace.manifest, then=setup.command("train"))
 
 

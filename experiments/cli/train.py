@@ -382,6 +382,7 @@ def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:
 def say_data(trial: Trial, prepared: PreparedData) -> None:
     """What a model is trained on. Raises DataError if it is nothing."""
     from data_pipelines.loading.selection import select_windows
+    from experiments.cli.mixture import show_drawn
 
     chosen = select_windows(prepared.store, loader_of(trial))
     used = [chosen.sets[name] for name in chosen.mixture.names]
@@ -394,5 +395,6 @@ def say_data(trial: Trial, prepared: PreparedData) -> None:
         f"{episodes:,} trajectories{limit}, {windows:,} windows of {trial.model.frames} frames, each "
         f"seen {passes:,.{0 if passes >= 10 else 1}f} times on average"
     )
+    show_drawn(chosen.drawn(), trial)
     for name, reason in chosen.mixture.dropped.items():
         say(f"note: not trained on {name}: {reason}")

@@ -20,10 +20,12 @@ from typing import Any
 from experiments.analysis.preregistered import FILE as PREREGISTERED
 from experiments.analysis.preregistered import ExpectationOutcome, compare_expected, read_expected
 from experiments.analysis.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
+from experiments.data_size import count_usable
 from experiments.preparing.tokenizer import QUALITY
 from experiments.report.clips import describe_clips
 from experiments.report.findings import Findings, describe_expected, read_findings
 from experiments.report.fits import describe_fits
+from experiments.report.mixture import describe_data_along, describe_mixture
 from experiments.report.numbers import Numbers
 from experiments.report.pieces import card, contents, picture, section, table
 from experiments.report.plot_style import OVER, drawn_metrics
@@ -75,17 +77,21 @@ def write_report(
     checks = check_study(
         sweeps, rows, along.optima, states, robots, name, numbers.outcomes, expected, checked, vocabulary
     )
+    usable = count_usable(workspace.data_summary)
+    data = {s.name: describe_data_along(s, provenance, numbers.results, usable) for s in sweeps}
+    mixture = describe_mixture(_defaults(shown.sweep)[0], numbers.results[first]) if has_reference else ""
     findings = read_findings(workspace.findings, [s.name for s in sweeps])
     headline = _headline(workspace, record, sweeps, rows, states, shown, _finished_when(numbers.results, finished))
     body = [
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, along, expected, findings),
+        *_curves(workspace, sweeps, rows, along, data, expected, findings),
         _fits(workspace, numbers),
         findings.rest,
         _clips(workspace.trials / first / SAMPLES, record, robots, aside) if has_reference else "",
         section(f"Robots{', the most controllable first' * are_sorted(robots)}{aside}", describe_robots(
             rows, shown.sweep, robots, workspace.data_summary
         )) if has_reference else "",
+        section(f"Mixture{aside}", mixture) if mixture else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),
         section("How to repeat it", _origin(workspace, record, finished, numbers.results)),
     ]  # fmt: skip
@@ -202,15 +208,16 @@ def _curves(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     along: AxisStatistics,
+    data: Mapping[str, str],
     expected: Sequence[ExpectationOutcome],
     findings: Findings,
 ) -> list[str]:
-    """A section for the scaling curves, which share a figure, and one for each other sweep: numbers, preregistered
-    expectations and the author's findings."""
+    """A section for the scaling curves, which share a figure, and one for each other sweep: numbers, what `data` says
+    of those that it was trained on, preregistered expectations and the author's findings."""
 
     def say(sweep: Sweep) -> str:
         said = findings.of_axes.get(sweep.name, "")
-        return describe(sweep, rows, along) + describe_expected(sweep, expected) + said
+        return describe(sweep, rows, along) + data[sweep.name] + describe_expected(sweep, expected) + said
 
     note = TWO_PERPLEXITIES if "perplexity" in {r.metric for r in rows} else ""
     sections = []

@@ -243,7 +243,7 @@ def run_trial(
     """
     import jax
 
-    from data_pipelines.loading.selection import count_trajectories, training_table
+    from data_pipelines.loading.selection import select_windows, training_table
     from hma_jax.evaluation.parts import Parts
     from hma_jax.model.flops import train_flops_per_step
     from hma_jax.model.hma import declare_model
@@ -284,11 +284,13 @@ def run_trial(
             trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
         ).summary.to_dict()
 
+    drawn = select_windows(prepared.store, loader_of(trial)).drawn()
     result = {
         "evaluation": evaluation.summary.to_dict(),
         "untrained": untrained,
         "training_loss": loss,
-        "trajectories": count_trajectories(prepared.store, loader_of(trial)),
+        "trajectories": {name: one.trajectories for name, one in drawn.items()},
+        "mixture": {name: {"windows": one.windows, "share": one.share} for name, one in drawn.items()},
         "parameters": declared.count(),
         "train_flops": train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         "run": {

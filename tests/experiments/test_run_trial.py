@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from data_pipelines.loading.selection import LoaderConfig
+from data_pipelines.loading.selection import Drawn, LoaderConfig
 from experiments.running import run_trial as trials
 from experiments.running.initial_model import add_robots
 from experiments.running.trial import loader_of
@@ -60,7 +60,8 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     trial = trials.Trial(TABLE.names, None, TABLE.names, MODEL, train_passive, STUDY.eval, measure_untrained=True)
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(trials, "open_prepared_data", lambda workspace: SimpleNamespace(store=None))
-        monkeypatch.setattr("data_pipelines.loading.selection.count_trajectories", lambda *_: {"arm": 3})
+        drawn = SimpleNamespace(drawn=lambda: {"arm": Drawn(3, 12, 1.0)})
+        monkeypatch.setattr("data_pipelines.loading.selection.select_windows", lambda *_: drawn)
         monkeypatch.setattr(trials, "train_trial", train)
         monkeypatch.setattr(trials, "evaluate_on", evaluate)
         monkeypatch.setattr(trials, "write_evaluation", lambda *_: None)
@@ -74,7 +75,7 @@ def test_nothing_but_the_evaluated_weights_is_left_of_a_training_state(evaluated
     assert evaluated.left == [0, 0]  # of the trained model, and of the untrained one
     result = evaluated.result
     assert result["training_loss"]["mean"] == 2 and result["run"]["train_seconds"] == 3
-    assert result["trajectories"] == {"arm": 3}
+    assert result["trajectories"] == {"arm": 3} and result["mixture"] == {"arm": {"windows": 12, "share": 1.0}}
 
 
 def test_the_average_of_the_weights_is_evaluated_as_it_was_trained_and_an_untrained_model_beside_it(

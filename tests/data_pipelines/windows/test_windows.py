@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.selection import LoaderConfig, count_trajectories
+from data_pipelines.loading.selection import LoaderConfig, select_windows
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.windows.slicer import WindowSlicer
@@ -118,7 +118,9 @@ def test_trajectories_of_a_subset_are_counted_without_the_damaged_ones():
     for cap in (None, 1, 40, 150):
         used = train_windows(data, "toy", 4, cap, rate=2.0).episodes
         assert len(used) == 20 if cap is None else len(used) < min(cap + 1, 20)
-        assert count_trajectories(data, LoaderConfig(4, max_trajectories=cap, datasets=("toy",))) == {"toy": len(used)}
+        if len(used):
+            chosen = select_windows(data, LoaderConfig(4, max_trajectories=cap, datasets=("toy",)))
+            assert chosen.drawn()["toy"].trajectories == len(used)
 
 
 def test_nothing_long_enough_says_what_is_needed():
