@@ -94,37 +94,33 @@ def judge(
     from experiments.applications.judging.judge import judge_recorded, judge_run
     from experiments.applications.judging.ladder import LadderConfig
     from experiments.applications.judging.real import read_real
+    from experiments.applications.policies.kinds import KINDS
     from experiments.applications.policies.tasks import ROBOTS, AnyTask, RecordedTask, find_task
     from hma_jax.simulator.robots import require_robot
     from hma_jax.training.runs import load_run
 
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
-    expert = {"--demonstrations": demonstrations, "--steps": steps, "--cloned": cloned, "--diffusion": diffusion}
+    expert = {"demonstrations": demonstrations, "steps": steps, "cloned": cloned, "diffusion": diffusion}
+    expert = {option: n for option, n in expert.items() if n is not None}
     _require_options_of(recordings, task, expert, {
         "--real": real, "--registry": registry, "--split": split, "--reward": reward
     })  # fmt: skip
-    usual = {
-        "--demonstrations": JudgeConfig.demonstrations, "--steps": LadderConfig.steps, "--cloned": LadderConfig.cloned,
-        "--diffusion": LadderConfig.diffusion,
-    }  # fmt: skip
     if recordings is None:
         if robot not in ROBOTS:
             require_robot(robot, load_run(run, "auto").table.names)
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
-        usual |= {"--cloned": 0, "--diffusion": 0}  # recordings have no expert to clone
+        expert = dict.fromkeys(KINDS, 0) | expert  # recordings have no expert to clone
         split = split or "train"
         judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold, reward)
-    expert = usual | {flag: n for flag, n in expert.items() if n is not None}
-    demonstrations, steps, cloned, diffusion = expert.values()
     config = JudgeConfig(
         judged_task,
         starts,
         starts if batch is None else batch,
         seed,
-        demonstrations=demonstrations,
-        ladder=replace(LadderConfig(), cloned=cloned, diffusion=diffusion, steps=steps),
+        demonstrations=expert.pop("demonstrations", JudgeConfig.demonstrations),
+        ladder=LadderConfig(**expert),
         head=replace(HeadConfig(), fit=replace(HeadConfig().fit, steps=head_steps)),
         head_episodes=head_episodes,
     )
@@ -134,11 +130,14 @@ def judge(
     else:
         use_entries(registry)
         judged = judge_recorded(run, out, config, recordings, policies, split, tuple(counts or ()))
+    ladder = judged.config.ladder
+    trained = {"--demonstrations": judged.config.demonstrations, "--steps": ladder.steps}
+    trained |= {f"--{kind}": n for kind, n in ladder.counts.items()}
     given: dict[str, Any] = {
         "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
         "--recordings": recordings, "--split": split, "--reward": reward, "--registry": registry, "--real": real,
         "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
-        "--hold": judged.config.task.hold, **(expert if recordings is None else {}),
+        "--hold": judged.config.task.hold, **(trained if recordings is None else {}),
         "--head-episodes": head_episodes, "--head-steps": head_steps, "--seed": seed, "--out": out,
     }  # fmt: skip
     words = [x for flag, value in given.items() if value is not None for x in (flag, value)]
@@ -159,7 +158,7 @@ def _show_agreement_with_labels(labels: Path, out: Path) -> None:
 
 
 def _require_options_of(
-    recordings: str | None, task: str, of_expert: dict[str, Any], of_recordings: dict[str, Any]
+    recordings: str | None, task: str, of_expert: dict[str, int], of_recordings: dict[str, Any]
 ) -> None:
     """Raises ConfigError for options of recordings without these, and for options of an expert with recordings."""
     if recordings is None:
@@ -169,7 +168,7 @@ def _require_options_of(
             )
         return
     require(task == "own", f"--task {task} is only for robots with a true simulator, not with --recordings")
-    unused = [flag for flag, n in of_expert.items() if n not in (None, 0)]
+    unused = [f"--{option}" for option, n in of_expert.items() if n]
     require(
         not unused,
         f"with --recordings there is no scripted expert to train policies on: remove {', '.join(unused)}, or set it "

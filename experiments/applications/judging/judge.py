@@ -70,7 +70,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, user_file: Pa
     the file gives are no policies.
     """
     simulator = load_simulator(run_directory, episodes=config.batch)
-    _require_policy(simulator, user_file is not None or config.ladder.cloned or config.ladder.diffusion)
+    _require_policy(simulator, user_file is not None or any(config.ladder.counts.values()))
     robot = simulator.robot(config.task.robot)
     return _judge(run_directory, out, simulator, robot, SimulatedTruth(config, robot, simulator), user_file)
 
@@ -100,10 +100,10 @@ def judge_recorded(
     return _judge(run_directory, out, _with_episodes(simulator, truth.config.batch), robot, truth, user_file, counted)
 
 
-def _require_policy(simulator: Simulator, given: bool | int) -> None:
+def _require_policy(simulator: Simulator, given: bool) -> None:
     """Raises ConfigError where neither are policies given nor is the model one."""
     some = given or _predicts_actions(simulator)
-    require(bool(some), "there is no policy to evaluate except the random one: give --policies FILE")
+    require(some, "there is no policy to evaluate except the random one: give --policies FILE")
 
 
 def _predicts_actions(simulator: Simulator) -> bool:
@@ -132,7 +132,7 @@ def _judge(
     user_policies, success, about = {}, None, truth.about()
     if user_file is not None:
         user_policies, success = load_user_policies(user_file, robot)
-    encoders = [config.ladder.encoder] * bool(config.ladder.cloned + config.ladder.diffusion)
+    encoders = [config.ladder.encoder] * any(config.ladder.counts.values())
     for encoder in encoders + [config.head.encoder] * (success is None):
         require_multiples(*simulator.tokenizer.image_shape, encoder.size)
     if user_file is not None:

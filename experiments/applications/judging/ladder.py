@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
 from experiments.applications.policies.files import DESCRIPTION, load_policy, save_policy
+from experiments.applications.policies.kinds import KINDS
 from experiments.applications.policies.learning import FitConfig, Report, log_spaced_steps
 from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.own_head import OwnHeadPolicy
@@ -23,13 +22,10 @@ RANDOM = "random"
 OWN_HEAD = "hma"
 """The model itself, where it predicts actions."""
 
-TRAINED = {ClonedPolicy.kind: (BcConfig, train_bc), DiffusionPolicy.kind: (DiffusionConfig, train_diffusion)}
-"""Kind of policy -> its configuration, and what trains it."""
-
 
 @dataclass(frozen=True)
 class LadderConfig:
-    """How many checkpoints of which policy; the random one comes on top."""
+    """How many checkpoints of each kind of policy (`KINDS`); the random one comes on top."""
 
     cloned: int = 6
     diffusion: int = 3
@@ -41,14 +37,17 @@ class LadderConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def __post_init__(self):
-        for kind in ("cloned", "diffusion"):
-            count = getattr(self, kind)
+        for kind, count in self.counts.items():
             require(count >= 0, f"--{kind} must not be negative, got {count}")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """{kind of policy: number of its checkpoints}."""
+        return {kind: getattr(self, kind) for kind in KINDS}
 
     def fits(self) -> dict[str, FitConfig]:
         """{kind of policy: its training}, of those that have checkpoints."""
-        counts = {ClonedPolicy.kind: self.cloned, DiffusionPolicy.kind: self.diffusion}
-        return {kind: self._fit(count) for kind, count in counts.items() if count}
+        return {kind: self._fit(count) for kind, count in self.counts.items() if count}
 
     def _fit(self, count: int) -> FitConfig:
         keep = log_spaced_steps(self.steps, count, self.first) if count > 1 else (self.steps,)
@@ -74,10 +73,14 @@ def train_ladder(
         if all((directory / f"{kind}-{step}" / DESCRIPTION).exists() for step in fit.keep):
             continue
         recorded = demos() if recorded is None else recorded
-        config_type, train = TRAINED[kind]
-        policy_config = config_type(frames=config.frames, encoder=config.encoder, fit=fit)
-        for step, policy in train(recorded, policy_config, seed, report).items():
+        policy_config = KINDS[kind].config(frames=config.frames, encoder=config.encoder, fit=fit)
+        for step, policy in KINDS[kind].train(recorded, policy_config, seed, report).items():
             save_policy(policy, directory / f"{kind}-{step}", about | {"step": step, "seed": seed})
+
+
+def kind_of(name: str) -> str:
+    """The kind of a policy that is made here, by its name; as in `KINDS` where it is trained."""
+    return name.split("-")[0]
 
 
 def find_policy(directory: Path, name: str, robot: Robot, simulator: Simulator) -> Policy:

@@ -17,11 +17,10 @@ from experiments.applications.judging.doubts import (
     doubts_of_starts,
 )
 from experiments.applications.judging.judge import Judgement
-from experiments.applications.judging.ladder import OWN_HEAD, RANDOM
+from experiments.applications.judging.ladder import OWN_HEAD, RANDOM, kind_of
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
 from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE, shown
-from experiments.applications.policies.cloning import ClonedPolicy
-from experiments.applications.policies.diffusion import DiffusionPolicy
+from experiments.applications.policies.kinds import KINDS
 from experiments.report.clips import animate, strip
 from experiments.report.pieces import STILL, moving, picture, section, table
 from experiments.report.style import CSS
@@ -35,11 +34,10 @@ ON_PAPER = 6
 
 POLICIES_EXPLAINED = {
     RANDOM: (RANDOM, "draws its actions at random"),
-    ClonedPolicy.kind: (f"{ClonedPolicy.kind}-N", "behaviour cloning, after N training steps"),
-    DiffusionPolicy.kind: (f"{DiffusionPolicy.kind}-N", "a small Diffusion Policy, after N training steps"),
+    **{name: (f"{name}-N", f"{kind.explained}, after N training steps") for name, kind in KINDS.items()},
     OWN_HEAD: (OWN_HEAD, "the model itself"),
 }
-"""How the name of a policy that is not the user's begins -> its heading, and what it is."""
+"""Kind of a policy that is not the user's -> its heading, and what it is."""
 
 COLUMNS_EXPLAINED = {
     REAL: "counted on the real robot",
@@ -94,7 +92,7 @@ def _doubts(summary: dict[str, Any]) -> list[str]:
 def _policies(summary: dict[str, Any]) -> str:
     """What the names of policies and of columns mean."""
     columns = next(iter(summary["policies"].values()))
-    kinds = dict.fromkeys(name.split("-")[0] for name in summary["policies"] if name not in summary["own"])
+    kinds = dict.fromkeys(kind_of(name) for name in summary["policies"] if name not in summary["own"])
     policies = _listed(dict(POLICIES_EXPLAINED[kind] for kind in kinds))
     rates = _listed({column: COLUMNS_EXPLAINED[column] for column in columns})
     return f"<p>Policies: {policies}.</p><p>Success rates: {rates}. docs/judging.md says more.</p>"

@@ -12,16 +12,17 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
 
+from experiments.applications.judging.ladder import kind_of
 from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE
+from experiments.applications.policies.kinds import KINDS
 from experiments.report.plot_style import INK, MUTED, STYLE, save, show_caption
 
 COLOURS = {
-    "cloned": ("blue: cloned", "#2b5c8a"),
-    "diffusion": ("orange: diffusion policies", "#b3541e"),
+    **{name: (kind.legend, kind.colour) for name, kind in KINDS.items()},
     "own": ("green: your own", "#2f7d4f"),
     "": ("grey: others", MUTED),
 }
-"""Kind of a policy, by how its name begins -> how the caption names it, and its colour."""
+"""Kind of a policy -> how the caption names it, and its colour."""
 
 BESIDE = ((4, 4), (-4, 4), (4, -4), (-4, -4))
 AWAY = tuple(
@@ -56,7 +57,7 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
     across = summary["compared with"] or CONTROL
     titles = {MODEL: "learned model", CONTROL: "control: actions of other episodes"}
     upwards = [column for column in titles if column != across]
-    kinds = {name: "own" if name in summary["own"] else name.split("-")[0] for name in summary["policies"]}
+    kinds = {name: "own" if name in summary["own"] else kind_of(name) for name in summary["policies"]}
     kinds = {name: kind if kind in COLOURS else "" for name, kind in kinds.items()}
     legend = ", ".join(words for kind, (words, _) in COLOURS.items() if kind in kinds.values())
     caption = f"lines: 95 % intervals; {legend}"

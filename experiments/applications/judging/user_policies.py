@@ -14,8 +14,7 @@ import numpy as np
 
 from experiments.applications.judging.ladder import OWN_HEAD, RANDOM
 from experiments.applications.judging.user_success import PAGE, UserSuccess, success_of
-from experiments.applications.policies.cloning import ClonedPolicy
-from experiments.applications.policies.diffusion import DiffusionPolicy
+from experiments.applications.policies.kinds import KINDS
 from experiments.applications.policies.policy import Policy
 from experiments.user_input.user_file import function_of, naming_line, run_file
 from hma_jax.config import ConfigError, require
@@ -23,7 +22,7 @@ from hma_jax.simulator.robots import Robot
 
 SIGNATURE = "policies(robot)"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-TAKEN = re.compile(rf"{RANDOM}|{OWN_HEAD}|({ClonedPolicy.kind}|{DiffusionPolicy.kind})-\d+")
+TAKEN = re.compile(rf"{RANDOM}|{OWN_HEAD}|({'|'.join(KINDS)})-\d+")
 """Names of policies that are made here, whichever of them there are in a judgement."""
 
 

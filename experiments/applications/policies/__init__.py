@@ -1,8 +1,8 @@
 """Policies that see images: what they are, what they are trained on, and how they are kept.
 
 `policy` says what a policy is, `tasks` what it should do, `demonstrations` are recorded episodes of the scripted
-expert, `cloning` and `diffusion` train networks on them, `files` saves and loads these; `own_head` is HMA as a policy,
-`scripted` the expert itself, which sees no images but the true state.
+expert, `cloning` and `diffusion` train networks on them, `kinds` is the table of these, `files` saves and loads them;
+`own_head` is HMA as a policy, `scripted` the expert itself, which sees no images but the true state.
 """
 
 from experiments.applications.policies.demonstrations import Demonstrations, record

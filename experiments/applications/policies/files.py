@@ -16,17 +16,12 @@ from safetensors.numpy import load_file
 
 from data_pipelines.publishing.files import publish, remove
 from experiments.applications.policies.acting import ChunkPolicy, Scale
-from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc
-from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, init_diffusion
+from experiments.applications.policies.kinds import KINDS
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.convert.tensors import write_safetensors
 
 DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
-KINDS = {
-    ClonedPolicy.kind: (ClonedPolicy, BcConfig, init_bc),
-    DiffusionPolicy.kind: (DiffusionPolicy, DiffusionConfig, init_diffusion),
-}
 
 
 def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] | None = None) -> None:
@@ -54,13 +49,13 @@ def load_policy(directory: Path) -> ChunkPolicy:
         weights = load_file(directory / WEIGHTS)
     except (OSError, ValueError, SafetensorError) as error:
         raise ConfigError(f"{directory} cannot be read as a policy ({error}); train it again") from error
-    kind = description.get("kind")
-    require(kind in KINDS, f"{directory}: unknown kind of policy {kind!r}; known: {', '.join(KINDS)}")
-    cls, config_type, init = KINDS[kind]
-    config = from_dict(config_type, description["config"], f"{directory}: config")
+    name = description.get("kind")
+    require(name in KINDS, f"{directory}: unknown kind of policy {name!r}; known: {', '.join(KINDS)}")
+    kind = KINDS[name]
+    config = from_dict(kind.config, description["config"], f"{directory}: config")
     scale = from_dict(Scale, description["scale"], f"{directory}: scale")
-    wanted = jax.eval_shape(lambda: init(config, len(scale.mean), 0))
-    return cls(config, unnamed(weights, wanted, directory), scale)
+    wanted = jax.eval_shape(lambda: kind.init(config, len(scale.mean), 0))
+    return kind.policy(config, unnamed(weights, wanted, directory), scale)
 
 
 def named(params: Any) -> dict[str, np.ndarray]:

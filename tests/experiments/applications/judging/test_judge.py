@@ -21,6 +21,7 @@ from experiments.applications.judging.page import write_page
 from experiments.applications.judging.scatter import draw_scatter
 from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
+from experiments.applications.policies.kinds import KINDS
 from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.network import EncoderConfig
 from experiments.cli.main import main
@@ -93,7 +94,7 @@ def test_demonstrations_are_as_long_as_the_task_where_little_is_left_of_them_to_
     assert truth.about() == ({"demonstrated_frames": frames} if told else {})
 
 
-@pytest.mark.parametrize("kind", ["cloned", "diffusion"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_negative_number_of_checkpoints_is_not_taken_for_one(kind):
     assert names(replace(ASKED.ladder, **{kind: 0}))
     with pytest.raises(ConfigError, match=f"--{kind} must not be negative, got -1"):
