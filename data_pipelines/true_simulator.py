@@ -110,10 +110,10 @@ class TrueSimulator(ABC, Generic[W]):
             if not again:
                 self._leave(b)
             world = now[0] if again else self.open_world(start.robot)
+            self._worlds[b], self._before[b] = (world, self.robots[start.robot]), []  # to be closed, should it fail now
             world.reset(start.seed)
             for action in start.actions:
                 world.step(action)
-            self._worlds[b], self._before[b] = (world, self.robots[start.robot]), []
         self._draw(which)
         return self.images
 

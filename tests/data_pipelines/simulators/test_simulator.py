@@ -4,7 +4,7 @@ test_simulators."""
 import numpy as np
 import pytest
 
-from data_pipelines.simulators.simulator import PHYSICS, PhysicsSimulator, new_seeds, physics_starts
+from data_pipelines.simulators.simulator import PHYSICS, PhysicsSimulator, PhysicsWorld, new_seeds, physics_starts
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
@@ -60,6 +60,20 @@ def test_a_world_that_gives_way_to_another_robot_is_closed():
     assert [one.size for one in opened] == [0, 0, 8]
     sim.close()
     assert opened[-1].size == 0
+
+
+def test_a_world_that_cannot_begin_its_episode_is_closed_with_the_others(monkeypatch):
+    (start,), sim, opened = starts(1), PhysicsSimulator([DRAWER], image_size=8), []
+
+    def fails(world: PhysicsWorld, seed: int) -> None:
+        opened.append(world.simulator)
+        raise RuntimeError(f"no physics of {seed}")
+
+    monkeypatch.setattr(PhysicsWorld, "reset", fails)
+    with pytest.raises(RuntimeError, match="no physics"):
+        sim.reset(start)
+    sim.close()
+    assert [one.size for one in opened] == [0]
 
 
 def test_what_cannot_be_simulated_is_said():
