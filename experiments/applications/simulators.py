@@ -153,8 +153,10 @@ def mark_absolute_actions(simulator: Simulator, run: Path | str) -> None:
     Robots described in a file of the run, and those of the suite, have the mark already. No simulated frame depends on
     it.
     """
+    if (Path(run) / ROBOTS).exists():  # then the store, which may be unfinished, is not opened
+        return
     store = _find_store(Workspace.of_run(Path(run)))
-    if store is None or (Path(run) / ROBOTS).exists():
+    if store is None:
         return
     recorded = [name for name in simulator.robots if name not in SPECS and name in store.names]
     absolute = [name for name in recorded if _are_absolute(store, name)]

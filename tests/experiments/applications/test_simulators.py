@@ -68,6 +68,7 @@ def test_of_one_s_own_data_targets_stay_where_they_were_moved_to_and_changes_end
 
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "robots.json").touch()  # what lies beside the run says it
+    monkeypatch.undo()  # the store is empty: it may just be made
     simulators_module.mark_absolute_actions(simulator, tmp_path / "model")
     assert len(described) == 1
 
