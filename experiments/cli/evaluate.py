@@ -90,7 +90,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     execution, protocol = setup.study.execution, setup.study.eval
     made_from = describe_evaluation(trained, names, prepared, protocol)
     if not replace:
-        require_same_evaluation(place, made_from)
+        require_same_evaluation(place, made_from, trained)
     # Besides what the stamp names: which windows are in a batch depends on its size, and a run that was trained again
     # may have other weights at the same step.
     weights = read_list(run / CHECKPOINTS / str(trained.step))

@@ -3,7 +3,7 @@ replace them unless that is asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
     The step is recorded only: of a run that trains on, later results replace earlier ones. So are, for `hma compare`,
     the steps that its training was to have, and the seed, which is part of the model's hash as well.
     """
-    train = {key: value for key, value in identity_of(trained.train).items() if key != "steps"}
     chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {
         name: {
@@ -36,7 +35,7 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
         for name in names
     }
     inputs = {
-        "model": stable_hash({"model": trained.model, "train": train, "provenance": trained.provenance}),
+        "model": _hash_model(trained, identity_of),
         "weights": trained.weights,
         "tokenizer": prepared.tokenizer.identity,
         "frames": prepared.manifest.frames,
@@ -51,11 +50,19 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
     return MadeFrom(inputs, recorded)
 
 
-def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:
-    """Raises ConfigError if `place` holds results of another evaluation than `wanted`."""
+def _hash_model(trained: Run, plain: Callable[[Any], Any]) -> str:
+    """A hash of what a run was trained to be, whatever its number of steps; `plain` writes its settings as JSON."""
+    train = {key: value for key, value in plain(trained.train).items() if key != "steps"}
+    return stable_hash({"model": plain(trained.model), "train": train, "provenance": trained.provenance})
+
+
+def require_same_evaluation(place: Path, wanted: MadeFrom, trained: Run) -> None:
+    """Raises ConfigError if `place` holds results of another evaluation than `wanted`, which is of `trained`."""
     existing = read_stamp(place, STAMP)
     if existing is not None:
         known = existing.inputs | {"eval": _protocol(existing.inputs.get("eval", {}))}
+        if known.get("model") == _hash_model(trained, to_dict):  # as earlier versions wrote it: of all fields
+            known["model"] = wanted.inputs["model"]
         lines = differences(known, wanted.inputs)
     else:
         lines = _differences_of_windows(place, wanted)

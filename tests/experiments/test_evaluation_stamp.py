@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,12 +15,22 @@ from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, r
 from experiments.preparing.made_from import MadeFrom
 from experiments.running.result_file import SAMPLES
 from experiments.running.run_trial import write_evaluation
-from hma_jax.config import ConfigError, EvalConfig, TrainConfig
-from hma_jax.config.json import to_dict
+from hma_jax.config import ConfigError, EvalConfig, ModelConfig, TrainConfig
+from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.evaluation.evaluate import Evaluation
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
 from tests.data_pipelines.windows.test_evalset import small_store
+
+TRAINED = SimpleNamespace(model=ModelConfig(), train=TrainConfig(), provenance={"loader": {}}, weights="last", step=3)
+
+PREPARED = SimpleNamespace(
+    manifest=SimpleNamespace(datasets=(), frames=4, rate=2.0), tokenizer=SimpleNamespace(identity="t")
+)
+
+
+def require_same(place: Path, wanted: MadeFrom) -> None:
+    require_same_evaluation(place, wanted, TRAINED)
 
 
 def made_from(step: int = 3, windows: int = 2, name: str = "arm", **changed) -> MadeFrom:
@@ -28,10 +40,10 @@ def made_from(step: int = 3, windows: int = 2, name: str = "arm", **changed) -> 
 
 
 def test_the_same_evaluation_may_be_repeated_of_a_later_step_too(tmp_path):
-    require_same_evaluation(tmp_path, made_from())
+    require_same(tmp_path, made_from())
     made_from().save(tmp_path, STAMP)
-    require_same_evaluation(tmp_path, made_from())
-    require_same_evaluation(tmp_path, made_from(step=9))
+    require_same(tmp_path, made_from())
+    require_same(tmp_path, made_from(step=9))
 
 
 def test_a_model_is_shown_beside_a_copied_frame():
@@ -65,7 +77,7 @@ def test_clips_of_an_evaluation_do_not_stay_beside_one_without(tmp_path):
 def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
     made_from().save(tmp_path, STAMP)
     with pytest.raises(ConfigError) as refused:
-        require_same_evaluation(tmp_path, wanted)
+        require_same(tmp_path, wanted)
     assert line in str(refused.value) and "--to DIR" in str(refused.value) and "--replace" in str(refused.value)
 
 
@@ -73,31 +85,39 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
     ("provenance", "recorded"), [({"loader": {}}, {"step": 3, "steps": 9, "seed": 7}), ({"official": 1}, {"step": 3})]
 )
 def test_the_seed_and_the_steps_of_the_training_are_recorded_where_the_run_knows_them(provenance, recorded):
-    of = {"model": {}, "train": TrainConfig(seed=7, steps=9), "provenance": provenance, "weights": "last", "step": 3}
-    prepared = SimpleNamespace(
-        manifest=SimpleNamespace(datasets=(), frames=4, rate=2.0), tokenizer=SimpleNamespace(identity="t")
-    )
-    assert describe_evaluation(SimpleNamespace(**of), (), prepared, EvalConfig()).recorded == recorded
+    of = vars(TRAINED) | {"train": TrainConfig(seed=7, steps=9), "provenance": provenance}
+    assert describe_evaluation(SimpleNamespace(**of), (), PREPARED, EvalConfig()).recorded == recorded
+
+
+def test_results_stay_those_of_their_model_where_an_earlier_version_hashed_all_of_its_fields(tmp_path):
+    wanted = describe_evaluation(TRAINED, (), PREPARED, EvalConfig())
+    train = to_dict(TRAINED.train)
+    del train["steps"]
+    for model, same in ((TRAINED.model, True), (ModelConfig(recall=True), False)):
+        former = stable_hash({"model": to_dict(model), "train": train, "provenance": TRAINED.provenance})
+        MadeFrom(wanted.inputs | {"model": former}).save(tmp_path, STAMP)
+        with nullcontext() if same else pytest.raises(ConfigError, match=f"model: '{former}' -> "):
+            require_same(tmp_path, wanted)
 
 
 def test_a_setting_of_the_protocol_that_came_later_is_no_difference(tmp_path):
     there = made_from()
     del there.inputs["eval"]["other_actions"]
     there.save(tmp_path, STAMP)
-    require_same_evaluation(tmp_path, made_from())
+    require_same(tmp_path, made_from())
     with pytest.raises(ConfigError, match="other_actions"):
-        require_same_evaluation(tmp_path, made_from(eval=to_dict(dataclasses.replace(EvalConfig(), other_actions=1))))
+        require_same(tmp_path, made_from(eval=to_dict(dataclasses.replace(EvalConfig(), other_actions=1))))
 
 
 def test_results_that_do_not_say_what_they_are_of_are_known_by_their_windows(tmp_path):
     number = np.arange(2)
     names, values = np.array(["arm", "arm"]), {"psnr": number * 1.0}
     WindowTable(names, number, number, number + 4, values).save(tmp_path / FILE, "run")
-    require_same_evaluation(tmp_path, made_from())
+    require_same(tmp_path, made_from())
     with pytest.raises(ConfigError, match="windows of arm: 2 -> 5"):
-        require_same_evaluation(tmp_path, made_from(windows=5))
+        require_same(tmp_path, made_from(windows=5))
     with pytest.raises(ConfigError, match="with drawer"):
-        require_same_evaluation(tmp_path, made_from(name="drawer"))
+        require_same(tmp_path, made_from(name="drawer"))
 
 
 def test_other_tokens_than_a_model_was_trained_on_are_told(tmp_path):
