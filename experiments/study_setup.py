@@ -22,7 +22,7 @@ from experiments.data_size import are_counted, sizes_by_tokens, use_sizes
 from experiments.presets import get_preset
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace, find_record
-from experiments.study import Study, on_tokenizer, on_user_data, without_equal_caps
+from experiments.study import Study, most_trajectories, on_tokenizer, on_user_data, without_equal_caps
 from experiments.terminal.program import PROGRAM
 from experiments.terminal.progress import say, short
 from experiments.terminal.words import few
@@ -200,11 +200,11 @@ def count_again(setup: StudySetup) -> StudySetup:
 
 def _without_equal_caps(study: Study, arguments: StudyArguments, workspace: Workspace) -> Study:
     """The same study, less the numbers of trajectories that would be trained on the same; those that the user chose are
-    left out only if the data, not the registry, say so. It keeps the numbers of the study in `workspace`, as an earlier
-    version planned it, if they differ only in such as no dataset has to train on, or follow from the registry: or that
-    study could not go on."""
-    chosen = "trajectory_counts" in arguments.chosen()
-    if chosen and not are_counted(study.dataset_names()):
+    left out only if the data, not the registry, say so. It keeps the numbers of the study in `workspace` if they differ
+    only in such as no dataset has to train on, or follow from the registry: its finished trials are then not run again
+    under another number, and a study that an earlier version planned goes on."""
+    chosen, counted = "trajectory_counts" in arguments.chosen(), are_counted(study.dataset_names())
+    if chosen and not counted:
         return study
     planned = without_equal_caps(study)
     try:
@@ -214,9 +214,13 @@ def _without_equal_caps(study: Study, arguments: StudyArguments, workspace: Work
     if earlier is None:
         return planned
     before = replace(study, trajectory_counts=earlier.study.trajectory_counts)
-    if chosen:
-        return study if before == study else planned
-    return before if planned == without_equal_caps(before) or before == without_equal_caps(study, True) else planned
+    if not chosen and before == without_equal_caps(study, by_entries=True):
+        return before
+    same, caps, most = without_equal_caps(before), planned.trajectory_counts, most_trajectories(study)
+    *_, last = same.trajectory_counts
+    if counted and most and min(last, caps[-1]) >= most:
+        planned = replace(planned, trajectory_counts=(*caps[:-1], last))
+    return before if planned == same else planned
 
 
 def use_entries(registry: Path | None) -> None:

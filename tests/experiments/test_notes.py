@@ -197,6 +197,10 @@ def test_points_that_are_the_same_trial_run_once(capsys, tmp_path):
     assert count_again(setup).study.trajectory_counts == make_setup(where).study.trajectory_counts == (4, 100)
     save_record(setup.workspace, Record(setup.study, provenance=PROVENANCE))  # of an earlier version, which goes on
     assert make_setup(where).study.trajectory_counts == (4, 7, 9, 100)
+    for caps in "4,1000", "4,100,1000", "4,8,100":  # its trial with at most 100 has all of them too
+        assert make_setup(replace(where, set=(f"trajectory_counts={caps}",))).study == make_setup(where).study
+    assert make_setup(replace(where, set=("trajectory_counts=4,6",))).study.trajectory_counts == (4, 6)
+    assert make_setup(replace(where, set=("trajectory_counts=2,500",))).study.trajectory_counts == (2, 100)
     declare(directory, 30)  # more were added since, of which no tokens were made
     (out / "study.json").unlink()
     assert make_setup(where).study.trajectory_counts == (4, 7, 9, 100)

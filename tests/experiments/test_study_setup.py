@@ -136,7 +136,8 @@ def test_the_study_is_the_same_too(where, world, monkeypatch):
 def test_a_study_goes_on_with_points_that_earlier_versions_planned(world, monkeypatch, tmp_path):
     """It was refused as another study, since caps that no dataset reaches in training came to count as equal."""
     monkeypatch.chdir(world)
-    monkeypatch.setattr("experiments.study.most_trajectories", lambda *_: 100)
+    for module in ("study", "study_setup"):
+        monkeypatch.setattr(f"experiments.{module}.most_trajectories", lambda *_: 100)
     where = StudyArguments("accelerator", tmp_path, (f"bridge/{ARM.name}",))
     setup = make_setup(where)
     caps = setup.study.trajectory_counts
