@@ -288,7 +288,7 @@ def main() -> None:
         not weights.exists() or (args.out / FILE).exists(),
         f"{weights} exists, but it is not known for which run it was trained; choose another --out or remove it",
     )
-    pin_settings(args.out, args.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
+    pin_settings(args.out, args.run, simulator, unused=("simulator.decode",))  # no frame is made
     if existing := weights.exists():
         say(f"{short(weights)} of this run exists already; remove it to train it again")
     else:

@@ -50,7 +50,7 @@ from experiments.applications.tables import make_once, write_table
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import step, wrote
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
-from hma_jax.config.json import identity_of
+from hma_jax.config.base import later
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.files import write_file
@@ -81,8 +81,8 @@ class Settings:
     steps: int = 3000  # of training, of every policy
     batch: int = 12  # windows of the model
     learning_rate: float = 1e-3
-    predicts: Predicts = "noise"  # of the Diffusion Policy, as the next
-    limits: Limits = "range"
+    predicts: Predicts = later("noise")  # of the Diffusion Policy, as the next
+    limits: Limits = later("range", before="spread")
     seed: int = 0
 
     def __post_init__(self):
@@ -204,7 +204,7 @@ def compare(
         "windows to train on; give a run with a shorter window",
     )
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
-    pin_settings(out, run, simulator, identity_of(settings), unused=("simulator.decode",))  # no frame is made
+    pin_settings(out, run, simulator, settings, unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():
         with step(f"record {settings.demonstrations} demonstrations"):

@@ -27,7 +27,6 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -57,7 +56,6 @@ from experiments.applications.tables import make_once, write_table
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import require
-from hma_jax.config.json import identity_of
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
@@ -136,11 +134,10 @@ def count_expert_actions(task: Task, stride: int) -> int:
     return 2 * task.frames * stride
 
 
-def pinned(settings: Settings, stride: int) -> dict[str, Any]:
-    """The settings, and how many actions the expert has where a frame has several: in earlier versions it had fewer,
-    so their goals were others."""
-    more = {"expert_actions": count_expert_actions(settings.make_task(), stride)} if stride > 1 else {}
-    return identity_of(settings) | more
+def besides_settings(task: Task, stride: int) -> dict[str, int]:
+    """How many actions the expert has where a frame has several: in earlier versions it had fewer, so their goals were
+    others."""
+    return {"expert_actions": count_expert_actions(task, stride)} if stride > 1 else {}
 
 
 def run_planner(way: str, simulator: Simulator, robot: Robot, settings: Settings, seed: int) -> dict:
@@ -205,7 +202,7 @@ def compare(run: Path, out: Path, settings: Settings, wanted: Collection[str]) -
     simulator = load_simulator(run, episodes=settings.search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = settings.start_seeds()
-    pin_settings(out, run, simulator, pinned(settings, robot.stride))
+    pin_settings(out, run, simulator, settings, besides_settings(settings.make_task(), robot.stride))
     paths = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
     tried = [way for way in WAYS if way in wanted or all(path.exists() for path in paths[way])]
     trials: dict[str, list[dict]] = {way: [] for way in tried}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from hma_jax.config import require
-from hma_jax.config.json import diff, identity_of
+from hma_jax.config.json import completed, diff, identity_of, to_dict
 from hma_jax.model.params import Params
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.simulator import Simulator
@@ -29,22 +29,24 @@ def pin_settings(
     out: Path,
     run: Path,
     simulator: Simulator,
-    settings: Mapping[str, Any],
-    *,
+    *settings: Any,
     may_differ: Collection[str] = (),
     unused: Collection[str] = (),
     file: str = FILE,
 ) -> None:
-    """Pins the directory `out` to the `simulator` of `run` and to `settings`: writes them to `file` there or, where it
-    exists, checks that it says the same. To be called once both are known to be valid.
+    """Pins the directory `out` to the `simulator` of `run` and to `settings`, configurations or dicts with some:
+    writes them to `file` there or, where it exists, checks that it says the same. To be called once all are known to
+    be valid. Of a field that came later (`hma_jax.config.base.later`) a file without it says the value from before.
 
     Fields named in `may_differ` (how many results there are) and in `unused` (what no result depends on), and those
     under them, may differ. Raises ConfigError, naming the differences, where another field does, and for a file of an
     earlier version, which does not say how frames are filled.
     """
-    path, wanted = out / file, described(run, simulator, settings)
+    path, wanted = out / file, described(run, simulator, *settings)
     if path.exists():
         known = json.loads(path.read_text())
+        for part in ({SIMULATOR: {"decode": simulator.decode}}, *settings):
+            known = completed(known, part)
         comparable = wanted if SIMULATOR in known else {name: x for name, x in wanted.items() if name != SIMULATOR}
         unused = unused if simulator.tokenizer.channels else (*unused, SAMPLER)
         free = tuple(f"{name}{end}" for name in (*may_differ, *unused) for end in ":.")
@@ -60,28 +62,29 @@ def pin_settings(
             "if you know that neither has changed, remove this file",
         )
         return
-    write_settings(out, run, simulator, settings, file)
+    write_settings(out, run, simulator, *settings, file=file)
 
 
-def write_settings(out: Path, run: Path, simulator: Simulator, settings: Mapping[str, Any], file: str = FILE) -> None:
+def write_settings(out: Path, run: Path, simulator: Simulator, *settings: Any, file: str = FILE) -> None:
     """Writes the file anew, as after results were added that `may_differ` allows."""
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / file, json.dumps(described(run, simulator, settings), indent=1) + "\n")
+    write_file(out / file, json.dumps(described(run, simulator, *settings), indent=1) + "\n")
 
 
-def described(run: Path, simulator: Simulator, settings: Mapping[str, Any]) -> dict[str, Any]:
+def described(run: Path, simulator: Simulator, *settings: Any) -> dict[str, Any]:
     """The content of the file. Runs are identified by name and a hash of their weights, robots by name and a hash of
     their descriptions."""
     robots = {
         name: short_hash(json.dumps(identity_of(robot)).encode()) for name, robot in sorted(simulator.robots.items())
     }
-    besides_weights = {"decode": identity_of(simulator.decode), "robots": robots}
+    besides_weights = {"decode": to_dict(simulator.decode), "robots": robots}
     description = {
         "run": run.resolve().name,
         "weights": hash_of(simulator.model.params),
         SIMULATOR: besides_weights,
-        **settings,
     }
+    for part in settings:
+        description |= to_dict(part)
     return json.loads(json.dumps(description))
 
 

@@ -79,7 +79,6 @@ from experiments.study_setup import use_entries
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import DecodeConfig, require
-from hma_jax.config.json import identity_of
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import change_decode, find_decode
@@ -316,13 +315,13 @@ def main() -> None:
     settings, without = source.settings, args.without_actions
     passive = without and load_passive(without, source.robot, simulator.decode)
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
-    pin_settings(out, run, simulator, identity_of(settings), may_differ=("seeds",))
+    pin_settings(out, run, simulator, settings, may_differ=("seeds",))
     if passive:
-        pin_settings(out, without, passive, {}, file=SECOND)
+        pin_settings(out, without, passive, file=SECOND)
     data = make_data(source, simulator, out, passive)
     trials = run_trials(source, data, out / "trials")
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
-    write_settings(out, run, simulator, identity_of(settings))
+    write_settings(out, run, simulator, settings)
     shortest = data["recorded"].lengths[:2].min()
     kinds = [kind for kind in data if kind != JUDGED_ON]
     draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")

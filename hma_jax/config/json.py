@@ -48,6 +48,18 @@ def _plain(config: Any, whole: bool) -> Any:
     return config
 
 
+def completed(values: Any, like: Any) -> Any:
+    """`values`, as any version wrote them of a config such as `like` or of a dict with some, with the fields that came
+    later (`base.later`) and are missing: they have the value from before. Comparable with `to_dict(like)`."""
+    before = {}
+    if dataclasses.is_dataclass(like):
+        before = {f.name: to_dict(f.metadata[BEFORE]) for f in dataclasses.fields(like) if BEFORE in f.metadata}
+        like = vars(like)
+    if not (isinstance(like, dict) and isinstance(values, dict)):
+        return values
+    return before | {name: completed(value, like.get(name)) for name, value in values.items()}
+
+
 def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
     """A `cls` from `to_dict`'s output, of an earlier version too, or from `identity_of`'s: a missing field that came
     later (`base.later`) has the value from before, any other its default.

@@ -38,7 +38,6 @@ from experiments.terminal.progress import step
 from experiments.terminal.words import few
 from experiments.user_input.user_file import naming_line
 from hma_jax.config import require
-from hma_jax.config.json import identity_of
 from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
@@ -145,7 +144,7 @@ def _judge(
         not others,
         f"--real has policies {few(others)}, but the policies here are {', '.join(policies)}; use the same names",
     )
-    pin_settings(out, run_directory, simulator, {"config": identity_of(config), **about}, file="judge.json")
+    pin_settings(out, run_directory, simulator, {"config": config}, about, file="judge.json")
     if user_file is not None:
         write_file(out / USER_FILE, user_file.read_bytes())
     about_policies = {"robot": robot.name, "task": config.task.name}

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from experiments.applications import own_policy
 from experiments.applications.settings_file import hash_of, pin_settings
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
-from hma_jax.config.json import to_dict
+from hma_jax.config.base import later
+from hma_jax.config.json import completed, to_dict
 from hma_jax.simulator.robots import Robot
 
+RESULTS = Path(__file__).parents[3] / "experiments" / "results"
 PARAMS = {"trunk": {"w": np.arange(3.0)}}
 SETTINGS = {"robot": "arm", "seeds": (0, 1), "search": {"candidates": 4}}
 ARM = Robot("arm", 2, (-1.0,), (1.0,), (0.0,))
@@ -87,3 +90,43 @@ def test_more_of_the_same_is_not_otherwise(tmp_path):
     pin_settings(tmp_path, Path("model"), simulator(), more, may_differ=("seeds",))
     with pytest.raises(ConfigError, match="seeds"):
         pin_settings(tmp_path, Path("model"), simulator(), more)
+
+
+@dataclass(frozen=True)
+class Search:
+    candidates: int = 4
+
+
+@dataclass(frozen=True)
+class Cooled(Search):
+    cooling: float = later(0.5, before=1.0)
+
+
+@dataclass(frozen=True)
+class Decode(DecodeConfig):
+    cooling: float = later(0.5, before=1.0)
+
+
+@pytest.mark.parametrize("within", [lambda search: search, lambda search: {"search": search}])
+def test_a_setting_that_came_later_has_the_value_from_before_in_a_file_without_it(within, tmp_path):
+    for out, first in ((tmp_path / "before", Search()), (tmp_path / "after", Cooled(cooling=1.0))):
+        for search in (first, Cooled(cooling=1.0)):
+            pin_settings(out, Path("model"), simulator(), within(search), {"robot": "arm"})
+        with pytest.raises(ConfigError, match="cooling: 1.0 -> 0.5"):
+            pin_settings(out, Path("model"), simulator(), within(Cooled()), {"robot": "arm"})
+
+
+def test_a_setting_of_decoding_that_came_later_has_the_value_from_before_in_a_file_without_it(tmp_path):
+    for decode in (DecodeConfig(8), Decode(8, cooling=1.0)):
+        pin_settings(tmp_path, Path("model"), simulator(decode=decode), SETTINGS)
+    with pytest.raises(ConfigError, match="simulator.decode.cooling: 1.0 -> 0.5"):
+        pin_settings(tmp_path, Path("model"), simulator(decode=Decode(8)), SETTINGS)
+
+
+@pytest.mark.parametrize("name", ["own_policy_chunk", "own_policy_grown"])
+def test_committed_policies_of_earlier_versions_can_be_gone_on_with(name):
+    """Their files lack settings that came later."""
+    known = json.loads((RESULTS / name / "settings.json").read_text())
+    asked = own_policy.Settings(predicts="chunk" if name.endswith("chunk") else "noise", limits="spread")
+    wanted = to_dict(asked)
+    assert {key: x for key, x in completed(known, asked).items() if key in wanted} == wanted
