@@ -162,6 +162,7 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
             "may write"
         )
     use_entries(arguments.registry)
+    datasets: dict[str, dict[str, str]] = {}
     if arguments.mixture is not None:
         names = get_mixture(arguments.mixture)
         study = on_user_data(study, names)
@@ -169,7 +170,8 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
     elif data:
         from experiments.preparing.sources import group_by_dataset
 
-        study = on_user_data(study, tuple(group_by_dataset(data)))
+        datasets = group_by_dataset(data)
+        study = on_user_data(study, tuple(datasets))
     if arguments.tokenizer is not None:
         from hma_jax.tokenizers.io import load_config
 
@@ -178,7 +180,9 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
     use_sizes({})
     if data:
         from experiments.preparing.sizes import find_sizes
+        from experiments.preparing.sources import require_entries
 
+        require_entries(study.all_names(), datasets)
         use_sizes(find_sizes(data, study.store.held_out, workspace))
     asked = study.trajectory_counts
     if data or arguments.mixture:

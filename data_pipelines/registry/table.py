@@ -17,6 +17,12 @@ from hma_jax.config import ConfigError, require
 MAX_LISTED = 12
 """Names in a message; `hma data list` shows all."""
 
+NEW_DATASET = (
+    "A new dataset needs an entry, in data_pipelines/registry/own.py or in a file given with --registry: `hma data "
+    "inspect DIR` suggests it."
+)
+"""What to do about a dataset that no entry describes."""
+
 _registered: dict[str, DatasetSpec] = {}
 
 
@@ -44,16 +50,19 @@ def get_spec(name: str) -> DatasetSpec:
     joined = next((spec.name for spec in table.values() if name in spec.joins), None)
     if joined is not None:
         raise ConfigError(f"{name!r} is no dataset by itself: the entry {joined!r} joins it; name {joined!r}")
+    raise ConfigError(f"{describe_unknown(name)} {NEW_DATASET}")
+
+
+def describe_unknown(name: str) -> str:
+    """What to say of a name that no entry has: the closest ones, or some."""
+    table = _table()
     names = [*table, *(part for spec in table.values() for part in spec.joins)]
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
     if close:
         hint = f"did you mean {', '.join(close)}?"
     else:
         hint = f"known: {', '.join([*table][:MAX_LISTED])}, ... (`hma data list` shows all)."
-    raise ConfigError(
-        f"unknown dataset {name!r}; {hint} A new dataset needs an entry, in data_pipelines/registry/own.py or in a "
-        "file given with --registry: `hma data inspect DIR` suggests it."
-    )
+    return f"unknown dataset {name!r}; {hint}"
 
 
 def find_spec(name: str) -> DatasetSpec | None:

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from data_pipelines.registry import DatasetSpec, find_reader, get_spec
+from data_pipelines.errors import NoDatasetError
+from data_pipelines.registry import DatasetSpec, find_reader, find_spec, get_spec
+from data_pipelines.registry.table import NEW_DATASET, describe_unknown
 from experiments.data_size import size_of
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
@@ -28,13 +30,11 @@ Unopened = tuple["DatasetSpec", None]
 
 def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
     """{dataset: {name in its files: location}} of the datasets at these locations; several locations are one dataset
-    where an entry joins them. Raises DataError for a location that is no dataset, ConfigError for two of one name."""
-    from data_pipelines.sources.open import source_name
-
+    where an entry joins them. Raises NoDatasetError with all locations that are no datasets, another DataError for one
+    that cannot be read, ConfigError for two of one name."""
     places: dict[str, str] = {}
     datasets: dict[str, dict[str, str]] = {}
-    for place in data:
-        name = source_name(place)
+    for place, name in zip(data, _names_at(data), strict=True):
         require(
             name not in places,
             f"--data: {places.get(name)} and {place} are both the dataset {name!r}, by the name in their files; a "
@@ -45,6 +45,34 @@ def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
         entry = find_reader(name)
         datasets.setdefault(name if entry is None else entry.name, {})[name] = place
     return datasets
+
+
+def _names_at(data: Sequence[str]) -> list[str]:
+    from data_pipelines.sources.open import source_name
+
+    names: list[str] = []
+    refused: list[NoDatasetError] = []
+    for place in data:
+        try:
+            names.append(source_name(place))
+        except NoDatasetError as error:
+            refused.append(error)
+    if len(refused) == 1:
+        raise refused[0]
+    if refused:
+        raise NoDatasetError("\n".join([*map(str, refused), "Leave these out of --data, or correct their paths."]))
+    return names
+
+
+def require_entries(names: Sequence[str], datasets: Mapping[str, Mapping[str, str]]) -> None:
+    """Raises ConfigError for datasets (`group_by_dataset`) that no entry describes, with the place of each."""
+    unknown = [
+        f"{describe_unknown(name)} It is what the files in {place} call themselves."
+        for name in names
+        if find_spec(name) is None
+        for place in datasets.get(name, {}).values()
+    ]
+    require(not unknown, "\n".join([*unknown, NEW_DATASET]))
 
 
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:

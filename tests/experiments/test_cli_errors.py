@@ -241,6 +241,24 @@ def test_unknown_dataset_name(tmp_path, refused):
     assert "data_pipelines/registry/own.py" in message and "hma data inspect" in message
 
 
+def test_all_datasets_without_an_entry_and_all_that_are_none_are_named_at_once(tmp_path, refused):
+    """With twenty new datasets it took twenty attempts to learn their names."""
+    places = [
+        write_rlds(tmp_path / f"{i}", make_spec(name, (2,)), [3]) for i, name in enumerate(("new_arm", "new_car"))
+    ]
+    known = write_rlds(tmp_path, ARM, LENGTHS)
+    message = refused(2, "study", *SMOKE, "--out", tmp_path / "out", "--data", known, *places)
+    for name, place in zip(("new_arm", "new_car"), places, strict=True):
+        (line,) = [line for line in message.splitlines() if name in line]
+        assert f"unknown dataset '{name}'" in line and f" {place} " in line
+    assert ARM.name not in message and message.count("hma data inspect") == 1
+    none = [tmp_path / "README.md", tmp_path / "downloads"]
+    none[0].write_text("x")
+    (none[1] / "x").mkdir(parents=True)
+    message = refused(2, "study", *SMOKE, "--out", tmp_path / "out", "--data", none[0], known, none[1])
+    assert all(str(place) in message for place in none) and ARM.name not in message
+
+
 def test_unknown_dataset_of_the_suite(tmp_path, refused):
     names = "datasets=rover_road,pushr_sand,arm_chalk"
     message = refused(2, "data", "suite", *SMOKE, "--out", tmp_path / "out", "--set", names)
