@@ -36,6 +36,7 @@ class DimensionFacts:
     quantiles: tuple[float, ...]  # at QUANTILES
     histogram: tuple[int, ...]  # values in BINS equal bins
     hint: str  # constant, end flag, switch, one of WRAPPING, absolute, delta, or nothing
+    broken: tuple[int, ...] = ()  # sampled episodes in which it is not finite at some step, from 0 on
 
 
 def dimension_facts(episodes: Sequence[np.ndarray]) -> tuple[DimensionFacts, ...]:
@@ -48,9 +49,10 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     values = np.concatenate(columns)
     finite = np.isfinite(values)
     good = values[finite]
+    broken = tuple(i for i, column in enumerate(columns) if not np.isfinite(column).all())
     if not len(good):
-        nan = float("nan")
-        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), (nan,) * len(QUANTILES), (0,) * BINS, "")
+        nan, none = float("nan"), (0,) * BINS
+        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), (nan,) * len(QUANTILES), none, "", broken)
     mean, std = float(good.mean()), float(good.std())
     columns = [kept for column in columns if len(kept := column[np.isfinite(column)])]
     changes = np.concatenate([np.diff(column) for column in columns])
@@ -66,7 +68,7 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     span = (0.0, extremes[1] - extremes[0]) if alive else (-1.0, 1.0)
     histogram = tuple(np.histogram(good - extremes[0], BINS, span)[0].tolist())
     bad = int((~finite).sum())
-    return DimensionFacts(*extremes, mean, std, distinct, smoothness, bad, quantiles, histogram, hint)
+    return DimensionFacts(*extremes, mean, std, distinct, smoothness, bad, quantiles, histogram, hint, broken)
 
 
 def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, smoothness: float) -> str:

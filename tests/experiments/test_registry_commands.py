@@ -142,11 +142,16 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
         assert f"next: hma tokenize --preset cpu --out {out} --data " in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("damage", ["ragged", "not finite"])
 @pytest.mark.parametrize("damaged, limit", [(1, ""), (17, " --set store.max_skipped=17")])
-def test_inspection_of_damaged_data_ends_with_a_command_that_leaves_the_damage_out(damaged, limit, tmp_path, capsys):
+def test_inspection_of_damaged_data_ends_with_a_command_that_leaves_the_damage_out(
+    damaged, limit, damage, tmp_path, capsys
+):
     def change(episode, features):
-        if episode < damaged:
+        if episode < damaged and damage == "ragged":
             features["steps/action"] = features["steps/action"][:-1]
+        elif episode < damaged:
+            features["steps/action"][7] = np.nan
 
     data = write_rlds(tmp_path, make_spec("my_robot"), [12] * (damaged + 3), change=change)
     words = ["--hz", "4", "--entry", f"{tmp_path}/my.toml", "--out", f"{tmp_path}/sheet"]

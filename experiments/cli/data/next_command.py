@@ -59,7 +59,7 @@ def tokenize_command(
         changes["eval.prompt_frames"] = prompt
     if rate is not None:
         changes["rate"] = f"{rate:g}"
-    if damaged := max(sum(facts.damaged.values()) for facts in datasets):
+    if damaged := max(_unusable(facts) for facts in datasets):
         changes["store.corrupt"] = "skip"
         if damaged > preset.store.max_skipped:
             changes["store.max_skipped"] = damaged
@@ -70,6 +70,16 @@ def tokenize_command(
     if out := _another_out(arguments.out, [facts.name for facts in datasets]):
         arguments = replace(arguments, out=out)
     return command("tokenize", *arguments.words())
+
+
+def _unusable(facts: Facts) -> int:
+    """Sampled episodes that tokenising refuses: those that cannot be read, and those whose actions, as the entry takes
+    them, are not all finite."""
+    from data_pipelines.inspection.issues import chosen_actions
+
+    fields = chosen_actions(facts, find_reader(facts.name))
+    broken = {episode for field in fields for value in field.dimensions for episode in value.broken}
+    return sum(facts.damaged.values()) + len(broken)
 
 
 def _another_out(default: Path, names: Sequence[str]) -> Path | None:
