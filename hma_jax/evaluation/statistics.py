@@ -114,12 +114,13 @@ def stratified(stats: Iterable[Stat], weights: Iterable[float] | None = None) ->
 
     The datasets are fixed, not a sample of possible datasets: only the episodes drawn within
     each contribute error. A dataset of one episode cannot know its own error; its mean is taken to
-    scatter as that of one episode of the others does on average. `n` and `episodes` count those of all.
+    scatter as that of one episode of the others does on average. Where none of these scatters at all, as of means that
+    are zero exactly, its error stays unknown. `n` and `episodes` count those of all.
     """
     stats = list(stats)
     require(len(stats) > 0, "no datasets to average over")
     known = [s.sem**2 * s.clusters for s in stats if not math.isnan(s.sem)]  # variance of one episode
-    typical = add_up(known) / len(known) if known else math.nan
+    typical = add_up(known) / len(known) if any(known) else math.nan
     squares = [typical / s.clusters if math.isnan(s.sem) else s.sem**2 for s in stats]
     parts = [1.0] * len(stats) if weights is None else list(weights)
     return Stat(

@@ -94,6 +94,8 @@ def test_a_dataset_of_one_episode_takes_the_scatter_of_the_others():
     stats = [Stat(1.0, 0.5, 40, 4), Stat(3.0, math.nan, 8, 1)]
     assert stratified(stats).sem == pytest.approx(math.sqrt(0.5**2 + 1.0**2) / 2)
     assert math.isnan(stratified(stats[1:]).sem)
+    assert math.isnan(stratified([Stat(0.0, 0.0, 2, 2), Stat(0.04, math.nan, 2, 1)]).sem)  # no scatter tells nothing
+    assert stratified([Stat(0.0, 0.0, 2, 2), Stat(0.0, 0.0, 4, 2)]).sem == 0
 
 
 def test_perplexity_has_an_error_even_when_all_windows_form_one_group():
