@@ -179,11 +179,11 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
     study = override(study, arguments.set, model)
     use_sizes({})
     if data:
-        from experiments.preparing.sizes import find_sizes
+        from experiments.preparing.sizes import find_sizes, group_readable
         from experiments.preparing.sources import require_entries
 
         require_entries(study.all_names(), datasets)
-        use_sizes(find_sizes(data, study.store.held_out, workspace))
+        use_sizes(find_sizes(datasets or group_readable(data), study.store.held_out, workspace))
     asked = study.trajectory_counts
     if data or arguments.mixture:
         study = _without_equal_caps(study, arguments, workspace)

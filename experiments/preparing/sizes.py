@@ -16,13 +16,19 @@ from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 
 
-def find_sizes(data: Sequence[str], held_out: HeldOut, workspace: Workspace) -> dict[str, DataSize]:
-    """The sizes of the datasets at these locations whose files say how many episodes there are, or whose tokens are in
-    `workspace`: tokens that were made of as many episodes. What cannot be read is left out: who reads it says why."""
+def group_readable(data: Sequence[str]) -> dict[str, dict[str, str]]:
+    """As `group_by_dataset`; {} where one of them cannot be read: who reads it says why."""
     try:
-        datasets = group_by_dataset(data)
+        return group_by_dataset(data)
     except (DataError, ConfigError):
         return {}
+
+
+def find_sizes(
+    datasets: Mapping[str, Mapping[str, str]], held_out: HeldOut, workspace: Workspace
+) -> dict[str, DataSize]:
+    """The sizes of `datasets`, as `group_by_dataset` gives them, whose files say how many episodes there are or whose
+    tokens are in `workspace`: tokens that were made of as many episodes."""
     by_tokens, sizes, others = sizes_by_tokens(workspace.data_summary), {}, []
     for name, places in datasets.items():
         spec, tokens = find_spec(name), by_tokens.get(name)
