@@ -24,6 +24,7 @@ from experiments.applications.policies.diffusion import (
     init_diffusion,
     train_diffusion,
 )
+from experiments.applications.policies.kinds import KINDS
 from experiments.applications.policies.learning import FitConfig, log_spaced_steps
 from experiments.applications.policies.network import EncoderConfig, as_floats, random_shift
 from experiments.applications.policies.tasks import held
@@ -158,14 +159,13 @@ def test_settings_of_jax_change_no_policy(setting, demos):
         np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["cloned", "diffusion"])
-def test_saved_policies_do_the_same_and_damaged_ones_are_refused(kind, demos, tmp_path):
-    if kind == "cloned":
-        config = BcConfig(encoder=SMALL, chunk=2)
-        policy = ClonedPolicy(config, init_bc(config, 4, 0), scale_of(demos))
-    else:
-        config = DiffusionConfig(encoder=SMALL, samples=2)
-        policy = DiffusionPolicy(config, init_diffusion(config, 4, 0), scale_of(demos))
+@pytest.mark.parametrize("name", KINDS)
+def test_trained_policies_of_every_kind_do_the_same_when_saved_and_damaged_ones_are_refused(name, demos, tmp_path):
+    kind, fit = KINDS[name], FitConfig(steps=2, batch=4, keep=(1,))
+    trained = kind.train(demos, kind.config(frames=1, encoder=SMALL, fit=fit), 1, lambda *_: None)
+    assert sorted(trained) == [1, 2]
+    policy = trained[2]
+    assert type(policy) is kind.policy and policy.kind == name
     save_policy(policy, tmp_path / "one", {"robot": "gripper_wood"})
     loaded, images = load_policy(tmp_path / "one"), demos.images[:2, 0]
     for each in (policy, loaded):
