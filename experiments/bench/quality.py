@@ -18,7 +18,7 @@ from experiments.bench.models import EXECUTION, Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
 from experiments.bench.timing import time_by_turns
-from hma_jax.config import EvalConfig, ModelConfig, Setting
+from hma_jax.config import EvalConfig, MaskingSetting, ModelConfig
 from hma_jax.evaluation.evaluate import evaluate
 from hma_jax.evaluation.summary import paired_difference
 from hma_jax.model.hma import declare_model
@@ -75,7 +75,7 @@ def judge(
     settings: dict[str, EvalConfig],
     frames: int,
     repeats: int,
-    setting: Setting,
+    setting: MaskingSetting,
     progress: Callable[[str, int], None],
 ) -> tuple[list[DecodingQuality], list[Stage]]:
     """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time, `setting` is

@@ -26,7 +26,7 @@ from experiments.running.result_file import SAMPLES, write_result
 from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
-from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
+from hma_jax.config import EvalConfig, ExecutionConfig, MaskingSetting, ModelConfig
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.evaluation.windows import FILE
 from hma_jax.training.run_lock import CHECKPOINTS
@@ -178,7 +178,7 @@ def evaluate_on(
     table: EmbodimentTable,
     prepared: PreparedData,
     config: EvalConfig,
-    setting: Setting = "forward",
+    setting: MaskingSetting = "forward",
     *,
     execution: ExecutionConfig = ExecutionConfig(),
     first: int | None = None,

@@ -21,12 +21,12 @@ from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, make_ablation
 from experiments.terminal.program import run_sweep
-from hma_jax.config import Setting, require
+from hma_jax.config import MaskingSetting, require
 
-NAMES: dict[Setting, str] = {"passive": "passive", "full": "full dynamics", "forward": "forward dynamics"}
+NAMES: dict[MaskingSetting, str] = {"passive": "passive", "full": "full dynamics", "forward": "forward dynamics"}
 
 
-def under(setting: Setting, trial: Trial) -> Trial:
+def under(setting: MaskingSetting, trial: Trial) -> Trial:
     """`trial` trained in `setting`; what predicts actions is added where there are any to predict."""
     masking = replace(trial.train.masking, setting=setting)
     model = replace(trial.model, action_heads=trial.model.action_heads or masking.predicts_actions)

@@ -1,7 +1,7 @@
 """Configuration: frozen dataclasses, validated when made. Nothing here imports JAX.
 
 A default lives here and nowhere else; named instances are `experiments.presets`. `model`, `training`,
-`tokenizer`, `pretrained_tokenizers` and `evaluation` hold what determines a result, `execution` how it is
+`tokenizer`, `fixed_tokenizers` and `evaluation` hold what determines a result, `execution` how it is
 computed; paths, clocks and verbosity belong to the code that calls. `json` reads and writes all of them.
 Finished results are named by these fields: one that is added is declared with `base.later`.
 """
@@ -9,8 +9,7 @@ Finished results are named by these fields: one that is added is declared with `
 from hma_jax.config.base import ConfigError, require
 from hma_jax.config.evaluation import SMALLEST_LPIPS_IMAGE, DecodeConfig, EvalConfig, SamplerConfig, check_decoding
 from hma_jax.config.execution import Dtype, ExecutionConfig, MeshConfig
-from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
-from hma_jax.config.pretrained_tokenizers import (
+from hma_jax.config.fixed_tokenizers import (
     AnyTokenizerConfig,
     Latents,
     Magvit2Config,
@@ -18,11 +17,12 @@ from hma_jax.config.pretrained_tokenizers import (
     PythonConfig,
     SvdVaeConfig,
 )
+from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
 from hma_jax.config.tokenizer import ImageSize, TokenGrid, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.config.training import (
     MaskingConfig,
+    MaskingSetting,
     OptimizerConfig,
-    Setting,
     TrainConfig,
     Weights,
     check_micro_batches,
@@ -50,7 +50,7 @@ __all__ = [
     "PixelsConfig",
     "PythonConfig",
     "SamplerConfig",
-    "Setting",
+    "MaskingSetting",
     "SvdVaeConfig",
     "TokenGrid",
     "TokenizerConfig",

@@ -9,11 +9,11 @@ from typing import Literal
 from hma_jax.config.base import check_fields, later, require, require_seed
 from hma_jax.config.model import ModelConfig
 
-Setting = Literal["forward", "passive", "full", "policy", "inverse"]
+MaskingSetting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
 
-PREDICT_FRAMES: tuple[Setting, ...] = ("forward", "passive", "full")
-PREDICT_ACTIONS: tuple[Setting, ...] = ("full", "policy", "inverse")
+PREDICT_FRAMES: tuple[MaskingSetting, ...] = ("forward", "passive", "full")
+PREDICT_ACTIONS: tuple[MaskingSetting, ...] = ("full", "policy", "inverse")
 
 ActionLeak = Literal["none", "conditioning", "all"]
 """Where the model is shown actions that are hidden (`MaskingConfig.action_leak`)."""
@@ -31,7 +31,7 @@ ActionScale = Literal["deviation", "quantiles"]
 class MaskingConfig:
     """Training-time masking and corruption (reference sections 1.9 and 2.3, paper section 3.5)."""
 
-    setting: Setting = "forward"  # what is masked in training, and so predicted (docs/models.md)
+    setting: MaskingSetting = "forward"  # what is masked in training, and so predicted (docs/models.md)
     action_loss_weight: float = 0.5  # weight of the action loss, if frames are predicted too; theirs has weight 1
     non_mlm_ratio: float = 0.2  # probability that the prompt frames of a window are not masked
     prompt_frames: int = 4  # number of prompt frames, the first of a window

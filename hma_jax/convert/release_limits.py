@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from hma_jax.config import ConfigError, ModelConfig, MupConfig, Setting
+from hma_jax.config import ConfigError, MaskingSetting, ModelConfig, MupConfig
 from hma_jax.convert.official_config import BASE_WIDTH, is_continuous
 from hma_jax.model.embodiments import EmbodimentTable
 
@@ -37,7 +37,7 @@ def loads_in_release(config: Mapping[str, Any]) -> bool:
     return not (is_continuous(config) and config.get("use_mup") and config["d_model"] != BASE_WIDTH)
 
 
-def require_official(model: ModelConfig, table: EmbodimentTable, setting: Setting = "forward") -> None:
+def require_official(model: ModelConfig, table: EmbodimentTable, setting: MaskingSetting = "forward") -> None:
     """Raises ConfigError for a model, trained for `setting`, that the release cannot compute."""
     reasons = []
     if setting == "passive":

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from hma_jax.config import ConfigError, DecodeConfig, Dtype, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config import ConfigError, DecodeConfig, Dtype, ExecutionConfig, MaskingSetting, ModelConfig, require
 from hma_jax.config.json import to_dict, to_plain_json
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.neutral import describe_tensors
@@ -65,7 +65,7 @@ class ProgramConfig:
 
 
 def generate_function(
-    model: ModelConfig, table: EmbodimentTable, setting: Setting, config: ProgramConfig
+    model: ModelConfig, table: EmbodimentTable, setting: MaskingSetting, config: ProgramConfig
 ) -> Callable[..., jax.Array]:
     """generate(weights, prompt, actions, embodiment, key) -> frames prompt .. frames - 1.
 

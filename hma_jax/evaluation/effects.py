@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtr  # not scipy.stats, which takes most of a second to import
 
-from hma_jax.config import ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config import ExecutionConfig, MaskingSetting, ModelConfig, require
 from hma_jax.evaluation.likelihood import window_loss
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.generation import next_frame_outputs
@@ -169,7 +169,7 @@ def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
 
 
 def make_loss(
-    model: ModelConfig, table: EmbodimentTable, setting: Setting, execution: ExecutionConfig = ExecutionConfig()
+    model: ModelConfig, table: EmbodimentTable, setting: MaskingSetting, execution: ExecutionConfig = ExecutionConfig()
 ) -> Callable[[Params, dict[str, jax.Array], jax.Array], jax.Array]:
     """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted; the
     batch is as `protocol.Batch` says, `setting` what the model was trained for."""

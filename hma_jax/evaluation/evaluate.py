@@ -18,7 +18,7 @@ import numpy as np
 from einops import rearrange
 from jax.sharding import Mesh, PartitionSpec
 
-from hma_jax.config import EvalConfig, ExecutionConfig, MeshConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ExecutionConfig, MaskingSetting, MeshConfig, ModelConfig, require
 from hma_jax.evaluation.images import Decoder, Sample, ToImages, image_metrics, make_clips
 from hma_jax.evaluation.lpips import load_lpips
 from hma_jax.evaluation.parts import Part, Parts
@@ -73,7 +73,7 @@ def evaluate(
     batches: Iterable[dict[str, Any]],
     config: EvalConfig,
     *,
-    setting: Setting = "forward",
+    setting: MaskingSetting = "forward",
     execution: ExecutionConfig = ExecutionConfig(),
     samples_per_dataset: int = 1,
     progress: Callable[[int], None] | None = None,
@@ -164,7 +164,7 @@ def make_evaluator(
     model: ModelConfig,
     table: EmbodimentTable,
     config: EvalConfig,
-    setting: Setting,
+    setting: MaskingSetting,
     execution: ExecutionConfig,
     to_images: ToImages,
     piece: int,
@@ -200,7 +200,7 @@ def make_evaluator(
     return jax.jit(evaluate_batch, out_shardings=replicated(mesh))
 
 
-def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: Setting) -> None:
+def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: MaskingSetting) -> None:
     """Raises ConfigError for a window without a frame to compare, or, of what predicts none, without an action."""
     if "real" not in batch:
         return

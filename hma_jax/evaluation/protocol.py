@@ -35,7 +35,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ExecutionConfig, MaskingSetting, ModelConfig, require
 from hma_jax.config.training import PREDICT_ACTIONS, PREDICT_FRAMES
 from hma_jax.evaluation.controllability import action_metrics, for_each_sequence
 from hma_jax.evaluation.draws import Purpose, random_actions, table_statistics, window_keys
@@ -86,12 +86,12 @@ class Predicted(NamedTuple):
     other: jax.Array | None = None  # under the first of another episode; None without other_images
 
 
-def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
+def predicts_actions(model: ModelConfig, setting: MaskingSetting) -> bool:
     """Whether a model so trained has a policy to evaluate."""
     return model.action_heads and setting in PREDICT_ACTIONS
 
 
-def predicts_frames(setting: Setting) -> bool:
+def predicts_frames(setting: MaskingSetting) -> bool:
     """Whether a model so trained has frames to evaluate."""
     return setting in PREDICT_FRAMES
 
@@ -124,7 +124,7 @@ def make_predictor(
     model: ModelConfig,
     table: EmbodimentTable,
     config: EvalConfig,
-    setting: Setting = "forward",
+    setting: MaskingSetting = "forward",
     execution: ExecutionConfig = ExecutionConfig(),
 ) -> Callable[..., tuple[dict[str, jax.Array], Predicted | None]]:
     """f(params, batch, units) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. Where the model
@@ -180,7 +180,7 @@ def _frame_metrics(
     batch: Batch,
     table: EmbodimentTable,
     config: EvalConfig,
-    setting: Setting,
+    setting: MaskingSetting,
 ) -> tuple[dict[str, jax.Array], Predicted]:
     """(metrics of tokens, Predicted) of a model that was trained for frames; `window` is what of a batch fits it."""
     model, key_B = hma.config, keys_of(batch, "likelihood", table, config)

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import MaskingConfig, ModelConfig, Setting
+from hma_jax.config import MaskingConfig, MaskingSetting, ModelConfig
 from hma_jax.kernels.random import Tag
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import compose, factorise
@@ -162,7 +162,7 @@ def followed(real_T: jax.Array) -> jax.Array:
 
 
 def hidden_at_inference(
-    table: EmbodimentTable, setting: Setting, embodiment_B: jax.Array, frames: int
+    table: EmbodimentTable, setting: MaskingSetting, embodiment_B: jax.Array, frames: int
 ) -> jax.Array | None:
     """bool [B, T]: chunks to hide from a model trained for `setting`, because it was never shown any; None: none."""
     shape = (len(embodiment_B), frames)
