@@ -108,9 +108,9 @@ def silence_background() -> None:
 @contextmanager
 def plain_messages() -> Iterator[None]:
     """What this project logs is a line on standard error, while the block runs, also after a library has called
-    `logging.basicConfig`, which would begin it with a level and a module."""
-    handler, loggers = logging.StreamHandler(), [logging.getLogger(name) for name in LOGGERS]
-    handler.setLevel(logging.WARNING)
+    `logging.basicConfig`, which would begin it with a level and a module. That is standard error as it is at the
+    time: a progress bar replaces it, to show lines above itself."""
+    handler, loggers = logging.lastResort, [logging.getLogger(name) for name in LOGGERS]
     for logger in loggers:
         logger.addHandler(handler)
         logger.propagate = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 
@@ -93,6 +94,19 @@ def test_a_message_is_the_same_line_whatever_libraries_have_done_to_the_log(caps
     finally:
         logging.root.removeHandler(other)
     assert capsys.readouterr().err == "the tokenizer runs code\n"
+
+
+def test_a_message_goes_where_a_progress_bar_has_put_standard_error(monkeypatch, capsys):
+    """It was written into the line of the bar, at its end."""
+    above_the_bar = io.StringIO()
+
+    def work():
+        monkeypatch.setattr("sys.stderr", above_the_bar)
+        logging.getLogger("hma_jax.x").warning("an action is clipped")
+
+    assert exit_code_of(work) == Exit.DONE
+    assert above_the_bar.getvalue() == "an action is clipped\n"
+    assert capsys.readouterr().err == ""
 
 
 def test_every_program_refuses_a_path_that_is_not_utf8_before_its_work(monkeypatch, capsys):
