@@ -31,7 +31,7 @@ from data_pipelines.tokens.part_files import Part, PartFacts, read_part
 from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, locks_of
 from data_pipelines.tokens.row_sample import merge_samples
 from hma_jax.config import ConfigError, require
-from hma_jax.config.json import diff, stable_hash
+from hma_jax.config.json import diff, stable_hash, to_dict
 from hma_jax.runtime.files import IO_ERRNOS
 from hma_jax.runtime.locks import Held
 
@@ -135,7 +135,11 @@ def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
 
 
 def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
-    return root / f".{plan.spec.name}.{stable_hash([plan, list(parts)])[:12]}"
+    """Where the parts of a plan are made: where an earlier version began to, whose name for it hashes all fields, if it
+    did."""
+    job = [plan, list(parts)]
+    work, former = (root / f".{plan.spec.name}.{stable_hash(named)[:12]}" for named in (job, to_dict(job)))
+    return former if former.exists() else work
 
 
 def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifest | None:

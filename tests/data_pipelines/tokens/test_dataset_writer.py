@@ -17,11 +17,13 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.output_lock import lock_output
+from data_pipelines.tokens import dataset_writer
 from data_pipelines.tokens.beside import beside
 from data_pipelines.tokens.dataset_writer import cut_parts
 from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, read_moments
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
+from hma_jax.config.json import stable_hash, to_dict
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.tokens.job_process import SPEC, contents, run, start
 
@@ -78,6 +80,16 @@ def test_finished_parts_are_not_made_again(rlds, tmp_path):
     assert {tmp_path / "toy" / p.name: t for p, t in parts.items()}.items() <= {
         p: p.stat().st_mtime_ns for p in (tmp_path / "toy").iterdir()
     }.items()
+
+
+def test_what_an_earlier_version_began_is_finished(rlds, undisturbed, tmp_path, monkeypatch):
+    """Its name for the same job was of all fields of the plan, also those that came later."""
+    monkeypatch.setattr(dataset_writer, "stable_hash", lambda job: stable_hash(to_dict(job)))
+    begin(rlds, tmp_path)
+    monkeypatch.undo()
+    first = []
+    run(rlds, tmp_path, progress=lambda done, total: first.append(done))
+    assert first[0] >= 6 and contents(tmp_path) == undisturbed
 
 
 def begin(rlds: Path, store: Path, **options) -> Path:
