@@ -16,7 +16,7 @@ from experiments.preparing.changes import require_preparable
 from experiments.preparing.counterfactual import make_counterfactual
 from experiments.preparing.given_tokenizer import adopt_tokenizer, judge_tokenizer
 from experiments.preparing.made_from import Step
-from experiments.preparing.sources import find_sources, say_short_episodes
+from experiments.preparing.sources import find_sources, say_other_versions, say_short_episodes
 from experiments.preparing.store import make_store
 from experiments.preparing.suite import make_suite
 from experiments.preparing.tokenizer import make_tokenizer
@@ -52,6 +52,7 @@ def prepare(
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     write_asked(study, workspace, sources, tokenizer)
     if replace or not workspace.manifest.exists():  # else all is known
+        say_other_versions(sources)
         say_short_episodes(study, sources)
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace, threads=threads)

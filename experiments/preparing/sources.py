@@ -132,6 +132,7 @@ def check_entries(study: Study, data: Sequence[str]) -> None:
     from data_pipelines.tokens.tokenize_job import resolve_frame_step
 
     sources = find_sources(study, data)
+    say_other_versions(sources)
     say_unreached_rates(study, sources)
     say_short_episodes(study, sources)
     for spec, path in sources:
@@ -144,6 +145,28 @@ def check_entries(study: Study, data: Sequence[str]) -> None:
                 check_fields(split.name, version / FEATURES, split.features, *keys)
             else:
                 open_source((spec, place), study.store).check_keys(*keys)
+
+
+def say_other_versions(sources: Sequence[Source]) -> None:
+    """Names the RLDS datasets of another version than their entry was written for. Where its fields are in the files
+    too, nothing else tells that units or conventions are others."""
+    from data_pipelines.sources.joined import Parts
+    from data_pipelines.sources.open import find_format
+    from data_pipelines.sources.rlds.schema import read_info, resolve_version
+
+    others = []
+    for spec, path in sources:
+        for place in path.places if isinstance(path, Parts) else (path,):
+            if not spec.version or find_format(place) != "rlds":
+                continue
+            there = read_info(resolve_version(place)).version
+            if there != spec.version:
+                others.append(f"{spec.name} (files {there}, entry {spec.version})")
+    if others:
+        say(
+            f"note: files of another version than their entry was written for: {few(others)}. Their fields may mean "
+            "something else: compare `hma data view`, or give the directory of the entry's version in --data"
+        )
 
 
 def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:

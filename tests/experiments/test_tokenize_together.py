@@ -25,7 +25,7 @@ from experiments.cli.main import main
 from experiments.cli.tokenize import MAX_LISTED, show_store
 from experiments.preparing import asked, pipeline, sources
 from experiments.preparing.asked import write_asked
-from experiments.preparing.sources import say_unreached_rates
+from experiments.preparing.sources import say_other_versions, say_unreached_rates
 from experiments.preparing.store import say_other_rates
 from experiments.running.workspace import Workspace
 from experiments.study_setup import StudyArguments, make_setup
@@ -270,6 +270,20 @@ def test_a_rate_that_the_files_of_rlds_say_otherwise_than_the_entry_is_told(tmp_
             say_other_rates(STUDY, [(ARM, place)])
             said = f"{ARM.name}: its files say {hz:g} Hz, but its registry entry {ARM.hz:g} Hz, which is used"
             assert (said in capsys.readouterr().out) == (hz != ARM.hz)
+
+
+def test_files_of_another_version_than_the_entry_was_written_for_are_told(tmp_path, capsys):
+    """The newest of several is read, and where its fields are the same nothing else tells that it is another."""
+    newest = write_rlds(tmp_path, ARM, LENGTHS)
+    older = shutil.copytree(newest, newest.parent / "0.1.0")
+    info = json.loads((older / "dataset_info.json").read_text())
+    (older / "dataset_info.json").write_text(json.dumps(info | {"version": "0.1.0"}))
+    entry = replace(ARM, version="0.1.0")
+    for place in newest.parent, Parts(ARM.name, (newest,)):
+        say_other_versions([(entry, place)])
+        assert f"{ARM.name} (files 1.0.0, entry 0.1.0)" in capsys.readouterr().out
+    say_other_versions([(entry, older), (replace(ARM, version=""), newest), (replace(ARM, version="1.0.0"), newest)])
+    assert not capsys.readouterr().out
 
 
 def test_of_many_losses_some_are_named(tmp_path, capsys):

@@ -142,6 +142,8 @@ def data_inspect(
     """
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, require_own_rate, suggest_entry
+    from data_pipelines.sources.rlds.location import locate
+    from experiments.preparing.sources import say_other_versions
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     stride_of(hz or 1, FRAME_RATE)  # raises before the dataset is read
@@ -180,6 +182,8 @@ def data_inspect(
         _write_entry(entry, suggestion)
         _say_displaced(own.get(facts.name), suggestion.spec(), entry)
     _say_other_rate(facts, hz)
+    if taken is not None:
+        say_other_versions([(taken, locate(directory))])
     if known is not None or entry is not None:
         _say_next(facts, windows, entry or registry, other_rate(facts, rate, registry) if taken else None)
 
