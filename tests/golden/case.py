@@ -90,14 +90,14 @@ class Case:
     def domains(self) -> list[str]:
         return self.info["domains"]
 
-    def actions(self, name: str) -> jax.Array:
+    def actions(self, name: str) -> np.ndarray:
         """Recorded chunks `actions__NAME`, padded to U."""
         actions = self.inputs[f"actions__{name}"]
         missing = self.table.action_width - actions.shape[-1]
-        return jnp.asarray(np.pad(actions, ((0, 0), (0, 0), (0, missing))))
+        return np.pad(actions, ((0, 0), (0, 0), (0, missing)))
 
-    def robot(self, name: str, batch: int) -> jax.Array:
-        return jnp.full(batch, self.table.index(name))
+    def robot(self, name: str, batch: int) -> np.ndarray:
+        return np.full(batch, self.table.index(name), np.int32)
 
     def official(self, params: Params) -> dict[str, np.ndarray]:
         """Official name -> array of parameters, or of gradients."""

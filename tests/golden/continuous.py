@@ -15,7 +15,14 @@ from hma_jax.model.frames import mask_cells, patchify, unpatchify
 from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.process import make_process, sampling_process
 from tests.golden.case import Case, norms
+from tests.golden.discrete import with_frame
 from tests.sampling import sample_recorded, trajectory_of
+
+_patchify, _unpatchify, _mask_cells = (
+    jax.jit(function, static_argnums=fixed)
+    for function, fixed in ((patchify, 1), (unpatchify, (1, 2)), (mask_cells, 3))
+)
+_choose_patches, _commit = jax.jit(choose_patches, static_argnums=(1, 2)), jax.jit(commit)
 
 
 class Latents:
@@ -23,14 +30,14 @@ class Latents:
 
     def __init__(self, case: Case):
         self.config = case.run.model.diffusion
-        latents = jnp.asarray(case.inputs["latents"])
+        latents = case.inputs["latents"]
         self.batch, self.frames, h, w, _ = latents.shape
         self.grid = (h // self.config.patch, w // self.config.patch)
-        self.tokens = patchify(latents, self.config.patch)
+        self.tokens = np.asarray(_patchify(latents, self.config.patch))
 
-    def masked(self, indicator: np.ndarray) -> jax.Array:
+    def masked(self, indicator: np.ndarray) -> np.ndarray:
         """bool [B, T, S, cells] from bool [B, T, h, w]."""
-        return patchify(jnp.asarray(indicator)[..., None], self.config.patch)
+        return np.asarray(_patchify(indicator[..., None], self.config.patch))
 
     def on_grid(self, x: jax.Array) -> np.ndarray:
         """[..., S, n] -> [..., rows, columns, n]."""
@@ -40,8 +47,8 @@ class Latents:
         """[B, ..., S, D] -> batch, channel, ..., row, column."""
         return np.moveaxis(self.on_grid(z), -1, 1)
 
-    def cells(self, tokens: jax.Array) -> jax.Array:
-        return unpatchify(tokens, self.config.patch, self.grid[1])
+    def cells(self, tokens: np.ndarray) -> jax.Array:
+        return _unpatchify(tokens, self.config.patch, self.grid[1])
 
 
 def applier(case: Case):
@@ -92,7 +99,7 @@ def check_forward(case: Case) -> None:
     tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
     model = case.declared.merge(case.params)
     case.check("patches_of_latents", latents.on_grid(tokens))
-    replaced = mask_cells(tokens, masked, model.embed.mask.get_value(), case.run.model.diffusion)
+    replaced = _mask_cells(tokens, masked, model.embed.mask.get_value(), case.run.model.diffusion)
     case.check("masked_patches", latents.on_grid(replaced))
 
     def check_z(output, actions, robot, frames=None):
@@ -109,8 +116,9 @@ def check_forward(case: Case) -> None:
         check_z("z_short_window", case.actions(case.domains[0])[:, :short], case.domains[0], short)
 
     if "head_t" in case.inputs:
-        time, condition = (jnp.asarray(case.inputs[f"head_{name}"]) for name in "tc")
-        case.check("head_output", model.denoiser(jnp.asarray(case.inputs["head_x_t"]), time, condition))
+        time, condition = (case.inputs[f"head_{name}"] for name in "tc")
+        denoise = jax.jit(lambda params, *inputs: frame_head(case.declared.merge(params), *inputs))
+        case.check("head_output", denoise(case.params, case.inputs["head_x_t"], time, condition))
         for robot in [r for r in case.domains if f"action_head_x_t__{r}" in case.inputs]:
             case.check(f"action_head_output__{robot}", _action_head(case, robot, time, condition))
     if "sample_c" in case.inputs:
@@ -118,7 +126,7 @@ def check_forward(case: Case) -> None:
 
 
 def _check_sampler(case: Case) -> None:
-    condition = jnp.asarray(case.inputs["sample_c"])
+    condition = case.inputs["sample_c"]
     noise = case.inputs["sample_noise_init"], case.inputs["sample_noise_steps"]
     case.check("sample_temperature1", make_sampler(case, frame_head, 1.0)(condition, *noise))
     visited = make_sampler(case, frame_head, 1.0, trajectory_of)(condition, *noise)
@@ -127,16 +135,17 @@ def _check_sampler(case: Case) -> None:
     case.check("sample_temperature0", make_sampler(case, frame_head, 0.0)(condition, *noise))
 
 
-def _pad(case: Case, x: np.ndarray) -> jax.Array:
+def _pad(case: Case, x: np.ndarray) -> np.ndarray:
     """[..., chunk] -> [..., U]."""
-    return jnp.pad(jnp.asarray(x), [(0, 0)] * (x.ndim - 1) + [(0, case.table.action_width - x.shape[-1])])
+    return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, case.table.action_width - x.shape[-1])])
 
 
-def _action_head(case: Case, robot: str, time: jax.Array, condition: jax.Array) -> jax.Array:
+def _action_head(case: Case, robot: str, time: np.ndarray, condition: np.ndarray) -> np.ndarray:
     """Rows [n, 2 chunk] of one robot's head."""
     x = case.inputs[f"action_head_x_t__{robot}"]
-    model = case.declared.merge(case.params)
-    out = model.action_head(_pad(case, x)[None], time[None], condition[None], case.robot(robot, 1))[0]
+    head = jax.jit(lambda params, *inputs: case.declared.merge(params).action_head(*inputs))
+    inputs = _pad(case, x)[None], time[None], condition[None], case.robot(robot, 1)
+    out = np.asarray(head(case.params, *inputs))[0]
     return out.reshape(len(x), 2, -1)[..., : x.shape[-1]].reshape(len(x), -1)
 
 
@@ -194,26 +203,26 @@ def check_generation(case: Case) -> None:
 
     def decode(window, unknown, t, steps, temperature, order, noise_name):
         """(frame, first conditions, patches after each step), as released: nothing is marked as known."""
-        frame = Frame(jnp.zeros_like(window[:, t]), jnp.ones(window[:, t].shape[:2], bool))
+        frame = Frame(np.zeros_like(window[:, t]), np.ones(window[:, t].shape[:2], bool))
         states, first = [], None
         for step, keep in enumerate(masked_counts(config, steps)):
-            ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
-            z = apply(ids, masked, actions[:, : window.shape[1]], robots).token_outputs[:, t]
+            ids, masked = with_frame(window, t, frame.values), with_frame(unknown, t, frame.masked)
+            z = np.asarray(apply(ids, masked, actions[:, : window.shape[1]], robots).token_outputs)[:, t]
             first = z if first is None else first
-            chosen = choose_patches(jnp.asarray(order), order.shape[1], keep)
-            condition = jnp.take_along_axis(z, chosen[..., None], axis=1)
+            chosen = np.asarray(_choose_patches(order, order.shape[1], keep))
+            condition = np.take_along_axis(z, chosen[..., None], axis=1)
             rows = condition.reshape(-1, condition.shape[-1])
             noise = [case.inputs[f"noise_{kind}__{noise_name}__{step}"] for kind in ("init", "steps")]
-            new = sampler(temperature)(rows, *noise).reshape(*chosen.shape, -1)
-            frame = commit(frame, chosen, new)
+            new = np.asarray(sampler(temperature)(rows, *noise)).reshape(*chosen.shape, -1)
+            frame = _commit(frame, chosen, new)
             vector = case.declared.merge(case.params).embed.mask.get_value()
-            states.append(mask_cells(frame.values, frame.masked, vector, config.diffusion))
-        return frame.values, first, jnp.stack(states, axis=1)
+            states.append(_mask_cells(frame.values, frame.masked, vector, config.diffusion))
+        return np.asarray(frame.values), first, np.stack(states, axis=1)
 
     for run, settings in case.info["runs"].items():
         tokens = latents.tokens[:, : settings.get("window", latents.frames)]
         t = settings["out_t"]
-        unknown = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= t)[None, :, None], tokens.shape[:3])
+        unknown = np.broadcast_to((np.arange(tokens.shape[1]) >= t)[None, :, None], tokens.shape[:3])
         order = case.inputs[f"order__{run}"]
         frame, first, states = decode(tokens, unknown, t, settings["M"], settings["temperature"], order, run)
         case.check(f"{run}_frame", latents.cells(frame))
@@ -223,12 +232,12 @@ def check_generation(case: Case) -> None:
     settings, steps = case.info.get("generate"), case.settings["maskgit_steps"]
     if settings:
         window, prompt = latents.tokens, settings["num_prompt"]
-        unknown = jnp.broadcast_to((jnp.arange(latents.frames) >= prompt)[None, :, None], window.shape[:3])
+        unknown = np.broadcast_to((np.arange(latents.frames) >= prompt)[None, :, None], window.shape[:3])
         for new, t in enumerate(range(prompt, latents.frames)):
             name = f"generate__{new}"
             order = case.inputs[f"order__{name}"]
             frame, _, _ = decode(window, unknown, t, steps, settings["temperature"], order, name)
-            window, unknown = window.at[:, t].set(frame), unknown.at[:, t].set(False)
+            window, unknown = with_frame(window, t, frame), with_frame(unknown, t, False)
         flat = np.asarray(latents.cells(window))
         case.check("generate_latents", flat.reshape(latents.batch, -1, flat.shape[-1]))
 
@@ -246,19 +255,19 @@ def check_joint(case: Case) -> None:
 
     robot = case.domains[0]
     robots = case.robot(robot, latents.batch)
-    everything = jnp.ones(tokens.shape[:2], bool)
-    out = apply(tokens, masked, jnp.zeros_like(case.actions(robot)), robots, everything)
+    everything = np.ones(tokens.shape[:2], bool)
+    out = apply(tokens, masked, np.zeros_like(case.actions(robot)), robots, everything)
     case.check("z_policy", latents.channels_first(out.token_outputs))
     case.check("action_z_policy", out.action_features_BTD)
 
-    rows = out.action_features_BTD.reshape(1, -1, out.action_features_BTD.shape[-1])
+    rows = np.asarray(out.action_features_BTD).reshape(1, -1, out.action_features_BTD.shape[-1])
 
     def head(model, x, t, z):
         return model.action_head(x[None], t[None], z, robots[:1])[0]
 
     noise = [_pad(case, case.inputs[f"action_noise_{kind}"]) for kind in ("init", "steps")]
     chunk = case.table.entries[case.table.index(robot)].chunk
-    case.check("action_sample_policy", make_sampler(case, head, 1.0)(rows, *noise)[:, :chunk])
+    case.check("action_sample_policy", np.asarray(make_sampler(case, head, 1.0)(rows, *noise))[:, :chunk])
     if "train_loss" in case.outputs:
         _check_joint_training(case, latents, robot)
 
@@ -268,11 +277,11 @@ def _check_joint_training(case: Case, latents: Latents, robot: str) -> None:
     tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
     robots, actions = case.robot(robot, latents.batch), case.actions(robot)
     shape = actions.shape[:2]
-    time = jnp.asarray(case.inputs["action_t"]).reshape(shape)
+    time = case.inputs["action_t"].reshape(shape)
     noise = _pad(case, case.inputs["action_noise"]).reshape(*shape, -1)
-    hidden = jnp.arange(shape[1])[None] >= case.inputs["action_mask_start"].reshape(-1, 1)
+    hidden = np.arange(shape[1])[None] >= case.inputs["action_mask_start"].reshape(-1, 1)
     chunk = case.table.entries[case.table.index(robot)].chunk
-    own = jnp.broadcast_to(jnp.arange(actions.shape[-1]) < chunk, actions.shape)
+    own = np.broadcast_to(np.arange(actions.shape[-1]) < chunk, actions.shape)
     weight, process = case.settings["action_loss_weight"], make_process(case.run.model.diffusion.steps)
 
     @jax.jit

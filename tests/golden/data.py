@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from data_pipelines.tokens.episode_record import StoredEpisode
@@ -39,10 +39,13 @@ def check_collators(case: Case) -> None:
         _check_latents(case, mode, first)
 
 
-def _from_first(recorded: np.ndarray, frames: int) -> jnp.ndarray:
+_corrupt, _mask_tokens = jax.jit(corrupt, static_argnums=(2, 3)), jax.jit(mask_tokens, static_argnums=3)
+
+
+def _from_first(recorded: np.ndarray, frames: int) -> np.ndarray:
     """[T, ...]: numbers are recorded from the first masked frame on, earlier ones do not matter."""
     missing = frames - len(recorded)
-    return jnp.asarray(np.concatenate([np.ones((missing, *recorded.shape[1:])), recorded]), jnp.float32)
+    return np.concatenate([np.ones((missing, *recorded.shape[1:])), recorded]).astype(np.float32)
 
 
 def _check_discrete(case: Case, mode: str, first: int) -> None:
@@ -60,19 +63,19 @@ def _check_discrete(case: Case, mode: str, first: int) -> None:
             uniform = inputs["prompt__uniform"]
             degrade = inputs["prompt__frame_r"][:, b].reshape(degrade.shape)
         draws = MaskingDraws(
-            u_corrupt=jnp.float32(inputs[f"{mode}__corrupt_u"]),
-            u_replace_TSQ=jnp.asarray(inputs[f"{mode}__corrupt_r"][b].reshape(frames, h * w, q)),
-            noise_TSQ=jnp.asarray(inputs[f"{mode}__random_values"][b].reshape(frames, h * w, q)),
-            first_masked=jnp.int32(first),
-            u_clean=jnp.float32(uniform[0]),
+            u_corrupt=np.float32(inputs[f"{mode}__corrupt_u"]),
+            u_replace_TSQ=inputs[f"{mode}__corrupt_r"][b].reshape(frames, h * w, q),
+            noise_TSQ=inputs[f"{mode}__random_values"][b].reshape(frames, h * w, q),
+            first_masked=np.int32(first),
+            u_clean=np.float32(uniform[0]),
             u_decay_T=_from_first(uniform[1:], frames),
             u_degrade_TSQ=_from_first(degrade, frames),
             u_rate_T=_from_first(inputs[f"{mode}__mask_prob_u"][b].ravel(), frames),
             u_mask_TS=_from_first(inputs[f"{mode}__mask_r"][b].reshape(-1, h * w), frames),
         )
-        tokens = jnp.asarray(inputs["tokens"][b].reshape(frames, -1))
-        ids = corrupt(tokens, draws, config, masking)
-        masked = mask_tokens(draws.u_rate_T, draws.u_mask_TS, draws.first_masked, masking)
+        tokens = inputs["tokens"][b].reshape(frames, -1)
+        ids = _corrupt(tokens, draws, config, masking)
+        masked = _mask_tokens(draws.u_rate_T, draws.u_mask_TS, draws.first_masked, masking)
         got.append(np.where(masked, config.vocab_size, ids).ravel())
     case.check(f"{mode}__input_ids", np.stack(got))
     case.check(f"{mode}__labels", inputs["tokens"].reshape(batch, -1))
@@ -86,7 +89,7 @@ def _check_latents(case: Case, mode: str, first: int) -> None:
     for b in range(batch):
         rate = _from_first(inputs[f"feature_{mode}__mask_prob_u"][b].ravel(), frames)
         cells = _from_first(inputs[f"feature_{mode}__mask_r"][b].reshape(-1, h * w), frames)
-        got.append(np.asarray(mask_tokens(rate, cells, jnp.int32(first), masking)).reshape(frames, h, w))
+        got.append(np.asarray(_mask_tokens(rate, cells, np.int32(first), masking)).reshape(frames, h, w))
     case.check(f"feature_{mode}__masked_tokens_indicator", np.stack(got))
 
 
@@ -173,7 +176,7 @@ def check_metrics(case: Case) -> None:
     ssim = metrics.ssim(true, predicted)
     factored = np.moveaxis(case.inputs["factored_logits"], (1, 2), (-1, -2))  # [B, T-1, h, w, Q, V]
     labels = case.inputs["labels"].reshape(len(factored), -1, *factored.shape[2:4])[:, 1:]
-    entropy = float(metrics.factored_cross_entropy(jnp.asarray(factored), jnp.asarray(labels)).mean())
+    entropy = float(np.mean(jax.jit(metrics.factored_cross_entropy)(factored, labels)))
     batches = case.inputs["batch_losses"], case.inputs["batch_sizes"]
     got = {
         "psnr_last_frame_per_clip": (last, 1e-6),

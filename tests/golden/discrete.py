@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import DecodeConfig, MaskingConfig
@@ -34,12 +33,12 @@ def check_channels_first(case: Case, output: str, logits_BTSQV: jax.Array) -> No
     case.check(output, got if got.ndim == want.ndim else got[:, :, -1])
 
 
-def windows(case: Case, name: str) -> tuple[jax.Array, jax.Array]:
+def windows(case: Case, name: str) -> tuple[np.ndarray, np.ndarray]:
     """(ids [B, T, S], masked): official ids hold the vocabulary's size where masked."""
-    ids = case.inputs[name]
-    ids = jnp.asarray(ids.reshape(len(ids), -1, case.run.model.tokens))
+    ids = case.inputs[name].astype(np.int32)
+    ids = ids.reshape(len(ids), -1, case.run.model.tokens)
     masked = ids == case.run.model.vocab_size
-    return jnp.where(masked, 0, ids), masked
+    return np.where(masked, 0, ids), masked
 
 
 def applier(case: Case):
@@ -80,11 +79,11 @@ def check_logits(case: Case) -> None:
 # --- Loss --------------------------------------------------------------------------------------
 
 
-def as_masked(ids: jax.Array, masked: jax.Array, hidden: jax.Array | None = None) -> Masked:
+def as_masked(ids: np.ndarray, masked: np.ndarray, hidden: np.ndarray | None = None) -> Masked:
     """Recorded masks as our collator would give them: frame 0 is never a target."""
-    targets = masked & (jnp.arange(ids.shape[1]) > 0)[None, :, None]
+    targets = masked & (np.arange(ids.shape[1]) > 0)[None, :, None]
     if hidden is None:
-        hidden = jnp.zeros(ids.shape[:2], bool)
+        hidden = np.zeros(ids.shape[:2], bool)
     return Masked(ids, masked, targets, hidden, hidden)
 
 
@@ -122,13 +121,18 @@ def check_loss(case: Case) -> None:
             case.check_zero(named, case.info["unused_parameters"])
 
     if "loss__no_action" in case.outputs:
-        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).token_outputs
-        digits = factorise(labels, case.run.model.factors, case.run.model.factor_vocab)
-        weight = recorded.targets_TS / recorded.targets_TS.sum()
-        per_token, _ = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
-        case.check("loss__no_action", (per_token * weight).sum())
-        right = (logits.argmax(-1) == digits).all(-1)
-        case.check("acc__no_action", (right * weight).sum())
+
+        @jax.jit
+        def loss_of(logits):
+            digits = factorise(labels, case.run.model.factors, case.run.model.factor_vocab)
+            weight = recorded.targets_TS / recorded.targets_TS.sum()
+            per_token, _ = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
+            right = (logits.argmax(-1) == digits).all(-1)
+            return (per_token * weight).sum(), (right * weight).sum()
+
+        loss, accuracy = loss_of(apply(ids, masked, None, case.robot(case.domains[0], batch)).token_outputs)
+        case.check("loss__no_action", loss)
+        case.check("acc__no_action", accuracy)
     if (case.folder / "mup_table.json").exists():
         check_mup_table(case)
 
@@ -136,50 +140,59 @@ def check_loss(case: Case) -> None:
 # --- Generation --------------------------------------------------------------------------------
 
 
-def classes_first(logits_BSQV: jax.Array, grid: tuple[int, int]) -> np.ndarray:
+def classes_first(logits_BSQV: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
     """The release's layout of a frame's logits: batch, class, factor, height, width."""
     b, _, q, v = logits_BSQV.shape
-    return np.asarray(logits_BSQV).transpose(0, 3, 2, 1).reshape(b, v, q, *grid)
+    return logits_BSQV.transpose(0, 3, 2, 1).reshape(b, v, q, *grid)
+
+
+def with_frame(window: np.ndarray, t: int, values: np.ndarray | jax.Array | bool) -> np.ndarray:
+    """A copy of [B, T, ...] with `values` as frame t."""
+    copy = np.array(window)
+    copy[:, t] = values
+    return copy
 
 
 class Decoder:
     """The release's inner loop over one frame of a whole window, by our parts and recorded numbers."""
 
-    def __init__(self, case: Case, actions: jax.Array | None, hidden: jax.Array | None = None):
+    def __init__(self, case: Case, actions: np.ndarray | None, hidden: np.ndarray | None = None):
         self.case, self.apply = case, applier(case)
         self.actions, self.hidden = actions, hidden
+        head = case.declared.merge(case.params).frame_head
+        self.draw = jax.jit(lambda logits, keys: sample_tokens(head, logits, keys, 0.0))
+        self.unmask = jax.jit(unmask)
 
-    def run(self, window: jax.Array, unknown: jax.Array, t: int, steps: int, scores: list[np.ndarray] | None):
+    def run(self, window: np.ndarray, unknown: np.ndarray, t: int, steps: int, scores: list[np.ndarray] | None):
         """(frame, first logits, frames after each step, the last pass). Without `scores` by confidence."""
         config, batch = self.case.run.model, len(window)
         robots, keys = (
             self.case.robot(self.case.domains[0], batch),
             jax.random.split(jax.random.key(0), batch),
         )
-        frame = Frame(jnp.zeros_like(window[:, t]), jnp.ones(window[:, t].shape, bool))
+        frame = Frame(np.zeros_like(window[:, t]), np.ones(window[:, t].shape, bool))
         states, first = [], None
-        head = self.case.declared.merge(self.case.params).frame_head
         for step, keep in enumerate(masked_counts(config, steps)):
-            ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
+            ids, masked = with_frame(window, t, frame.values), with_frame(unknown, t, frame.masked)
             out = self.apply(ids, masked, self.actions, robots, self.hidden)
-            logits = out.token_outputs[:, t]
+            logits = np.asarray(out.token_outputs)[:, t]
             first = logits if first is None else first
-            sampled, score = sample_tokens(head, logits, keys, 0.0)
+            sampled, score = self.draw(logits, keys)
             if keep and scores is not None:
-                score = jnp.asarray(scores[step].reshape(batch, -1))
-            frame = unmask(frame, sampled, score, keep)
+                score = scores[step].reshape(batch, -1)
+            frame = self.unmask(frame, sampled, score, keep)
             states.append(np.where(frame.masked, config.vocab_size, frame.values))
-        return frame.values, first, np.stack(states, axis=1), out
+        return np.asarray(frame.values), first, np.stack(states, axis=1), out
 
-    def generate(self, tokens: jax.Array, prompt: int, steps: int, scores: list[np.ndarray]):
+    def generate(self, tokens: np.ndarray, prompt: int, steps: int, scores: list[np.ndarray]):
         """(whole window [B, T, S], first logits of every new frame, the last pass)."""
         frames = tokens.shape[1]
-        unknown = jnp.broadcast_to((jnp.arange(frames) >= prompt)[None, :, None], tokens.shape)
+        unknown = np.broadcast_to((np.arange(frames) >= prompt)[None, :, None], tokens.shape)
         window, firsts, out = tokens, [], None
         for new, t in enumerate(range(prompt, frames)):
             own = scores[new * (steps - 1) : (new + 1) * (steps - 1)]
             frame, first, _, out = self.run(window, unknown, t, steps, own)
-            window, unknown = window.at[:, t].set(frame), unknown.at[:, t].set(False)
+            window, unknown = with_frame(window, t, frame), with_frame(unknown, t, False)
             firsts.append(first)
         return window, firsts, out
 
@@ -194,7 +207,7 @@ def check_generation(case: Case) -> None:
     grid = case.inputs["tokens"].shape[-2:]
     robot, out_t, prompt = case.domains[0], case.info["out_t"], case.info["num_prompt"]
     actions = case.actions(robot)
-    later = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= out_t)[None, :, None], tokens.shape)
+    later = np.broadcast_to((np.arange(tokens.shape[1]) >= out_t)[None, :, None], tokens.shape)
 
     def as_frame(x):
         return np.asarray(x).reshape(*x.shape[:-1], *grid)
@@ -224,7 +237,7 @@ def check_generation(case: Case) -> None:
             case.check(key, whole.reshape(len(whole), -1), via="rollout")
 
 
-def rolled_out(case: Case, tokens: jax.Array, prompt: int, actions: jax.Array) -> jax.Array:
+def rolled_out(case: Case, tokens: np.ndarray, prompt: int, actions: np.ndarray) -> np.ndarray:
     """The window [B, T, S] as `rollout` continues its prompt, likeliest tokens at once."""
     keys = jax.random.split(jax.random.key(0), len(tokens))
     robots, decode = case.robot(case.domains[0], len(tokens)), DecodeConfig(unmask_steps=1)
@@ -234,4 +247,4 @@ def rolled_out(case: Case, tokens: jax.Array, prompt: int, actions: jax.Array) -
         return rollout(case.declared.merge(params), start, actions[:, None], robots, keys, decode)[:, 0]
 
     start = tokens[:, :prompt]
-    return jnp.concatenate([start, run(case.params, start)], axis=1)
+    return np.concatenate([start, run(case.params, start)], axis=1)

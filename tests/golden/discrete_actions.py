@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from tests.golden.case import Case, norms
 from tests.golden.discrete import MASKING, Decoder, as_masked, check_channels_first, loss_and_accuracy, windows
@@ -14,7 +15,8 @@ from tests.golden.discrete import MASKING, Decoder, as_masked, check_channels_fi
 def check_joint(case: Case) -> None:
     ids, masked = windows(case, "tokens")
     batch = len(ids)
-    everything = jnp.ones(ids.shape[:2], bool)
+    everything = np.ones(ids.shape[:2], bool)
+    unnormalise = jax.jit(case.table.scale().unnormalise)
 
     @jax.jit
     def read(params, actions, robots, hidden):
@@ -27,8 +29,8 @@ def check_joint(case: Case) -> None:
         for way, hidden in (("given", ~everything), ("policy", everything)):
             logits, predicted = read(case.params, case.actions(robot), robots, hidden)
             check_channels_first(case, f"states_{way}__{robot}", logits)
-            case.check(f"actions_{way}__{robot}", predicted[..., :chunk])
-        raw = case.table.scale().unnormalise(predicted, robots)
+            case.check(f"actions_{way}__{robot}", np.asarray(predicted)[..., :chunk])
+        raw = np.asarray(unnormalise(predicted, robots))
         case.check(f"actions_policy_unnormalized__{robot}", raw[..., :chunk])
     if "train_loss" in case.outputs:
         _check_training(case)
@@ -36,17 +38,21 @@ def check_joint(case: Case) -> None:
         _check_policy(case, everything)
 
 
-def _check_policy(case: Case, everything: jax.Array) -> None:
+def _check_policy(case: Case, everything: np.ndarray) -> None:
     """Frames and actions of a window whose actions are all hidden."""
     tokens, _ = windows(case, "clean_tokens")
     batch = len(tokens)
     robot, prompt = case.domains[0], case.info["num_prompt"]
-    nothing = jnp.zeros_like(case.actions(robot))
+    nothing = np.zeros_like(case.actions(robot))
     window, _, out = Decoder(case, nothing, everything).generate(tokens, prompt, 1, [])
     case.check("generate_policy_tokens", window.reshape(batch, -1))
     robots = case.robot(robot, batch)
-    predicted = case.declared.merge(case.params).action_head(out.action_features_BTD, robots)
-    raw = case.table.scale().unnormalise(predicted, robots)
+
+    @jax.jit
+    def read(params, features):
+        return case.table.scale().unnormalise(case.declared.merge(params).action_head(features, robots), robots)
+
+    raw = np.asarray(read(case.params, out.action_features_BTD))
     chunk = case.table.entries[case.table.index(robot)].chunk
     case.check("generate_policy_actions_unnormalized", raw[..., :chunk])
 
@@ -59,7 +65,7 @@ def _check_training(case: Case) -> None:
     robot, batch = case.domains[0], len(ids)
     actions, robots = case.actions(robot), case.robot(robot, batch)
     chunk = case.table.entries[case.table.index(robot)].chunk
-    hidden = jnp.asarray(case.inputs["action_mask_draw"] < case.inputs["action_drop_ratio"])[..., 0]
+    hidden = (case.inputs["action_mask_draw"] < case.inputs["action_drop_ratio"])[..., 0]
     masking = replace(MASKING, setting="full", action_leak="conditioning")
     weight = case.settings["action_loss_weight"]
     recorded = as_masked(ids, masked, hidden)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from data_pipelines.registry import DatasetSpec
@@ -84,28 +84,33 @@ def _indices(case: Case, label: str, want: dict[str, Any]) -> None:
 
 
 def _embedding(case: Case, label: str, want: dict[str, Any]) -> None:
-    got = timestep_embedding(jnp.array(want["timesteps"]), want["dim"])
+    got = jax.jit(timestep_embedding, static_argnums=1)(np.array(want["timesteps"]), want["dim"])
     case.compare(label, got, np.asarray(want["embedding"], np.float32), 1e-4)
 
 
 # --- Tokens and decoding -----------------------------------------------------------------------
 
 
+_factorise = jax.jit(factorise, static_argnums=(1, 2))
+_compose, _patches = (jax.jit(function, static_argnums=1) for function in (compose, patchify))
+_cells = jax.jit(unpatchify, static_argnums=(1, 2))
+
+
 def _factorisation(case: Case, label: str, want: list[dict[str, Any]]) -> None:
     wrong = []
     for one in want:
-        ids, size = jnp.array(one["ids"]), one["factor_size"]
-        digits = factorise(ids, one["num_factors"], size)
-        if digits.tolist() != one["factors"] or compose(digits, size).tolist() != one["ids"]:
+        size = one["factor_size"]
+        digits = _factorise(np.array(one["ids"]), one["num_factors"], size)
+        if digits.tolist() != one["factors"] or _compose(digits, size).tolist() != one["ids"]:
             wrong.append(f"{one['num_factors']} factors of {size}")
     _exact(case, label, wrong, len(want))
 
 
 def _patchify(case: Case, label: str, want: dict[str, Any]) -> None:
     shape, new = want["input_shape"], want["output_shape"]
-    x, patch = jnp.arange(np.prod(shape)).reshape(shape), shape[2] // new[2]
-    tokens = patchify(x, patch)
-    good = tokens.ravel().tolist() == want["output"] and (unpatchify(tokens, patch, new[3]) == x).all()
+    x, patch = np.arange(np.prod(shape)).reshape(shape), shape[2] // new[2]
+    tokens = np.asarray(_patches(x, patch))
+    good = tokens.ravel().tolist() == want["output"] and (np.asarray(_cells(tokens, patch, new[3])) == x).all()
     _exact(case, label, [] if good else ["the order differs"], 1)
 
 
@@ -148,7 +153,7 @@ def _weights(case: Case, label: str, want: list[dict[str, Any]]) -> None:
 
 def _rate(case: Case, label: str, want: dict[str, Any]) -> None:
     config = OptimizerConfig(learning_rate=1.0, warmup_steps=want["warmup_steps"])
-    schedule = make_schedule(config, want["total_steps"])
+    schedule = jax.jit(make_schedule(config, want["total_steps"]))
     for name in want.keys() - {"warmup_steps", "total_steps", "note", "index"}:
         if name == "constant_with_warmup":
             # Theirs counts warm-up steps from 0, so that its first update does nothing if there are any.
@@ -157,7 +162,7 @@ def _rate(case: Case, label: str, want: dict[str, Any]) -> None:
             case.compare(f"{label}.{name}", got, want[name], 1e-6)
         elif name == "custom_cosine":
             kind = OptimizerConfig(learning_rate=1.0, warmup_steps=want["warmup_steps"], schedule="cosine")
-            cosine = make_schedule(kind, want["total_steps"])
+            cosine = jax.jit(make_schedule(kind, want["total_steps"]))
             got = [float(cosine(i)) for i in want["index"]]
             case.compare(f"{label}.{name}", got, want[name], 1e-6)
         else:
