@@ -12,6 +12,10 @@ def logits(heat: jax.Array) -> jax.Array:
     return jnp.log(heat) - jnp.log1p(-heat)
 
 
+def fresh(robots: int, points: int):
+    return jax.jit(lambda: init_detector(jax.random.key(0), robots=robots, points=points))()
+
+
 def test_a_point_is_found_where_its_heat_is_and_is_sure_only_if_it_is_there():
     position = jnp.array([[[10.0, 40.5], [31.3, 7.2]], [[55.0, 20.0], [3.0, 62.0]]])
     there = jnp.array([[1.0, 1.0], [1.0, 0.0]])
@@ -21,24 +25,24 @@ def test_a_point_is_found_where_its_heat_is_and_is_sure_only_if_it_is_there():
 
 
 def test_robots_have_outputs_of_their_own():
-    weights = init_detector(jax.random.key(0), robots=2, points=3)
-    film = jax.random.uniform(jax.random.key(1), (5, 16, 16, 3)) * 255
+    weights = fresh(robots=2, points=3)
+    film = np.random.default_rng(1).uniform(0, 255, (5, 16, 16, 3)).astype(np.float32)
     run = jax.jit(detect)
     found, other = run(weights, film, 0), run(weights, film, 1)
     assert found.position.shape == (5, 3, 2) and (other.confidence != found.confidence).any()
-    moved = weights | {"heads": weights["heads"].at[1].add(1.0)}
+    moved = weights | {"heads": np.asarray(weights["heads"]) + np.array([0, 1], np.float32).reshape(2, 1, 1)}
     np.testing.assert_array_equal(run(moved, film, 0).confidence, found.confidence)
 
 
 def test_the_loss_is_least_where_the_heat_is_right_and_asks_of_known_points_alone():
-    weights = init_detector(jax.random.key(0), robots=1, points=2)
-    images, robot = jnp.zeros((1, 16, 16, 3)), jnp.zeros(1, int)
-    position, there = jnp.full((1, 2, 2), 6.5), jnp.array([[1.0, 0.0]])
+    weights = fresh(robots=1, points=2)
+    images, robot = np.zeros((1, 16, 16, 3), np.float32), np.zeros(1, np.int32)
+    position, there = np.full((1, 2, 2), 6.5, np.float32), np.array([[1.0, 0.0]], np.float32)
 
     @jax.jit
     def loss(bias: float, known: jax.Array) -> jax.Array:
         blind = weights | {"heads": 0 * weights["heads"], "heads_bias": jnp.array([[-2.0, bias]])}
         return points_loss(blind, images, robot, position, there, known)
 
-    both, first = jnp.ones((1, 2)), jnp.array([[1.0, 0.0]])
+    both, first = np.ones((1, 2), np.float32), np.array([[1.0, 0.0]], np.float32)
     assert loss(-9.0, both) < loss(-2.0, both) and loss(-9.0, first) == loss(-2.0, first) > 0

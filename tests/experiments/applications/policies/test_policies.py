@@ -141,20 +141,25 @@ def test_cloning_learns_and_is_a_function_of_its_seed(demos):
     assert not np.array_equal(one, other)
 
 
-@pytest.mark.parametrize("setting", [partial(jax.enable_x64, True), partial(jax.default_prng_impl, "rbg")])
-def test_settings_of_jax_change_no_policy(setting, demos):
+def trained(demos) -> tuple[list[np.ndarray], np.ndarray]:
     config = DiffusionConfig(encoder=SMALL, samples=2, fit=FitConfig(steps=2, batch=4))
     images = demos.images[:2, 0]
+    policy = train_diffusion(demos, config, 1, lambda *_: None)[2]
+    shown = jax.jit(lambda key: random_shift(as_floats(images[:, None]), key, 2))(key_of(1))
+    return [*jax.tree.leaves(policy.params), shown], policy.act(images)
 
-    def trained() -> tuple[list[np.ndarray], np.ndarray]:
-        policy = train_diffusion(demos, config, 1, lambda *_: None)[2]
-        shown = random_shift(as_floats(images[:, None]), key_of(1), 2)
-        return [*jax.tree.leaves(policy.params), shown], policy.act(images)
 
-    usual, acted = trained()
+@pytest.fixture(scope="module")
+def usual(demos):
+    return trained(demos)
+
+
+@pytest.mark.parametrize("setting", [partial(jax.enable_x64, True), partial(jax.default_prng_impl, "rbg")])
+def test_settings_of_jax_change_no_policy(setting, demos, usual):
+    learnt, acted = usual
     with setting():
-        other, acted_there = trained()
-    for mine, theirs in zip([*usual, acted], [*other, acted_there], strict=True):
+        other, acted_there = trained(demos)
+    for mine, theirs in zip([*learnt, acted], [*other, acted_there], strict=True):
         assert mine.dtype == theirs.dtype == np.float32
         np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
 
