@@ -29,6 +29,12 @@ def programs(model: Model, tokenizer: Tokenizer, episodes: int, decode: DecodeCo
     return shared
 
 
+def forget(episodes: int) -> None:
+    """Simulators of so many episodes compile anew what they run: for tests of when that is."""
+    for key in [key for key in COMPILED if key[5] == episodes]:
+        del COMPILED[key]
+
+
 @pytest.fixture(autouse=True)
 def shared_programs() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:  # unlike the fixture, it leaves steps that were traced

@@ -43,3 +43,10 @@ def actions(robot: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """[count, A] within the robot's range."""
     entry = ROBOTS[robot]
     return rng.uniform(entry.low, entry.high, (count, entry.action_dim)).astype(np.float32)
+
+
+def chunks_of(robot: int, count: int, seed: int = 9) -> np.ndarray:
+    """[count, stride, A]"""
+    entry = ROBOTS[robot]
+    rng = np.random.default_rng([robot, seed])
+    return actions(robot, count * entry.stride, rng).reshape(count, entry.stride, entry.action_dim)

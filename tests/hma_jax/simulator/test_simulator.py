@@ -4,10 +4,10 @@ import logging
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
-import jax.monitoring
 import numpy as np
 import pytest
 
@@ -19,11 +19,11 @@ from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.programs import Programs
 from hma_jax.simulator.starts import load_starts, save_starts
-from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
+from hma_jax.simulator.warm_up import sizes, warm_up_more
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.training.runs import Model
-from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, TOKENIZER, actions, parts, simulator, start
+from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, TOKENIZER, chunks_of, parts, simulator, start
 from tests.tiny import TABLE
 
 FRAMES = 7
@@ -32,25 +32,22 @@ FRAMES = 7
 STREAMING = DecodeConfig(2, temperature=1.0, slide="streaming")
 
 
-def chunks_of(robot: int, count: int, seed: int = 9) -> np.ndarray:
-    """[count, stride, A]"""
-    entry = ROBOTS[robot]
-    rng = np.random.default_rng([robot, seed])
-    return actions(robot, count * entry.stride, rng).reshape(count, entry.stride, entry.action_dim)
+@partial(jax.jit, static_argnums=4)
+def rollout_of(*arguments):
+    model, _ = parts()
+    return rollout(model.declared.merge(model.params), *arguments)
 
 
 def rolled_out(first, chunks: np.ndarray, seed: int, decode: DecodeConfig) -> np.ndarray:
     """The frames that `rollout` makes after a start under chunks [n, stride, A], decoded."""
-    model, tokenizer = parts()
+    _, tokenizer = parts()
     robot = TABLE.index(first.robot)
     past = first.actions.reshape(len(first.images) - 1, *chunks.shape[1:])
     whole = np.concatenate([past, chunks, chunks[:1]])  # the last frame's own is seen by none
     padded = np.zeros((1, 1, len(whole), TABLE.action_width), np.float32)
     padded[0, 0, :, : whole[0].size] = whole.reshape(len(whole), -1)
     prompt, keys = tokenizer.encode(first.images)[None], jax.random.key(seed)[None]
-    made = jax.jit(
-        lambda p: rollout(model.declared.merge(p), prompt, padded, np.array([robot], np.int32), keys, decode)
-    )(model.params)
+    made = rollout_of(prompt, padded, np.array([robot], np.int32), keys, decode)
     return tokenizer.decode(np.asarray(made)[0, 0])
 
 
@@ -58,42 +55,15 @@ def rolled_out(first, chunks: np.ndarray, seed: int, decode: DecodeConfig) -> np
     "decode", [DECODE, pytest.param(STREAMING, marks=pytest.mark.slow)], ids=["exact", "streaming"]
 )
 def test_episodes_of_different_robots_starts_and_seeds_are_what_rollout_makes_of_each(decode):
-    lengths, seeds = (1, 2, 6), (5, 5, 2**32 - 1)
-    starts = [start(robot, frames) for robot, frames in enumerate(lengths)]
-    sim = simulator(episodes=3, decode=decode)
-    sim.reset(starts, seeds=seeds)
-    plans = [chunks_of(robot, FRAMES) for robot in range(3)]
-    made = np.stack([sim.step([plan[t] for plan in plans]) for t in range(FRAMES)])
-    for b in range(3):
-        want = rolled_out(starts[b], plans[b], seeds[b], decode)
-        np.testing.assert_array_equal(made[:, b], want, err_msg=f"episode {b}")
-
-
-def test_nothing_is_compiled_once_an_episode_is_under_way():
-    sim, compiled = simulator(episodes=2, decode=DecodeConfig(1)), []  # of no other test
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, _, **more: compiled.append(name) if name.endswith("backend_compile_duration") else None
-    )
-
-    def everything(frames: int) -> None:
-        sim.reset([start(0, frames), start(1, frames)], seeds=frames)
-        kept = sim.snapshot()
-        for t in range(8):
-            sim.step([chunks_of(0, 8)[t], None if t == 3 else chunks_of(1, 8)[t][0]])
-        sim.rewind(2)
-        sim.branch([1, 1])
-        sim.restore(kept)
-
-    told = []
-    warm_up(sim, progress=lambda *step: told.append(step))
-    assert [(done, total) for done, total, _ in told] == [(i, len(told)) for i in range(len(told))]
-    assert sim.counts == (0, 0) and not sim.images.any(), "warming up leaves nothing behind"
-    everything(1)
-    assert compiled, "the listener hears nothing"
-    compiled.clear()
-    everything(4)
-    everything(9)
-    assert not compiled, f"{len(compiled)} programs were compiled again"
+    lengths, sim = (1, 6), simulator(episodes=2, decode=decode)
+    for robots, seeds in (((0, 1), (5, 5)), ((2, 0), (2**32 - 1, 6))):
+        starts = [start(robot, frames) for robot, frames in zip(robots, lengths, strict=True)]
+        sim.reset(starts, seeds=seeds)
+        plans = [chunks_of(robot, FRAMES) for robot in robots]
+        made = np.stack([sim.step([plan[t] for plan in plans]) for t in range(FRAMES)])
+        for b, robot in enumerate(robots):
+            want = rolled_out(starts[b], plans[b], seeds[b], decode)
+            np.testing.assert_array_equal(made[:, b], want, err_msg=f"robot {robot}")
 
 
 def test_what_advances_any_number_of_episodes_was_compiled_before(monkeypatch):
@@ -200,7 +170,7 @@ def test_a_snapshot_of_another_model_changes_nothing():
 def test_a_snapshot_of_a_model_of_the_same_architecture_is_refused(tmp_path):
     """All shapes are equal: it went on, with another model's cache."""
     sim, (model, tokenizer) = simulator(), parts()
-    params = jax.tree.map(lambda x: x + 0.01 * (x.ndim == 2), model.params)
+    params = jax.tree.map(lambda x: jax.device_put(np.asarray(x) + np.float32(0.01 * (x.ndim == 2))), model.params)
     others = {
         "model": Simulator(replace(model, run=replace(model.run, params=params)), tokenizer),
         "tokenizer": Simulator(model, LfqTokenizer(TOKENIZER, declare_tokenizer(TOKENIZER).init(1))),
@@ -297,13 +267,14 @@ def test_a_whole_number_gives_each_episode_a_seed_of_its_own():
 
 
 def test_branches_differ_by_their_actions_alone():
-    sim, plan = simulator(episodes=3), chunks_of(1, 6)
-    sim.reset([start(0, 2), start(1, 2), start(2, 2)], seeds=4)
-    sim.branch([1, 1, 1])
-    other = chunks_of(1, 6, seed=10)
-    for t in range(6):
-        images = sim.step([plan[t], other[t], plan[t]])
-    np.testing.assert_array_equal(images[0], images[2])
+    sim, plan = simulator(episodes=2), chunks_of(1, 12)
+    sim.reset([start(0, 2), start(1, 2)], seeds=4)
+    sim.branch([1, 1])
+    for chunk in plan[:6]:
+        images = sim.step([chunk, chunk])
+    np.testing.assert_array_equal(images[0], images[1])
+    for chunk, other in zip(plan[6:], chunks_of(1, 6, seed=10), strict=True):
+        images = sim.step([chunk, other])
     assert (images[0] != images[1]).any()
 
 
