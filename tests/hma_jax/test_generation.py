@@ -15,6 +15,7 @@ from hma_jax.generation import (
     rollout_naive,
     start,
 )
+from hma_jax.generation.decoding import decode_frame
 from hma_jax.generation.rollout import Sequences
 from tests.tiny import DIFFUSION, SMALLER, TABLE, lively_params, model_config, random_batch, shallow_config
 
@@ -158,16 +159,6 @@ def test_top_1_is_greedy():
     np.testing.assert_array_equal(a, b)
 
 
-def test_equal_actions_give_equal_rollouts_even_when_sampled():
-    config = model_config()
-    declared, params = lively_params(config)
-    batch = random_batch(0, config, 2)
-    same = np.stack([batch["actions"]] * 2, axis=1)
-    keys = jax.random.split(jax.random.key(0), 2)
-    got = jitted_rollout(declared, batch, same, keys, DecodeConfig(2, 1.0), 2)(params)
-    np.testing.assert_array_equal(got[:, 0], got[:, 1])
-
-
 def test_every_frame_of_every_example_is_drawn_with_random_numbers_of_its_own():
     sequences = Sequences(None, None, None, jax.random.split(jax.random.key(0), 2))
     keys = [jax.random.key_data(sequences.keys_at(t)).tolist() for t in (1, 2)]
@@ -251,12 +242,14 @@ def test_temperature_is_a_temperature():
     """Low temperatures approach the most likely token; the release's made no difference."""
     config = shallow_config()
     declared, params = lively_params(config)
-    batch = random_batch(0, config, 8)
-    actions = batch["actions"][:, None]
+    shape = (8, config.tokens, config.factors, config.factor_vocab)
+    logits = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     keys = jax.random.split(jax.random.key(0), 8)
 
     def run(temperature: float) -> np.ndarray:
-        return np.asarray(jitted_rollout(declared, batch, actions, keys, DecodeConfig(1, temperature), 5)(params))
+        decode = DecodeConfig(1, temperature)
+        drawn = jax.jit(lambda p: decode_frame(declared.merge(p), logits, lambda _: logits, keys, decode))
+        return np.asarray(drawn(params))
 
     greedy = run(0.0)
     assert (run(0.01) == greedy).mean() > (run(5.0) == greedy).mean() + 0.2
@@ -265,14 +258,14 @@ def test_temperature_is_a_temperature():
 LONG = 14  # frames, of models whose window has 6
 
 
-def long_batch(config, seed: int = 0) -> dict:
-    return random_batch(seed, replace(config, frames=LONG), 2)
+def long_batch(config, frames: int = LONG) -> dict:
+    return random_batch(0, replace(config, frames=frames), 2)
 
 
-def past_the_window(config, decode: DecodeConfig, prompt: int, hidden=None):
+def past_the_window(config, decode: DecodeConfig, prompt: int, hidden=None, frames: int = LONG):
     """(params, params -> (`rollout`'s frames, `rollout_naive`'s))."""
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
-    batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
+    batch, keys = long_batch(config, frames), jax.random.split(jax.random.key(0), 2)
     start, rest = batch["tokens"][:, :prompt], (batch["embodiment"], keys, decode)
     fast = jax.jit(
         lambda p: rollout(declared.merge(p), start, batch["actions"][:, None], *rest, action_hidden_BT=hidden)
@@ -309,7 +302,7 @@ def test_the_sliding_rollout_equals_recomputing_every_window(options: dict, deco
     np.testing.assert_array_equal(got, want)
 
 
-NEW, FEWER = 24, 9
+NEW, FEWER = 24, 6
 """Frames, many of them past a window of 4. What recomputes them is written out frame by frame, and compiled so."""
 GREEDY, SAMPLED = DecodeConfig(2), DecodeConfig(2, 1.0, top_k=4)
 
@@ -355,8 +348,9 @@ def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions()
 
 def test_streaming_is_exact_but_for_what_a_finished_frame_had_seen_and_where_it_stood():
     """In one layer its keys and values are those of itself and its position: without positions they never change."""
-    config, prompt, hidden = shallow_config(), 3, np.random.default_rng(0).random((2, LONG)) < 0.5
-    params, both = past_the_window(config, DecodeConfig(2, slide="streaming"), prompt, hidden)
+    config, prompt, frames = shallow_config(frames=4), 2, 8
+    hidden = np.random.default_rng(0).random((2, frames)) < 0.5
+    params, both = past_the_window(config, DecodeConfig(2, slide="streaming"), prompt, hidden, frames)
     streamed, exact = both(params)
     inside = config.frames - prompt
     np.testing.assert_array_equal(streamed[:, :inside], exact[:, :inside])
