@@ -54,7 +54,9 @@ def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monke
     monkeypatch.setattr(decoding, "denoise", numbered)
     predictions, keys = jnp.zeros((2, tokens, 3)), jax.random.split(jax.random.key(0), 2)
     decode = DecodeConfig(9, sampler=SamplerConfig(steps=3))
-    frame = decoding.decode_frame(SimpleNamespace(config=config), predictions, lambda _: predictions, keys, decode)
+    model = SimpleNamespace(config=config)
+    fill = jax.jit(lambda keys: decoding.decode_frame(model, predictions, lambda _: predictions, keys, decode))
+    frame = np.asarray(fill(keys))
     assert min(drawn) == 1 and sum(drawn) == tokens
     np.testing.assert_array_equal(np.sort(frame[..., 0]), [np.repeat(np.arange(1.0, len(drawn) + 1), drawn)] * 2)
 
@@ -69,7 +71,8 @@ def test_every_look_samples_all_that_is_no_longer_masked_where_that_is_asked_for
     )
     predictions, keys = jnp.zeros((1, 4, 3)), jax.random.split(jax.random.key(0), 1)
     decode = DecodeConfig(2, sampler=SamplerConfig(steps=3), resample=resample)
-    decoding.decode_frame(SimpleNamespace(config=config), predictions, lambda _: predictions, keys, decode)
+    model = SimpleNamespace(config=config)
+    jax.eval_shape(lambda keys: decoding.decode_frame(model, predictions, lambda _: predictions, keys, decode), keys)
     assert drawn == sizes
 
 
@@ -101,18 +104,16 @@ def test_latents_are_kept_within_the_clip_of_the_configuration():
 
 
 def test_every_look_draws_with_random_numbers_of_its_own(monkeypatch):
-    seen, config = [], model_config(tokens=4)
+    """Each fills some of 16 tokens, here with a part of the key that it is given."""
 
     def sample(head, predictions, keys, *_):
-        seen.append(tuple(jax.random.key_data(keys).ravel().tolist()))
-        return jnp.zeros((1, 4), jnp.int32), jnp.zeros((1, 4))
+        part = jax.random.key_data(keys)[:, -1:].astype(jnp.int32)
+        return jnp.broadcast_to(part, (1, 16)), jnp.zeros((1, 16))
 
     monkeypatch.setattr(decoding, "sample_tokens", sample)
-    model, predictions = SimpleNamespace(config=config, frame_head=None), jnp.zeros((1, 4, 2))
-    with jax.disable_jit():  # a loop of looks is traced once
-        keys = jax.random.split(jax.random.key(0), 1)
-        decoding.decode_frame(model, predictions, lambda _: predictions, keys, DecodeConfig(3))
-    assert len(seen) == len(set(seen)) == 3
+    model, predictions = SimpleNamespace(config=model_config(tokens=16), frame_head=None), np.zeros((1, 16, 2))
+    fill = jax.jit(lambda key: decoding.decode_frame(model, predictions, lambda _: predictions, key, DecodeConfig(3)))
+    assert len(np.unique(fill(jax.random.split(jax.random.key(0), 1)))) == 3
 
 
 def test_the_confidence_in_a_token_is_the_product_of_its_factors_probabilities():

@@ -14,7 +14,7 @@ SCALE = 0.7
 
 
 def drawn(seed: int, *shape: int, dtype=jnp.float32) -> jax.Array:
-    return jnp.asarray(np.random.default_rng(seed).standard_normal(shape), dtype)
+    return jax.device_put(np.random.default_rng(seed).standard_normal(shape).astype(jnp.dtype(dtype)))
 
 
 def value_and_gradients(function, *args):
