@@ -20,13 +20,13 @@ from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import COMMITTED, WEIGHTS, Detector, select_robots
 from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
-from experiments.applications.endurance.films import Film, load_films, make_films, save_films
+from experiments.applications.endurance.films import load_films, make_films, save_films
 from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.terminal.exit_code import exit_code_of
-from experiments.terminal.progress import Update, console, step, wrote
+from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
@@ -73,17 +73,10 @@ def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int
     return found
 
 
-def run_variant(
-    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int,
-    robots: Mapping[str, Robot], starts: Mapping[str, Sequence[Start]], unfinished: Path, update: Update,
-) -> dict[str, Film]:  # fmt: skip
-    """`robots` of a run, each from its start number `which` on, in one batch. See `make_films` for `unfinished`."""
+def load_variant(run: Path, variant: str, robots: int) -> Simulator:
+    """The simulator of `run` with the decoding settings of a variant, for so many robots in one batch."""
     decode = change_decode(find_decode(run), **VARIANTS[variant])
-    options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
-    simulator, drives = load_simulator(run, **options), []
-    for name, robot in robots.items():
-        drives.append(make_drive(robot, starts[name][which], round(60 * minutes * robot.hz), kind, seed=which))
-    return make_films(simulator, detector, drives, unfinished, update)
+    return load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=robots, decode=decode, history=1)
 
 
 def main() -> None:
@@ -119,9 +112,12 @@ def main() -> None:
                 unfinished = path.with_name(f"{path.name}.unfinished")
                 if not path.exists():
                     with step(f"{variant}, {kind}, {args.minutes:g} min, start {which}") as update:
-                        options = (variant, kind, args.minutes, which, robots, starts)
-                        made = run_variant(args.run, detector, *options, unfinished, update)
-                    save_films(made, path)
+                        drives = [
+                            make_drive(robot, starts[name][which], round(60 * args.minutes * robot.hz), kind, which)
+                            for name, robot in robots.items()
+                        ]
+                        filmed = load_variant(args.run, variant, len(robots))
+                        save_films(make_films(filmed, detector, drives, unfinished, update), path)
                 unfinished.unlink(missing_ok=True)
                 films = load_films(path)
                 hz = {name: SPECS[name].hz for name in films}

@@ -35,3 +35,8 @@ class JudgeConfig:
         fewest = 2  # with one at a time the control has no other episode to take actions from
         require(self.batch >= fewest, f"--batch must be at least {fewest}, got {self.batch}")
         require(self.starts % self.batch == 0, f"--starts {self.starts} is not a multiple of --batch {self.batch}")
+
+    @property
+    def seeds(self) -> list[int]:
+        """Seeds of the episodes, in the order of starts."""
+        return [self.seed + i for i in range(self.starts)]

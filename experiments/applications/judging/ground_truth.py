@@ -42,6 +42,7 @@ class GroundTruth(Protocol):
     """
 
     config: JudgeConfig
+    robot: Robot
     worlds: tuple[str, ...]
 
     def about(self) -> dict[str, Any]: ...
@@ -74,7 +75,7 @@ class SimulatedTruth:
     def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator):
         """Raises ConfigError for a robot that has none."""
         require(has_truth(robot), f"{robot.name} has no true simulator here; give recordings of it with --recordings")
-        self.config, self._robot, self._learned = config, robot, learned
+        self.config, self.robot, self._learned = config, robot, learned
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
@@ -93,7 +94,7 @@ class SimulatedTruth:
             made = record(
                 task,
                 config.demonstrations,
-                stride=self._robot.stride,
+                stride=self.robot.stride,
                 image_size=self._size,
                 noise=config.noise,
                 after=0,
@@ -104,7 +105,7 @@ class SimulatedTruth:
         return made
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
-        config, size, stride = self.config, self._size, self._robot.stride
+        config, size, stride = self.config, self._size, self.robot.stride
         with step("record episodes for the success head"):
             known = head_recordings(config, size, stride, config.head_episodes, config.seed)
         with step("train the success head") as report:
@@ -114,14 +115,14 @@ class SimulatedTruth:
         del reconstruct  # rates of the true frames stand beside those of the model
         config, episodes = self.config, max(self.config.head_episodes // 10, 12)
         with step("record episodes to measure the success head on"):
-            new = head_recordings(config, self._size, self._robot.stride, episodes, config.seed + HELD_OUT)
+            new = head_recordings(config, self._size, self.robot.stride, episodes, config.seed + HELD_OUT)
         return measure_head(head, new, config.task)
 
     def starts(self) -> list[Start]:
-        return make_starts(self.config.task, self.config.starts, self._size, self._robot.stride)
+        return make_starts(self.config.task, self.config.starts, self._size, self.robot.stride)
 
     def open(self) -> AbstractContextManager[AnySimulator]:
-        return closing(true_simulator(self._learned, [self._robot], self.config.batch))
+        return closing(true_simulator(self._learned, [self.robot], self.config.batch))
 
 
 def describe_rare_success(demos: Demonstrations, task: Task) -> str:

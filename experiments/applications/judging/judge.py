@@ -71,7 +71,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, user_file: Pa
     simulator = load_simulator(run_directory, episodes=config.batch)
     _require_policy(simulator, user_file is not None or any(config.ladder.counts.values()))
     robot = simulator.robot(config.task.robot)
-    return _judge(run_directory, out, simulator, robot, SimulatedTruth(config, robot, simulator), user_file)
+    return _judge(run_directory, out, simulator, SimulatedTruth(config, robot, simulator), user_file)
 
 
 def judge_recorded(
@@ -96,7 +96,7 @@ def judge_recorded(
     recorded, _ = open_trajectories(dataset, split, robot, {}, simulator.tokenizer, stores)
     require_layout(recorded, robot, simulator.model.table)
     truth = RecordedTruth(config, recorded, robot)
-    return _judge(run_directory, out, _with_episodes(simulator, truth.config.batch), robot, truth, user_file, counted)
+    return _judge(run_directory, out, _with_episodes(simulator, truth.config.batch), truth, user_file, counted)
 
 
 def _require_policy(simulator: Simulator, given: bool) -> None:
@@ -121,12 +121,11 @@ def _judge(
     run_directory: Path,
     out: Path,
     simulator: Simulator,
-    robot: Robot,
     truth: GroundTruth,
     user_file: Path | None,
     counted: Sequence[str] = (),
 ) -> Judgement:
-    config = truth.config
+    config, robot = truth.config, truth.robot
     policies = names(config.ladder) + [OWN_HEAD] * _predicts_actions(simulator)  # may refuse the ladder
     user_policies, success, about = {}, None, truth.about()
     if user_file is not None:
@@ -152,7 +151,6 @@ def _judge(
         train_ladder(out / "policies", truth.demonstrations, config.ladder, config.seed, about_policies, report)
     head = _find_head(out / "head", truth, simulator, success)
     starts = truth.starts()
-    seeds = [config.seed + i for i in range(len(starts))]
     acting: dict[str, Policy] = dict(user_policies)  # what was compiled for one world serves the next
     with truth.open() as true:
         for world, name in itertools.product(truth.worlds, policies):
@@ -162,11 +160,11 @@ def _judge(
                 policy = acting[name] = acting.get(name) or find_policy(out / "policies", name, robot, simulator)
                 with step(f"{name} in the {world} world") as report:
                     made = run(
-                        true if world == TRUE else simulator, policy, starts, seeds, config.task,
+                        true if world == TRUE else simulator, policy, starts, config.seeds, config.task,
                         shuffled=world == SHUFFLED, report=report,
                     )  # fmt: skip
                 save_rollout(made, path)
-    return _collect(out, truth, head, policies, tuple(user_policies), robot, starts, seeds)
+    return _collect(out, truth, head, policies, tuple(user_policies), starts)
 
 
 def _collect(
@@ -175,24 +173,22 @@ def _collect(
     head: Head,
     policies: Sequence[str],
     user_policies: tuple[str, ...],
-    robot: Robot,
     starts: Sequence[Start],
-    seeds: Sequence[int],
 ) -> Judgement:
-    numbers = [start.seed if start.seed is not None else -1 for start in starts]
+    config, numbers = truth.config, [start.seed if start.seed is not None else -1 for start in starts]
     outcomes, seconds, clipped = [], {}, {}
     for world in truth.worlds:
         times = []
         for name in policies:
             rollout = load_rollout(_place(out, name, world))
             times.append(rollout.seconds)
-            outcomes += judge_rollout(rollout, head, truth.config.task, name, world, numbers, seeds)
+            outcomes += judge_rollout(rollout, head, config.task, name, world, numbers, config.seeds)
             if world == LEARNED:
-                clipped[name] = _clipped_share(rollout.actions, robot)
+                clipped[name] = _clipped_share(rollout.actions, truth.robot)
         seconds[world] = float(np.median(np.concatenate(times)))  # the first one compiles
     rollouts = lambda name, world: load_rollout(_place(out, name, world))  # noqa: E731
     return Judgement(
-        truth.config, head, tuple(policies), user_policies, truth.worlds, tuple(outcomes), clipped, seconds, rollouts
+        config, head, tuple(policies), user_policies, truth.worlds, tuple(outcomes), clipped, seconds, rollouts
     )
 
 

@@ -73,7 +73,7 @@ class RecordedTruth:
         task = config.task
         if not isinstance(task, RecordedTask):
             raise TypeError(f"recordings have a RecordedTask, not {task}")
-        self._recorded, self._robot = recorded, robot
+        self._recorded, self.robot = recorded, robot
         with step("which recordings succeeded") as report:
             outlines = [recorded.outline(i) for i in _one_by_one(range(len(recorded)), report)]
         length = np.array([outline.frames - BEFORE for outline in outlines])
@@ -217,9 +217,9 @@ class RecordedTruth:
     def starts(self) -> list[Start]:
         starts = []
         for i in self._begun_from[: self.config.starts]:
-            trajectory = confined(self._recorded[i], self._robot)
-            given = trajectory.chunks[:BEFORE].reshape(-1, self._robot.action_dim)
-            starts.append(Start(self._robot.name, trajectory.images[:START_FRAMES], given))
+            trajectory = confined(self._recorded[i], self.robot)
+            given = trajectory.chunks[:BEFORE].reshape(-1, self.robot.action_dim)
+            starts.append(Start(self.robot.name, trajectory.images[:START_FRAMES], given))
         return starts
 
     def open(self) -> AbstractContextManager[None]:
