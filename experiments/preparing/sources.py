@@ -188,7 +188,7 @@ def say_short_episodes(study: Study, sources: Sequence[Source]) -> None:
         size, needed = size_of(spec, study.store.held_out), least * spec.stride_at(study.rate)
         steps = size.mean_steps or spec.median_steps or spec.mean_steps
         if 0 < steps < needed:
-            short.append(f"{spec.name} (about {steps:.3g} steps an episode; {needed} are needed)")
+            short.append(f"{spec.name} (about {round(steps, 1):,g} steps an episode; {needed:,} are needed)")
             stride = max(stride, spec.stride_at(study.rate))
             if not size.mean_steps and spec.episodes not in (0, size.episodes):
                 parts.append(spec.name)

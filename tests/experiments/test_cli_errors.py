@@ -31,6 +31,8 @@ from data_pipelines.windows.evalset import EvalManifest
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
 from experiments.preparing import tokenizer, windows
+from experiments.preparing.sources import say_short_episodes
+from experiments.presets import get_preset
 from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.convert import read_official, write_run
@@ -302,6 +304,13 @@ def test_episodes_that_an_entry_says_are_too_short_are_told_before_a_tokenizer_i
         assert "it would be trained" in said.err and (note in said.out) == told
         assert main(["train", *SMOKE, "--out", str(tmp_path / "new"), "--data", str(arm), "--dry-run"]) == 0
         assert (note in capsys.readouterr().out) == told
+
+
+def test_thousands_of_steps_are_written_out(capsys):
+    """They were "about 1.23e+03 steps"."""
+    spec = replace(ARM, hz=1000.0, mean_steps=1234.56)
+    say_short_episodes(get_preset("smoke"), [(spec, Path())])
+    assert f"{ARM.name} (about 1,234.6 steps an episode; 1,500 are needed)" in capsys.readouterr().out
 
 
 def test_so_are_those_of_data_that_replace_others_of_which_windows_are_there(arm, tmp_path, monkeypatch, capsys):
