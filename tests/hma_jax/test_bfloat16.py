@@ -84,7 +84,7 @@ def test_what_heads_predict_is_not_rounded_to_bfloat16(diffusion):
         x_BTU = jnp.resize(x_BTC, (2, 3, TABLE.action_width))
         return model.denoiser(x_BTC, time, z_BTD), model.action_head(x_BTU, time, z_BTD, robots)
 
-    for y in predicted(lively_params(config)[1], z, x):
+    for y in map(np.asarray, predicted(lively_params(config)[1], z, x)):
         live = y[y != 0]
         assert y.dtype == np.float32 and np.mean(live == live.astype(jnp.bfloat16).astype(np.float32)) < 0.1
 

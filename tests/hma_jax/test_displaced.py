@@ -1,5 +1,6 @@
 """A past in which patches are displaced: what it shows where, and that the frames to learn stay true."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -68,13 +69,16 @@ def test_the_past_alone_is_displaced(monkeypatch):
     config = shallow_config(action_heads=False)
     batch = random_batch(0, config, 32)
     tokens, given = jnp.asarray(batch["tokens"]), (batch["actions"], batch["embodiment"])
-    keys, shown = noise_keys(jax.random.key(0), len(tokens)), []
-    for masking in (TRUE, DISPLACED):
+    keys, model = noise_keys(jax.random.key(0), len(tokens)), SimpleNamespace(table=TABLE)
+
+    @partial(jax.jit, static_argnums=0)
+    def shown(masking, tokens):
         masked = mask(jax.random.key(0), tokens, given[1], config, masking, TABLE)
         with pytest.raises(Shown) as shows:
-            losses.masked_loss(SimpleNamespace(table=TABLE), masked, tokens, *given, masking, keys, training=True)
-        shown.append(shows.value.args)
-    (past, *rest), (displaced, *others) = shown
+            losses.masked_loss(model, masked, tokens, *given, masking, keys, training=True)
+        return shows.value.args
+
+    (past, *rest), (displaced, *others) = shown(TRUE, tokens), shown(DISPLACED, tokens)
     assert 0.02 < (past != displaced).mean() < 0.2
     for same, too in zip(rest, others, strict=True):
         np.testing.assert_array_equal(same, too)

@@ -50,33 +50,37 @@ def test_robots_without_actions_are_shown_none_where_others_are_shown_theirs(mon
 
 
 def action_losses(config, action_head):
-    """Of `action_head(target, *its arguments)` in a model's place."""
-    batch = random_batch(0, config)
-    robots, actions = jnp.asarray(batch["embodiment"]), batch["actions"]
-    target = TABLE.scale().normalise(actions, robots)
-    model = SimpleNamespace(
-        config=config,
-        table=TABLE,
-        normalise=TABLE.scale().normalise,
-        action_head=lambda *given: action_head(target, *given),
-    )
-    return action_loss_per_step(model, jnp.zeros((*actions.shape[:2], 1)), actions, robots, robots, KEYS), robots
+    """(losses, the head's first argument, robots) of `action_head(target, *its arguments)` in a model's place."""
+    batch, normalise = random_batch(0, config), TABLE.scale().normalise
+
+    @jax.jit
+    def run(actions, robots):
+        target, seen = normalise(actions, robots), []
+
+        def head(*given):
+            seen.append(given[0])
+            return action_head(target, *given)
+
+        model = SimpleNamespace(config=config, table=TABLE, normalise=normalise, action_head=head)
+        features = jnp.zeros((*actions.shape[:2], 1))
+        return action_loss_per_step(model, features, actions, robots, robots, KEYS), seen[0]
+
+    return *run(batch["actions"], batch["embodiment"]), batch["embodiment"]
 
 
 def test_the_error_of_actions_is_the_mean_over_a_robot_s_own_live_values():
     """However wide the widest robot's are."""
-    error, _ = action_losses(shallow_config(), lambda target, *_: target + 2)
+    error, *_ = action_losses(shallow_config(), lambda target, *_: target + 2)
     np.testing.assert_allclose(error, 4, rtol=1e-5)
 
 
 def test_action_values_without_a_signal_are_not_noised():
     """As where actions are sampled (`generation.policy`): else what is learnt would depend on the widest robot."""
-    seen = []
 
     def head(target, x, time, *_):
-        seen.append(x)
         return jnp.zeros((*x.shape[:-1], 2 * x.shape[-1]))
 
-    _, robots = action_losses(shallow_config(diffusion=DIFFUSION), head)
-    (noised,) = seen
-    np.testing.assert_array_equal(noised != 0, np.broadcast_to(TABLE.alive()[robots][:, None], noised.shape))
+    _, noised, robots = action_losses(shallow_config(diffusion=DIFFUSION), head)
+    np.testing.assert_array_equal(
+        np.asarray(noised) != 0, np.broadcast_to(TABLE.alive()[robots][:, None], noised.shape)
+    )

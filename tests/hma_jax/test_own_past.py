@@ -19,7 +19,7 @@ from hma_jax.objective import losses, own_past
 from hma_jax.objective.losses import noise_keys
 from hma_jax.objective.masking import mask_batch
 from hma_jax.objective.own_past import draw_own_past
-from tests.tiny import TABLE, lively_params, random_batch, shallow_config
+from tests.tiny import TABLE, lively_params, mask, random_batch, shallow_config
 
 TRUE = MaskingConfig(teacher_forcing=True, min_ratio=1.0, max_corrupt_rate=0.0, non_mlm_ratio=0.0)
 OWN = MaskingConfig(teacher_forcing=True, min_ratio=1.0, max_corrupt_rate=0.0, non_mlm_ratio=0.0, own_past=1.0)
@@ -147,7 +147,7 @@ def test_it_is_drawn_after_hidden_actions_where_these_leak_to_the_model(monkeypa
     seen = []
     monkeypatch.setattr(losses, "draw_own_past", lambda model, past, *_, leak, **__: seen.append(leak) or past)
     masking = replace(OWN, setting="passive", action_leak="all")
-    masked = mask_batch(jax.random.key(0), tokens, given[1], config, masking, TABLE)
+    masked = mask(jax.random.key(0), tokens, given[1], config, masking, TABLE)
     jax.eval_shape(
         lambda: losses.masked_loss(declared.merge(params), masked, tokens, *given, masking, keys, training=True).tokens
     )

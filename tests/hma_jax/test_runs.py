@@ -270,7 +270,7 @@ def test_a_model_is_loaded_as_it_is_executed(dtype: str, averaged):
     assert model.config == MODEL and model.table == TABLE and model.step == 2
     for x, y in zip(jax.tree.leaves(model.params), jax.tree.leaves(state.params), strict=True):
         assert x.devices() == {jax.local_devices()[0]}
-        np.testing.assert_array_equal(x, y.astype(x.dtype))
+        np.testing.assert_array_equal(x, np.asarray(y).astype(x.dtype))
     assert model.params["trunk"]["blocks"]["mlp_in"]["kernel"].dtype == dtype
     assert model.params["embed"]["tables"].dtype == "float32"
 
