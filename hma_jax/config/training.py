@@ -129,9 +129,18 @@ class MaskingConfig:
         return self.setting in PREDICT_ACTIONS
 
     @property
+    def shows_all_actions(self) -> bool:
+        """Whether no recorded action is hidden."""
+        return self.setting == "forward"
+
+    @property
+    def hides_all_actions(self) -> bool:
+        return self.setting in ("passive", "inverse")
+
+    @property
     def ignores_actions(self) -> bool:
         """Whether frames are predicted without actions, so that none has an effect."""
-        return self.setting == "passive"
+        return self.predicts_frames and self.hides_all_actions
 
 
 # --- Training --------------------------------------------------------------------------------

@@ -139,7 +139,7 @@ def _masked_pass(
     real_BT: jax.Array | None,
 ) -> Outputs:
     """The model's outputs for the frames from FIRST_PREDICTED on; arguments are those of `masked_loss`."""
-    all_shown = masking.setting == "forward" and all(model.table.chunks)
+    all_shown = masking.shows_all_actions and all(model.table.chunks)
     hidden = None if all_shown else masked.action_hidden_T
     options = {"leak": masking.action_leak, "robot_row_B": robot_row_B}
     if not masking.teacher_forcing:

@@ -146,14 +146,16 @@ def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Arr
     DIFFERS: with `full`, every step by itself, by a rate of the example, as in the release's discrete variant; its
     continuous one hides all chunks from a random frame on (reference section 2.4).
     """
-    if masking.setting in ("passive", "inverse"):
+    if masking.shows_all_actions:  # asked first: where it is True, `masked_loss` does not look at what is hidden
+        return jnp.zeros(frames, bool)
+    if masking.hides_all_actions:
         return jnp.ones(frames, bool)
     if masking.setting == "full":
         u = jax.random.uniform(key, (frames + 1,), jnp.float32)
         return u[1:] < u[0]
     if masking.setting == "policy":
         return jnp.arange(frames) >= jax.random.randint(key, (), 0, frames, jnp.int32)
-    return jnp.zeros(frames, bool)
+    raise ValueError(f"hide_actions does not say which chunks {masking.setting!r} hides; add it there")
 
 
 def followed(real_T: jax.Array) -> jax.Array:
@@ -166,7 +168,7 @@ def hidden_at_inference(
 ) -> jax.Array | None:
     """bool [B, T]: chunks to hide from a model trained for `setting`, because it was never shown any; None: none."""
     shape = (len(embodiment_B), frames)
-    if setting == "passive":
+    if MaskingConfig(setting=setting).ignores_actions:
         return jnp.ones(shape, bool)
     if all(table.chunks):
         return None

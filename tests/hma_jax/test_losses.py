@@ -1,13 +1,14 @@
 """The terms of the loss: what is compared with what, and over what their means are."""
 
 from types import SimpleNamespace
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import MaskingConfig
+from hma_jax.config import MaskingConfig, MaskingSetting
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import action_loss_per_step, masked_loss
 from tests.hma_jax.test_masking import MIXED, masked_batch
@@ -30,23 +31,35 @@ def test_labels_are_smoothed_by_as_much_as_is_configured(monkeypatch):
     assert seen == [0.3]
 
 
-def test_robots_without_actions_are_shown_none_where_others_are_shown_theirs(monkeypatch):
-    """As at inference: zeros that were shown in training alone would be another input."""
-    masking, seen = MaskingConfig(teacher_forcing=True), []
+def hidden_from_model(masking, table=TABLE):
+    """(bool [B, T], which chunks are hidden; the same as the model is told; each one's robot)."""
 
-    class Seen(Exception):
+    class Told(Exception):
         pass
 
-    def forced_pass(model, past, inputs, masked, actions, robots, hidden, **_):
-        seen.append(hidden)
-        raise Seen
+    def align_hidden(hidden, shape):
+        raise Told(hidden)
 
-    monkeypatch.setattr("hma_jax.objective.losses.teacher_forced_pass", forced_pass)
-    data, masked = masked_batch(shallow_config(), masking, MIXED, batch=8)
-    robots, model = data["embodiment"], SimpleNamespace(table=MIXED)
-    with pytest.raises(Seen):
-        masked_loss(model, masked, data["tokens"], data["actions"], robots, masking, KEYS, training=True)
-    np.testing.assert_array_equal(np.all(seen[0], axis=1), np.array(MIXED.chunks)[robots] == 0)
+    data, masked = masked_batch(shallow_config(), masking, table)
+    inputs = masked, data["tokens"], data["actions"], data["embodiment"], masking, jax.random.split(KEYS[0], 64)
+    model = SimpleNamespace(table=table, align=lambda actions: actions, align_hidden=align_hidden)
+    with pytest.raises(Told) as told:
+        masked_loss(model, *inputs, training=True)
+    return masked.action_hidden_T, *told.value.args, data["embodiment"]
+
+
+@pytest.mark.parametrize("setting", get_args(MaskingSetting))
+def test_whatever_a_setting_hides_is_hidden_from_the_model(setting):
+    """The model is told of no chunks (None) only where none is hidden."""
+    hidden, told, _ = hidden_from_model(MaskingConfig(setting=setting))
+    np.testing.assert_array_equal(hidden, np.zeros_like(hidden) if told is None else told)
+
+
+@pytest.mark.parametrize("teacher_forcing", [False, True])
+def test_robots_without_actions_are_shown_none_where_others_are_shown_theirs(teacher_forcing):
+    """As at inference: zeros that were shown in training alone would be another input."""
+    _, told, robots = hidden_from_model(MaskingConfig(teacher_forcing=teacher_forcing), MIXED)
+    np.testing.assert_array_equal(np.all(told, axis=1), np.array(MIXED.chunks)[robots] == 0)
 
 
 def action_losses(config, action_head):

@@ -1,6 +1,7 @@
 import dataclasses
 import zlib
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from hma_jax.config import ConfigError, MaskingConfig
+from hma_jax.config import ConfigError, MaskingConfig, MaskingSetting
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import LossSums, count_targets, masked_loss
@@ -44,7 +45,7 @@ def masked_batch(config, masking, table=TABLE, seed=0, batch=64):
 def test_the_settings_differ_in_what_is_hidden_and_predicted():
     config = shallow_config()
     seen = {}
-    for setting in ("forward", "passive", "full", "policy", "inverse"):
+    for setting in get_args(MaskingSetting):
         _, masked = masked_batch(config, MaskingConfig(setting=setting))
         seen[setting] = [
             float(np.mean(x)) for x in (masked.targets_TS, masked.action_hidden_T, masked.action_targets_T)
