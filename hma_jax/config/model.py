@@ -152,7 +152,12 @@ class ModelConfig:
     @property
     def concat(self) -> bool:
         """Whether actions enter as tokens of their own."""
-        return "concat" in self.conditioning
+        return "concat" in self.conditioning.split("+")
+
+    @property
+    def block_conditioning(self) -> str | None:
+        """How actions act inside every block (`model.conditioning.IN_BLOCKS`); None: as tokens only."""
+        return "+".join(way for way in self.conditioning.split("+") if way != "concat") or None
 
     @property
     def frame_tokens(self) -> int:

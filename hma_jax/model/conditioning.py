@@ -6,7 +6,7 @@ DIFFERS: the release masks action tokens only and goes on modulating by what it 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,16 +29,26 @@ class ActionFeature(NamedTuple):
     shown_BT: jax.Array | None  # bool; None: all of them
 
 
-def make_conditioning(config: ModelConfig, embodiments: int) -> nnx.Module | None:
-    """The module of one block; None where actions enter as tokens only."""
-    if "modulate" in config.conditioning:
-        return used("actions_shown", Modulation(config, embodiments))
-    if config.conditioning == "cross_attention":
-        return used("actions_shown", CrossAttention(config, embodiments))
-    return Addition() if config.conditioning == "add" else None
+class BlockConditioning(nnx.Module):
+    """What an action adds to the tokens of a block."""
+
+    def __init__(self, config: ModelConfig, embodiments: int):
+        """Without parameters."""
+
+    def __call__(
+        self, x_BTPD: jax.Array, action: ActionFeature, robot_row_B: jax.Array, visible: jax.Array, past: Any
+    ) -> tuple[jax.Array, Any]:
+        """(what is added to `x_BTPD`, what of these frames is cached), `past` being what was cached of earlier ones;
+        `visible` [T, T_past + T] as for temporal attention."""
+        raise NotImplementedError
+
+    @staticmethod
+    def multiplications(config: ModelConfig, seen: float) -> tuple[float, float]:
+        """Multiply-adds of its matrix products, (per token, per frame); `seen` as for `flops.pass_flops`."""
+        raise NotImplementedError
 
 
-class Modulation(nnx.Module):
+class Modulation(BlockConditioning):
     """W_o[LN(x) (1 + scale) + shift] with (shift, scale) from the action feature."""
 
     def __init__(self, config: ModelConfig, embodiments: int):
@@ -59,8 +69,12 @@ class Modulation(nnx.Module):
         y = self.out(layer_norm(x_BTPD, FINE_EPS) * (1 + scale) + shift, robot_row_B)
         return _where_shown(action, y), None
 
+    @staticmethod
+    def multiplications(config: ModelConfig, seen: float) -> tuple[float, float]:
+        return config.width**2, 3 * config.width**2  # shift and scale are made once per frame
 
-class Addition(nnx.Module):
+
+class Addition(BlockConditioning):
     """The feature itself, on every token of its frame; no parameters."""
 
     def __call__(
@@ -69,8 +83,12 @@ class Addition(nnx.Module):
         del robot_row_B, visible, past
         return _where_shown(action, over_tokens(action.feature_BTD, x_BTPD.shape[2])), None
 
+    @staticmethod
+    def multiplications(config: ModelConfig, seen: float) -> tuple[float, float]:
+        return 0, 0
 
-class CrossAttention(nnx.Module):
+
+class CrossAttention(BlockConditioning):
     """Every token attends to the actions of its own and earlier frames, with normalised q and k.
 
     DIFFERS: the release's heads attend to each other at one position and its results are
@@ -103,7 +121,7 @@ class CrossAttention(nnx.Module):
         visible: jax.Array,
         past: tuple[jax.Array, jax.Array, jax.Array] | None,
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
-        """`visible` [T, T_past + T] as for temporal attention; `past` are keys, values and shown."""
+        """Keys, values and shown are cached."""
         a = action.feature_BTD
         shown = jnp.ones(a.shape[:2], bool) if action.shown_BT is None else action.shown_BT
         q = self._heads(remat.tag_product(self._map(x_BTPD, self.q, robot_row_B)), robot_row_B)
@@ -119,6 +137,10 @@ class CrossAttention(nnx.Module):
         y = jnp.einsum("bphts,bshi->btphi", weights, v).reshape(x_BTPD.shape)
         some = jnp.any(allowed_BTs, axis=-1)
         return jnp.where(some[:, :, None, None], self.out(y, robot_row_B), 0), new
+
+    @staticmethod
+    def multiplications(config: ModelConfig, seen: float) -> tuple[float, float]:
+        return 2 * config.width**2 + 2 * seen * config.width, 2 * config.width**2
 
     def _map(self, x: jax.Array, kernel: nnx.Param, robot_row_B: jax.Array) -> jax.Array:
         return per_robot(x, kernel.astype(x.dtype), robot_row_B, layouts_of(kernel))
@@ -140,3 +162,17 @@ def _own_bonus(allowed_BTs: jax.Array) -> jax.Array:
 
 def _where_shown(action: ActionFeature, y: jax.Array) -> jax.Array:
     return y if action.shown_BT is None else jnp.where(action.shown_BT[:, :, None, None], y, 0)
+
+
+IN_BLOCKS: dict[str, type[BlockConditioning]] = {
+    "modulate": Modulation,
+    "add": Addition,
+    "cross_attention": CrossAttention,
+}
+"""By `ModelConfig.block_conditioning`."""
+
+
+def make_conditioning(config: ModelConfig, embodiments: int) -> BlockConditioning | None:
+    """The module of one block; None where actions enter as tokens only."""
+    way = config.block_conditioning
+    return used("actions_shown", IN_BLOCKS[way](config, embodiments)) if way else None

@@ -8,6 +8,7 @@ it counts the body of a scan once.
 from __future__ import annotations
 
 from hma_jax.config import MaskingConfig, ModelConfig, TrainConfig
+from hma_jax.model.conditioning import IN_BLOCKS
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.heads import TIME_FEATURES
 
@@ -49,12 +50,9 @@ def pass_flops(
     mlp = 2 * d * config.mlp_width
     scores = 2 * p * d + 2 * seen * d  # logits and weighted values
     per_token, per_frame = attention + mlp + scores, 0.0
-    if "modulate" in config.conditioning:
-        per_token += d * d
-        per_frame += 3 * d * d  # shift and scale are made once per frame
-    elif config.conditioning == "cross_attention":
-        per_token += 2 * d * d + 2 * seen * d
-        per_frame += 2 * d * d
+    if config.block_conditioning:
+        of_token, per_frame = IN_BLOCKS[config.block_conditioning].multiplications(config, seen)
+        per_token += of_token
     stem = table.action_width * d + d * d
     embedding = config.tokens * config.diffusion.token_channels * d if config.diffusion else 0
     outputs = d if config.diffusion else config.factors * config.factor_vocab

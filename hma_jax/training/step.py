@@ -195,7 +195,7 @@ def find_presence(
     shown."""
     action_hidden_BT = masked.action_hidden_T
     # Blocks without conditioning have nothing to leak into.
-    leaks = leak == "all" or (leak == "conditioning" and model.conditioning != "concat")
+    leaks = leak == "all" or (leak == "conditioning" and model.block_conditioning is not None)
     real_BT = jnp.ones_like(action_hidden_BT) if real_BT is None else real_BT
     rows: dict[Use, jax.Array] = {
         "always": jnp.ones(len(embodiment_B), bool),

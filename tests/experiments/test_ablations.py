@@ -26,6 +26,9 @@ from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
 PLAIN = {name: study for name, study in PRESETS.items() if not study.designs.end_controls}
 """cpu-full has more controls, and ablations of its own length: test_designs.py."""
 
+VARIANTS = len(get_args(Conditioning)) + 1
+"""Of conditioning: every way, and the default with the other alignment."""
+
 
 def changes(sweep, study) -> dict[str, set[str]]:
     """{name: configuration fields in which its trials differ from the reference}."""
@@ -54,7 +57,7 @@ def test_settings_change_the_setting_and_heads_only_where_actions_are_predicted(
 def test_every_conditioning_and_the_other_alignment(base, other):
     study = replace(SMOKE, model=replace(SMOKE.model, action_alignment=base))
     found = changes(conditioning_axis.plan(study), study)
-    assert set(get_args(Conditioning)) < set(found) and len(found) == 6
+    assert set(get_args(Conditioning)) < set(found) and len(found) == VARIANTS
     assert found.pop("concat+modulate") == set()
     assert found.pop(f"concat+modulate, {other} alignment") == {"model.action_alignment"}
     assert set(map(frozenset, found.values())) == {frozenset({"model.conditioning"})}
@@ -81,7 +84,7 @@ def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(stu
     alone = study.train.masking.teacher_forcing  # the settings are trained without it
     assert not any(p.trial.train.masking.teacher_forcing for p in settings.points)
     shared = 0 if alone else seeds + 1
-    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (3 * seeds + 1) + (6 * seeds + 1) - shared
+    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (3 * seeds + 1) + (VARIANTS * seeds + 1) - shared
     width = unique_trials([width_axis.plan(study)], PROVENANCE)
     for sweep in (conditioning,) if alone else (settings, conditioning):
         shared = [p for p in sweep.points if p.x == sweep.reference_x and p.trial.train.seed in study.seeds]

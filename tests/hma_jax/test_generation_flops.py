@@ -3,12 +3,13 @@
 import dataclasses
 import math
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from hma_jax.config import DecodeConfig, DiffusionConfig, ExecutionConfig, SamplerConfig
+from hma_jax.config import Conditioning, DecodeConfig, DiffusionConfig, ExecutionConfig, SamplerConfig
 from hma_jax.generation import rollout, rollout_naive, steps
 from hma_jax.generation.cache import Window
 from hma_jax.generation.flops import frame_flops, rollout_flops, sampler_flops
@@ -19,8 +20,6 @@ from tests.tiny import TABLE, model_config, random_batch
 
 DIFFUSION = DiffusionConfig(channels=2, patch=2, width=48, depth=2, steps=20)
 KINDS = {"ids": None, "latents": DIFFUSION}
-CONDITIONINGS = ("concat+modulate", "modulate", "concat", "add", "cross_attention")
-
 
 ROWS = 2
 """Examples at a time: with one, a product of matrices may have one row."""
@@ -85,7 +84,7 @@ class Case:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("conditioning", CONDITIONINGS)
+@pytest.mark.parametrize("conditioning", get_args(Conditioning))
 def test_a_pass_counts_exactly_what_is_multiplied(kind, conditioning):
     case = Case(diffusion=KINDS[kind], conditioning=conditioning)
     frames = case.config.frames

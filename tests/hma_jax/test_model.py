@@ -1,14 +1,15 @@
 from dataclasses import replace
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, ExecutionConfig, ModelConfig, MupConfig
+from hma_jax.config import Conditioning, ConfigError, ExecutionConfig, ModelConfig, MupConfig
 from hma_jax.evaluation.metrics import factored_cross_entropy
-from hma_jax.model.conditioning import ActionFeature, CrossAttention
+from hma_jax.model.conditioning import IN_BLOCKS, ActionFeature, CrossAttention
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
@@ -89,6 +90,13 @@ def test_of_actions_attended_to_a_frame_s_own_weighs_as_much_as_all_earlier_ones
     last = ActionFeature(feature[:, 5:], shown[:, 5:])
     again, _ = attend(x[:, 5:], last, slices, jnp.ones((1, 6), bool), past)
     np.testing.assert_allclose(again[:, 0], got[:, 5], atol=1e-5)
+
+
+def test_every_way_of_conditioning_in_blocks_is_a_class_of_its_own():
+    """Not that of another one whose name it contains."""
+    ways = {ModelConfig(conditioning=kind).block_conditioning for kind in get_args(Conditioning)}
+    assert ways - {None} == set(IN_BLOCKS), "add yours to IN_BLOCKS of hma_jax/model/conditioning.py"
+    assert len(set(IN_BLOCKS.values())) == len(IN_BLOCKS)
 
 
 def test_padding_and_dead_dimensions_of_actions_are_ignored():
