@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from hma_jax.config import ConfigError, MaskingSetting, ModelConfig, MupConfig
-from hma_jax.convert.official_config import BASE_WIDTH, is_continuous
+from hma_jax.convert.official_config import BASE_WIDTH, NETWORKS, is_continuous
 from hma_jax.model.embodiments import EmbodimentTable
 
 ATTENTION_SCALE = 8
@@ -52,6 +52,8 @@ def require_official(model: ModelConfig, table: EmbodimentTable, setting: Maskin
         )
     if model.conditioning == "cross_attention":
         reasons.append("model.conditioning is 'cross_attention', which the release computes differently")
+    elif model.conditioning not in NETWORKS.values():
+        reasons.append(f"model.conditioning is {model.conditioning!r}, which the release does not have")
     if model.recall:
         reasons.append("model.recall is true, but masked tokens of the release hold only one learned vector")
     if model.chain_factors:

@@ -6,16 +6,19 @@ import json
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig, MupConfig
+from hma_jax.config import Conditioning, ConfigError, ExecutionConfig, MaskingConfig, MupConfig
 from hma_jax.convert import loads_in_release, read_official, write_official
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.convert.official import official_config, official_tensors
+from hma_jax.convert.official_config import NETWORKS, write_config
+from hma_jax.convert.release_limits import require_official
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.training.runs import Run
@@ -203,6 +206,18 @@ def test_what_the_release_cannot_compute_is_refused_by_name(changes, message, tm
     with pytest.raises(ConfigError, match=message):
         write_official(run, tmp_path / "a")
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("conditioning", [*get_args(Conditioning), "new"])
+def test_a_way_of_conditioning_is_one_of_the_release_or_refused_by_name(conditioning):
+    config = model_config()
+    object.__setattr__(config, "conditioning", conditioning)  # as if a new one were there already
+    if conditioning == "cross_attention" or conditioning not in NETWORKS.values():
+        with pytest.raises(ConfigError, match=f"model.conditioning is '{conditioning}'"):
+            require_official(config, TABLE)
+    else:
+        require_official(config, TABLE)
+        assert NETWORKS[write_config(config, TABLE, MaskingConfig())["action_network"]] == conditioning
 
 
 @pytest.mark.parametrize("setting", ["passive", "inverse"])
