@@ -20,13 +20,13 @@ MIN_TOKENS = 128
 """Frames of fewer tokens are left to `plain`: they would be mostly padding."""
 
 
-def within(qkv: jax.Array, scale: float, interpret: bool = False) -> jax.Array:
-    """As `plain.within`. With `interpret` the kernel is run step by step on any platform, for tests."""
+def within(qkv: jax.Array, scale: float) -> jax.Array:
+    """As `plain.within`."""
     if qkv.shape[2] < MIN_TOKENS:
         return plain.within(qkv, scale)
 
     def on_device(qkv: jax.Array) -> jax.Array:
-        return _attend(qkv, scale, interpret)
+        return _attend(qkv, scale)
 
     if is_split():
         mesh = jax.sharding.get_abstract_mesh()
@@ -37,7 +37,8 @@ def within(qkv: jax.Array, scale: float, interpret: bool = False) -> jax.Array:
     return on_device(qkv)
 
 
-def _attend(qkv: jax.Array, scale: float, interpret: bool) -> jax.Array:
+def _attend(qkv: jax.Array, scale: float, interpret: bool = False) -> jax.Array:
+    """With `interpret` the kernel is run step by step on any platform, for tests."""
     # Not with the module, which every process imports: Pallas is an eighth of the time that takes.
     from jax.experimental.pallas.ops.tpu import splash_attention
 

@@ -1,11 +1,15 @@
 """Every backend of attention has the values and the gradients of the plain one."""
 
+from collections.abc import Callable
+from typing import NamedTuple, get_args
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig
+from hma_jax.config.execution import Attention
 from hma_jax.kernels import attention, cpu, cudnn, plain, splash
 from hma_jax.model.hma import declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch
@@ -37,54 +41,81 @@ def check_equal(function, reference, *args, tolerance: float):
         np.testing.assert_allclose(got, want, atol=tolerance * np.abs(want).max())
 
 
-def by_frame(qkv: jax.Array, scale: float) -> jax.Array:
-    """The CPU's way, whatever the size of a frame."""
-    return cpu._by_frame(qkv, scale)
+class OwnWay(NamedTuple):
+    """For which arguments a backend takes a way of its own within frames, and what is patched so that it does here."""
+
+    patched: Callable[[pytest.MonkeyPatch], None]
+    shapes: tuple[tuple[int, ...], ...]
+    dtypes: tuple[str, ...] = ("float32", "bfloat16")
 
 
-def interpreted_splash(qkv: jax.Array, scale: float) -> jax.Array:
-    return splash.within(qkv, scale, interpret=True)
+def interpret_splash(patch: pytest.MonkeyPatch) -> None:
+    attend = splash._attend
+    patch.setattr(splash, "_attend", lambda qkv, scale: attend(qkv, scale, interpret=True))
 
 
+def stand_in_for_cudnn(patch: pytest.MonkeyPatch) -> None:
+    """XLA's implementation of the same call."""
+    real = jax.nn.dot_product_attention
+    patch.setattr(jax.nn, "dot_product_attention", lambda *qkv, **how: real(*qkv, **how | {"implementation": "xla"}))
+
+
+OWN_WAYS = {
+    "cpu": OwnWay(lambda patch: patch.setattr(cpu, "CACHED_BYTES", 0), ((2, 3, 7, 3, 2, 5), (1, 1, 9, 3, 3, 4))),
+    "cudnn": OwnWay(stand_in_for_cudnn, ((2, 3, 6, 3, 2, 8),), ("bfloat16",)),
+    "splash": OwnWay(interpret_splash, ((1, 2, 140, 3, 2, 8),)),
+}
+PLAIN = attention.BACKENDS["plain"]
 TOLERANCE = {"float32": 2e-5, "bfloat16": 2e-2}
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE)
+def own(part: str) -> list[str]:
+    """The backends whose function `part` is not that of `plain`."""
+    return [name for name, backend in attention.BACKENDS.items() if getattr(backend, part) is not getattr(PLAIN, part)]
+
+
+def test_every_name_is_a_backend_that_is_tested_here():
+    assert set(get_args(Attention)) == {"auto", *attention.BACKENDS}, "add yours to both"
+    assert own("within") == list(OWN_WAYS), "add yours to OWN_WAYS"
+
+
 @pytest.mark.parametrize(
-    "within, shape",
-    [(by_frame, (2, 3, 7, 3, 2, 5)), (by_frame, (1, 1, 9, 3, 3, 4)), (interpreted_splash, (1, 2, 140, 3, 2, 8))],
-    ids=["cpu", "cpu-odd-heads", "splash"],
+    "name, shape, dtype",
+    [(name, shape, dtype) for name, way in OWN_WAYS.items() for shape in way.shapes for dtype in way.dtypes],
 )
-def test_attention_within_frames_is_plain_attention(within, shape: tuple, dtype: str):
-    qkv = drawn(0, *shape, dtype=dtype)
-    check_equal(lambda x: within(x, SCALE), lambda x: plain.within(x, SCALE), qkv, tolerance=TOLERANCE[dtype])
+def test_attention_within_frames_is_plain_attention(name: str, shape: tuple, dtype: str, monkeypatch):
+    OWN_WAYS[name].patched(monkeypatch)
+    monkeypatch.setattr(plain, "within", None)  # what a backend leaves to `plain` is not its own
+    qkv, within = drawn(0, *shape, dtype=dtype), attention.BACKENDS[name].within
+    check_equal(lambda x: within(x, SCALE), lambda x: PLAIN.within(x, SCALE), qkv, tolerance=TOLERANCE[dtype])
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("frames", [1, 2])
-def test_attention_of_one_frame_over_a_cache_is_plain_attention(frames: int, dtype: str):
-    qkv, keys, values = drawn(0, 2, frames, 4, 3, 2, 8, dtype=dtype), *drawn(1, 2, 2, 5, 4, 2, 8, dtype=dtype)
-    visible = np.random.default_rng(3).random((frames, 5 + frames)) < 0.6
+@pytest.mark.parametrize("part, name", [(part, name) for part in ("over_time", "over_cache") for name in own(part)])
+def test_attention_over_time_is_plain_attention(part: str, name: str, frames: int, dtype: str):
+    args, past = [drawn(0, 2, frames, 4, 3, 2, 8, dtype=dtype)], 0
+    if part == "over_cache":
+        past = 5
+        args.extend(drawn(1, 2, 2, past, 4, 2, 8, dtype=dtype))  # keys and values
+    visible = np.random.default_rng(3).random((frames, past + frames)) < 0.6
     visible[:, -1] = True
+    ours, theirs = (getattr(backend, part) for backend in (attention.BACKENDS[name], PLAIN))
     check_equal(
-        lambda *a: cpu.over_cache(*a, visible, SCALE),
-        lambda *a: plain.over_cache(*a, visible, SCALE),
-        qkv, keys, values, tolerance=TOLERANCE[dtype],
-    )  # fmt: skip
+        lambda *a: ours(*a, visible, SCALE), lambda *a: theirs(*a, visible, SCALE), *args, tolerance=TOLERANCE[dtype]
+    )
 
 
 def test_cudnn_is_given_frames_as_sequences(monkeypatch):
-    """Where there is no such GPU, XLA's implementation of the same call stands in for the kernel."""
     calls = []
-    real = jax.nn.dot_product_attention
 
     def stand_in(q, k, v, *, scale, implementation):
         calls.append((q.shape, implementation))
-        return real(q, k, v, scale=scale, implementation="xla")
+        return q
 
     monkeypatch.setattr(jax.nn, "dot_product_attention", stand_in)
     qkv = drawn(0, 2, 3, 6, 3, 2, 8, dtype=jnp.bfloat16)
-    check_equal(lambda x: cudnn.within(x, SCALE), lambda x: plain.within(x, SCALE), qkv, tolerance=2e-2)
+    cudnn.within(qkv, SCALE)
     assert calls == [((6, 6, 2, 8), "cudnn")]
     cudnn.within(qkv.astype(jnp.float32), SCALE)
     assert len(calls) == 1, "cuDNN has no kernel for float32"
