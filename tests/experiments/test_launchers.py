@@ -103,25 +103,26 @@ class FakeRay:
 def places(tmp_path, monkeypatch):
     pytest.importorskip("submitit", reason="needs the extra `slurm`")
 
-    def make(name: str, root: Path):
-        if name == "local":
-            return fake_trial.launcher(root, 2)
-        if name == "slurm":
-            place = SlurmLauncher(
-                root, None, command=fake_trial.command, executor=FakeSlurm(root / "slurm", monkeypatch)
-            )
-        else:
-            place = RayLauncher(root, 2, command=fake_trial.command, engine=FakeRay())
+    options = {
+        "local": lambda root: {},
+        "slurm": lambda root: {"executor": FakeSlurm(root / "slurm", monkeypatch)},
+        "ray": lambda root: {"engine": FakeRay()},
+    }
+
+    def make(name: str, root: Path, workers: int | None = 2):
+        assert name in options, f"add to the fixture `places` what the launcher {name} needs here"
+        place = launcher_class(name)(root, workers, command=fake_trial.command, **options[name](root))
         place.pause = 0.01
         return place
 
     return make
 
 
-def test_every_launcher_is_tested_here():
-    assert set(LAUNCHERS) == {"local", "slurm", "ray"}
-    for name in LAUNCHERS:
-        assert launcher_class(name).Settings
+@pytest.mark.parametrize("workers", [None, 2])
+@pytest.mark.parametrize("name", list(LAUNCHERS))
+def test_how_many_trials_a_launcher_takes_at_a_time_is_known_without_it(name, workers, places, tmp_path):
+    known = LauncherOptions(name, workers).at_once
+    assert places(name, tmp_path, workers).at_once == (sys.maxsize if known is None else known)
 
 
 @pytest.mark.parametrize("name", list(LAUNCHERS))
@@ -136,7 +137,7 @@ def test_trials_come_to_the_same_ends_everywhere(name, places, tmp_path):
 
 
 def test_slurm_gets_one_array_of_all_trials_and_those_that_are_lost_later(places, tmp_path):
-    place = places("slurm", tmp_path)
+    place = places("slurm", tmp_path, workers=None)
     jobs = [job("a"), job("b", "SIGKILL"), job("c")]
     run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
     assert place._executor.arrays == [3, 1]
@@ -468,7 +469,7 @@ def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):
         (("ray", 1, ("resources=fast_disk",)), "--launcher-set resources=fast_disk: write it as resources=NAME=AMOUNT"),
         (("slurm", 1, ("gpus=1.5",)), "gpus: expected int, got 1.5"),
         (("local", 1, ("gpus=1",)), "the local launcher has no such setting; it has none"),
-        (("mpi", 1, ()), "--launcher mpi: choose one of local, slurm, ray"),
+        (("mpi", 1, ()), f"--launcher mpi: choose one of {', '.join(LAUNCHERS)}"),
     ],
 )
 def test_mistakes_in_launcher_settings_are_said_before_anything_runs(said, words):
@@ -479,7 +480,7 @@ def test_mistakes_in_launcher_settings_are_said_before_anything_runs(said, words
 
 def test_the_command_line_refuses_a_launcher_that_is_not_there(capsys):
     assert main(["study", "--preset", "smoke", "--launcher", "pbs"]) == 2
-    assert "--launcher pbs: choose one of local, slurm, ray" in capsys.readouterr().err
+    assert f"--launcher pbs: choose one of {', '.join(LAUNCHERS)}" in capsys.readouterr().err
 
 
 def test_settings_are_read_as_what_they_are():

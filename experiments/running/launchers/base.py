@@ -40,6 +40,11 @@ class Launcher(ABC):
     """How many trials it takes at a time; the engines queue what does not fit."""
 
     @classmethod
+    def limit(cls, workers: int | None, settings: Any) -> int | None:
+        """`at_once`, with so many `workers`; None: as many as there is room for. Needs no engine."""
+        return workers
+
+    @classmethod
     @abstractmethod
     def share(cls, workers: int | None, settings: Any) -> float | None:
         """How many accelerators a trial gets, with so many `workers`; below 1: several trials share one. None: neither

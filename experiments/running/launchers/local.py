@@ -40,12 +40,16 @@ class LocalLauncher(Launcher):
         settings: LocalSettings = LocalSettings(),
         command: Command = trial_command,
     ):
-        self.at_once = workers or 1
+        self.at_once = self.limit(workers, settings)
         cores = sorted(os.sched_getaffinity(0), key=core_place) if hasattr(os, "sched_getaffinity") else ()
         self._accelerators = find_accelerators()
         self._slots = cut(self.at_once, self._accelerators, cores)
         self._free = list(range(self.at_once))
         self._root, self._command = root, command
+
+    @classmethod
+    def limit(cls, workers: int | None, settings: LocalSettings) -> int:
+        return workers or 1
 
     @classmethod
     def share(cls, workers: int | None, settings: LocalSettings) -> float | None:

@@ -72,7 +72,7 @@ class RayLauncher(Launcher):
         command: Command = trial_command,
         engine: Any = None,
     ):
-        self.at_once = workers or Launcher.at_once
+        self.at_once = self.limit(workers, settings) or Launcher.at_once
         self._root, self._command = root, command
         self._accelerator = "tpu" if settings.tpus else "gpu" if settings.gpus else ""
         self._ray = engine or _join(settings.address)

@@ -41,8 +41,9 @@ class LauncherOptions:
 
     @property
     def at_once(self) -> int | None:
-        """Trials at a time; None: as many as the cluster has room for."""
-        return self.workers or (1 if self.name == "local" else None)
+        """Trials at a time; None: as many as the cluster has room for (`Launcher.limit`)."""
+        kind, settings = self._parsed()
+        return kind.limit(self.workers, settings)
 
     def share(self) -> float | None:
         """How many accelerators each trial gets (`Launcher.share`)."""

@@ -108,7 +108,7 @@ class SlurmLauncher(Launcher):
         command: Command = trial_command,
         executor: Any = None,
     ):
-        self.at_once = workers or Launcher.at_once
+        self.at_once = self.limit(workers, settings) or Launcher.at_once
         self._root, self._command = root, command
         by_option = any(option.startswith(("gres=gpu", "gpus")) for option in settings.sbatch)
         self._accelerator = "gpu" if settings.gpus or by_option else ""
