@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 
@@ -19,11 +19,14 @@ from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
 from experiments.bench.timing import time_by_turns
 from hma_jax.config import EvalConfig, MaskingSetting, ModelConfig
+from hma_jax.config.evaluation import SamplerKind
 from hma_jax.evaluation.evaluate import evaluate
 from hma_jax.evaluation.summary import paired_difference
 from hma_jax.model.hma import declare_model
 
-SAMPLER_STEPS = {"ddpm": (100, 50, 25, 12, 8, 4), "ddim": (100, 50, 25, 12, 8, 4), "dpm++": (12, 10, 8)}
+SAMPLER_STEPS = (100, 50, 25, 12, 8, 4)
+FEWER_STEPS = {"dpm++": (12, 10, 8)}
+"""By sampler, in place of SAMPLER_STEPS."""
 PASSES = (8, 4, 2, 1)
 
 
@@ -62,8 +65,8 @@ def decodings(model: ModelConfig, config: EvalConfig, frames: int) -> dict[str, 
         return {f"M = {m}": changed(unmask_steps=m) for m in PASSES if m <= model.tokens}
     return {
         f"{kind} {steps}": changed(sampler=replace(config.decode.sampler, kind=kind, steps=steps))
-        for kind, counts in SAMPLER_STEPS.items()
-        for steps in counts
+        for kind in get_args(SamplerKind)
+        for steps in FEWER_STEPS.get(kind, SAMPLER_STEPS)
         if steps <= model.diffusion.steps
     }
 
@@ -119,7 +122,7 @@ def judge(
 
 def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
     """PSNR and delta PSNR over the time per frame, every point named."""
-    from experiments.report.plot_style import COLOURS, DEFAULT, STYLE, plain_log, plt, save
+    from experiments.report.plot_style import COLOURS, DEFAULT, MARKERS, STYLE, plain_log, plt, save
 
     cost = "milliseconds_per_frame"
     with plt.rc_context(STYLE):
@@ -128,13 +131,14 @@ def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
             panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
         ):
             kinds = dict.fromkeys(row.decoding.split()[0] for row in rows)
-            colours = COLOURS["perplexity"], COLOURS["delta_psnr"], DEFAULT  # for as many kinds as SAMPLER_STEPS has
-            looks = colours[: len(kinds)], (5, -12, 12)[: len(kinds)]
-            for kind, colour, lift in zip(kinds, *looks, strict=True):
+            looks = [(COLOURS["perplexity"], 5), (COLOURS["delta_psnr"], -12), (DEFAULT, 12)]
+            for number, kind in enumerate(kinds):
+                colour, lift = looks[number % len(looks)]
+                marker = MARKERS[number // len(looks)]
                 points = [r for r in rows if r.decoding.split()[0] == kind]
                 time, value, sem = ([getattr(r, f) for r in points] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(
-                    time, value, sem, color=colour, marker="o", markersize=4, linewidth=1.2, capsize=2, label=kind
+                    time, value, sem, color=colour, marker=marker, markersize=4, linewidth=1.2, capsize=2, label=kind
                 )
                 for row in points:
                     steps = row.decoding.split()[-1]

@@ -1,6 +1,7 @@
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from experiments.bench.timing import Compiled, Timing, summarise, time_by_turns
 from experiments.bench.train import time_training
 from experiments.cli.main import main
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig, SamplerConfig
+from hma_jax.config.evaluation import SamplerKind
 from hma_jax.model.flops import denoiser_flops, pass_flops
 from tests.data_pipelines.fakes import REAL_DATA
 from tests.hma_jax.evaluation.fakes import GreyTokenizer, make_batches
@@ -193,6 +195,7 @@ def test_decodings_vary_what_the_model_leaves_open():
     assert list(decodings(ids, EvalConfig(), 24)) == ["exact", "streaming"]
     samplers = decodings(latents, EvalConfig(), 12)
     assert list(samplers)[:2] == ["ddpm 100", "ddpm 50"] and {"ddim 4", "dpm++ 8"} < set(samplers)
+    assert {name.split()[0] for name in samplers} == set(get_args(SamplerKind))
     assert samplers["dpm++ 8"].decode.sampler.kind == "dpm++"
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 from hma_jax.config import Conditioning, DecodeConfig, DiffusionConfig, ExecutionConfig, SamplerConfig
+from hma_jax.config.evaluation import SamplerKind
 from hma_jax.generation import rollout, rollout_naive, steps
 from hma_jax.generation.cache import Window
 from hma_jax.generation.flops import frame_flops, rollout_flops, sampler_flops
@@ -145,7 +146,9 @@ def test_of_the_frames_before_a_new_one_none_is_read_out():
 
 
 @pytest.mark.parametrize("resample", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("sampler", [SamplerConfig("ddpm", 5), SamplerConfig("ddim", 12), SamplerConfig("dpm++", 8)])
+@pytest.mark.parametrize(
+    "sampler", [SamplerConfig(kind, 5 + n) for n, kind in enumerate(get_args(SamplerKind))], ids=get_args(SamplerKind)
+)
 def test_the_denoiser_counts_the_tokens_that_it_sees_at_every_step(resample, sampler):
     """Without the trunk's part: the difference of two numbers of steps."""
     case = Case(diffusion=DIFFUSION)
