@@ -22,6 +22,9 @@ Weights = Literal["auto", "last", "ema"]
 """Which weights of a run: the last ones, their moving average, or (`auto`) the average where the run
 keeps one (`TrainConfig.ema_decay`)."""
 
+Matrices = Literal["adamw", "muon"]
+"""Optimisers of the trunk's hidden matrices."""
+
 ActionScale = Literal["deviation", "quantiles"]
 """What actions are measured in: standard deviations from their mean, or such that their quantiles of 1 % and
 99 % become -1 and 1."""
@@ -163,7 +166,7 @@ class OptimizerConfig:
     clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
     # Optimiser of the trunk's hidden matrices: AdamW, as for all other parameters, or Muon, which orthogonalises their
     # momentum (Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
-    matrices: Literal["adamw", "muon"] = later("adamw")
+    matrices: Matrices = later("adamw")
 
     def __post_init__(self):
         check_fields(self, infinite_allowed=("clip_norm",))

@@ -217,18 +217,25 @@ def apply_update(
     count_E = {use: n + presence.robots[use].astype(n.dtype) for use, n in state.count_E.items()}
     b1, b2 = config.beta1, config.beta2
 
-    def update(p, g, m, v, spec: ParamSpec, multiplier: float):
+    # Each: (gradient, first and second moment) -> (new moments, what is moved along).
+    def adamw(g, m, v, spec: ParamSpec, multiplier: float):
         # The count may be 0 before a first example; its (unused) correction must stay finite.
         steps = jnp.maximum(_entry_of(spec, count, count_E), 1).astype(jnp.float32)
-        if config.matrices == "muon" and spec.role == "hidden":
-            mu = MUON_MOMENTUM
-            new_m, new_v = mu * m + (1 - mu) * g, v
-            move = muon_direction(mu * new_m + (1 - mu) * g, spec, multiplier, min_shard_size)
-        else:
-            new_m = b1 * m + (1 - b1) * g
-            new_v = b2 * v + (1 - b2) * jnp.square(g)
-            adam = new_m / (1 - b1**steps) / (jnp.sqrt(new_v / (1 - b2**steps)) + config.epsilon)
-            move = multiplier * adam
+        new_m = b1 * m + (1 - b1) * g
+        new_v = b2 * v + (1 - b2) * jnp.square(g)
+        adam = new_m / (1 - b1**steps) / (jnp.sqrt(new_v / (1 - b2**steps)) + config.epsilon)
+        return new_m, new_v, multiplier * adam
+
+    def muon(g, m, v, spec: ParamSpec, multiplier: float):
+        mu = MUON_MOMENTUM
+        new_m = mu * m + (1 - mu) * g
+        return new_m, v, muon_direction(mu * new_m + (1 - mu) * g, spec, multiplier, min_shard_size)
+
+    of_matrices = {"adamw": adamw, "muon": muon}[config.matrices]
+
+    def update(p, g, m, v, spec: ParamSpec, multiplier: float):
+        rule = of_matrices if spec.role == "hidden" else adamw
+        new_m, new_v, move = rule(g, m, v, spec, multiplier)
         decay = config.weight_decay * p if spec.decay else 0.0
         new_p = p - learning_rate * (move + decay)
         return tuple(jnp.where(presence.of(spec), new, old) for new, old in ((new_p, p), (new_m, m), (new_v, v)))

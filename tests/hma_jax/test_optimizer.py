@@ -9,6 +9,7 @@ import optax
 import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, MupConfig, OptimizerConfig, TrainConfig
+from hma_jax.config.training import Matrices
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec, Use, is_spec
 from hma_jax.training import optimizer
@@ -71,11 +72,15 @@ def slices(declared, tree, robot):
     return out
 
 
-@pytest.mark.parametrize("config", [CONFIG, MUON], ids=["adamw", "muon"])
-def test_robots_absent_from_a_step_do_not_move(config):
+@pytest.mark.parametrize("matrices", get_args(Matrices))
+def test_a_step_goes_against_the_gradient_and_robots_absent_from_it_do_not_move(matrices):
+    config = replace(CONFIG, matrices=matrices)
     declared, params = lively_params(shallow_config())
     state = begun(params)
     params1, state1 = update(params, state, [True, True, True], config=config)
+    trees = (jax.tree.leaves(jax.tree.map(np.asarray, tree)) for tree in (params, params1, gradients(params)))
+    for before, after, gradient in zip(*trees, strict=True):
+        assert np.sum((before * (1 - 1e-3) - after) * gradient) > 0  # decay apart
     params2, state2 = update(params1, state1, [True, False, True], seed=1, config=config)
     for name, before in slices(declared, params1, 1).items():
         np.testing.assert_array_equal(before, slices(declared, params2, 1)[name], err_msg=name)

@@ -3,12 +3,14 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, OptimizerConfig
+from hma_jax.config.training import Matrices
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import is_spec
 from hma_jax.training import train_only
@@ -35,7 +37,9 @@ def test_there_are_moments_of_what_is_trained_alone():
     assert one.params == whole.params and one.opt_state.count_E == whole.opt_state.count_E
 
 
-@pytest.mark.parametrize("matrices", ["adamw", pytest.param("muon", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "matrices", [pytest.param(name, marks=[pytest.mark.slow] * (name != "adamw")) for name in get_args(Matrices)]
+)
 @pytest.mark.parametrize("batch", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_what_a_robot_learns_does_not_depend_on_which_others_are_trained(batch: int, matrices: str):
     """With fewer examples than robots, and with more."""
