@@ -12,8 +12,7 @@ from hma_jax.config import Magvit2Config, PixelsConfig, SvdVaeConfig
 from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, Source, tokenizer_shapes
 from hma_jax.convert.tensors import write_safetensors
 from hma_jax.tokenizers.base import Tokenizer
-from hma_jax.tokenizers.pixels import PixelTokenizer
-from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
+from hma_jax.tokenizers.io import KINDS
 
 MAGVIT2_SMALL = Magvit2Config(image_size=16, channels=4, multipliers=(1, 2), res_blocks=1, bits=6, groups=2)
 VAE_SMALL = SvdVaeConfig(image_size=16, channels=(4, 8), layers=1, groups=2)
@@ -30,8 +29,7 @@ OFFICIAL = {
 
 
 def make(config: Any, seed: int = 0, piece: int | None = None) -> Tokenizer:
-    kinds = {c.config_class: c for c in (Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)}
-    cls = kinds[type(config)]
+    cls = KINDS[config.kind]
     return cls(config, cls.declare(config).init(seed), piece=piece)
 
 

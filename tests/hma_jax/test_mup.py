@@ -1,12 +1,14 @@
 """muP in both variants: what each parameter is to the width, and what becomes of activations."""
 
 from dataclasses import replace
+from typing import get_args
 
 import jax
 import numpy as np
 import pytest
 
 from hma_jax.config import (
+    Conditioning,
     ConfigError,
     DiffusionConfig,
     MaskingConfig,
@@ -30,7 +32,8 @@ VARIANTS = {
         "diffusion": DiffusionConfig(channels=2, patch=2, width=32, depth=1, steps=100),
     },
 }
-ROLES = [("discrete", "concat+modulate"), ("discrete", "cross_attention"), ("continuous", "concat+modulate")]
+IN_BLOCKS = {ModelConfig(conditioning=kind).block_conditioning: kind for kind in get_args(Conditioning)}
+ROLES = [("continuous", "concat+modulate"), *(("discrete", kind) for kind in IN_BLOCKS.values())]
 # A rate that learns the batch by heart in ten steps: a smaller one hides what is wrong.
 TRAIN = train_config(
     steps=10,

@@ -13,10 +13,11 @@ import pytest
 from hma_jax.config import AnyTokenizerConfig, ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
 from hma_jax.config.json import from_dict, to_json
 from hma_jax.model.frames import compose, factorise
-from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
+from hma_jax.tokenizers.io import KINDS, load_config, load_tokenizer, save_tokenizer
 from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes
 from tests.hma_jax.pretrained import MAGVIT2_SMALL, PIXELS_SMALL, VAE_SMALL, make, noise
+from tests.hma_jax.test_tokenizer import BOTH as TRAINED_HERE
 
 CONFIGS = {c.kind: c for c in (MAGVIT2_SMALL, VAE_SMALL, PIXELS_SMALL)}
 
@@ -37,6 +38,11 @@ def vae():
 
 
 # --- The interface -----------------------------------------------------------------------------
+
+
+def test_every_kind_is_tested():
+    """The user's own code by test_own_tokenizer.py."""
+    assert set(KINDS) == {*CONFIGS, *TRAINED_HERE, "python"}, "add a small configuration of yours to CONFIGS"
 
 
 def test_facts_are_those_of_the_tokens(tokenizer):

@@ -26,7 +26,7 @@ from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources import lerobot_dataset, lerobot_meta
 from data_pipelines.sources.joined import JoinedSource
 from data_pipelines.sources.lerobot import LeRobotSource
-from data_pipelines.sources.open import find_format, open_source, read_rate, read_size, source_name
+from data_pipelines.sources.open import FORMATS, find_format, open_source, read_rate, read_size, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.robomimic import RobomimicSource
@@ -476,11 +476,14 @@ def test_a_format_that_is_not_known_is_one_clear_message(records):
 @pytest.fixture
 def places(tmp_path, records):
     """A dataset of each format, with its entry."""
-    return [
-        (TOP, write_lerobot(tmp_path / "toy-arm", "v3.0", lengths=(12, 9, 10, 11))),
-        (VIEW, write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4, 6))),
-        (make_spec(), records),
-    ]
+    made = {
+        "lerobot": (TOP, write_lerobot(tmp_path / "toy-arm", "v3.0", lengths=(12, 9, 10, 11))),
+        "robomimic": (VIEW, write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4, 6))),
+        "rlds": (make_spec(), records),
+    }
+    assert set(made) == set(FORMATS), "add a dataset of yours here"
+    assert [find_format(place) for _, place in made.values()] == list(made)
+    return list(made.values())
 
 
 def test_every_format_is_tokenised_directly(tmp_path, places):
@@ -491,6 +494,7 @@ def test_every_format_is_tokenised_directly(tmp_path, places):
     assert store.hash() == TokenStore(tmp_path / "again").hash()
     for spec, place in places:
         source, manifest = open_source(place), store.manifest(spec.name)
+        assert (source_name(place), read_rate(place)) == (source.name, source.hz)
         assert sorted((*manifest.train.episodes, *manifest.val.episodes)) == list(range(len(source)))
         for at, i in enumerate(manifest.train.episodes):
             stored, raw = store.episode(spec.name, "train", at), source.episode(i, spec.image_key, spec.action_keys)
