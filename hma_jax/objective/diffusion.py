@@ -182,11 +182,13 @@ def sampler_step(
             eps = (from_xt * x - x0) / from_eps  # what the clipped x0 leaves
             cleaner = process.alphas_cumprod_prev
             x = _at(np.sqrt(cleaner), index) * x0 + _at(np.sqrt(1.0 - cleaner), index) * eps
-        else:
+        elif sampler.kind == "ddpm":
             x = _at(process.posterior_x0, index) * x0 + _at(process.posterior_xt, index) * x
             if sampler.noisy_steps:
                 scale = jnp.where(index > 0, sampler.temperature, 0.0)
                 x += scale * jnp.exp(0.5 * predicted.log_variance) * noise_at(index)
+        else:
+            raise ValueError(f"sampler_step has no step of {sampler.kind!r}; add it there")
         return x, x0
 
     return step
