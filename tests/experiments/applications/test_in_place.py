@@ -116,7 +116,7 @@ def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monk
 
     def untrained(scenes, unfinished, **_):
         unfinished.touch()
-        return Detector(init_detector(jax.random.key(0), 1, 5), list(scenes))
+        return Detector(jax.jit(init_detector, static_argnums=(1, 2))(jax.random.key(0), 1, 5), list(scenes))
 
     for name, value in (("EPISODES", 1), ("MIN_EPISODES", 1), ("HELD_OUT", (1, 1)), ("train_detector", untrained)):
         monkeypatch.setattr(detector_module, name, value)

@@ -31,7 +31,7 @@ class GreyTokenizer:
         return jnp.broadcast_to(level[:, None, None, None], (len(tokens), SIZE, SIZE, 3))
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
-        return np.asarray(self.decode_uint8_fn(self.params, jnp.asarray(tokens)))
+        return np.asarray(jax.jit(self.decode_uint8_fn)(self.params, tokens))
 
 
 def make_window(number: int, config: ModelConfig, name: str, table: EmbodimentTable = TABLE) -> dict[str, Any]:

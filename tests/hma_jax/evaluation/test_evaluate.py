@@ -193,7 +193,7 @@ def test_random_actions_follow_the_statistics_of_the_batch():
     (batch,) = make_batches(CONFIG, names=("arm",), each=4)
     mean, std = (np.full((4, TABLE.action_width), value, np.float32) for value in (5, 0.5))
     given = batch | {"action_mean": mean, "action_std": std}
-    sequences, _ = evaluation_inputs(given, TABLE, replace(EVAL, random_actions=64))
+    sequences, _ = jax.jit(lambda: evaluation_inputs(given, TABLE, replace(EVAL, random_actions=64)))()
     drawn = np.asarray(sequences[:, 1:, EVAL.first_predicted - 1 :])
     assert drawn.mean() == pytest.approx(5, abs=0.05) and drawn.std() == pytest.approx(0.5, abs=0.05)
 
@@ -300,14 +300,14 @@ def test_what_was_trained_for_actions_alone_is_judged_by_them_alone(params, sett
     found = evaluate(params, CONFIG, TABLE, TOKENIZER, batches, EVAL, setting=setting)
     actions = {"action_error", "action_error_of_mean", "action_gain"}
     assert found.windows.metrics.keys() == found.summary.overall.keys() == actions and not found.samples
-    broken = jax.tree.map(lambda x: x * jnp.nan, params)
+    broken = jax.tree.map(lambda x: jax.device_put(np.full_like(x, np.nan)), params)
     with pytest.raises(ConfigError, match=r"predictions are not finite \(arm, pusher\); did the model diverge"):
         evaluate(broken, CONFIG, TABLE, TOKENIZER, batches, EVAL, setting=setting)
 
 
 def test_ids_chosen_by_logits_that_are_no_numbers_are_not_judged(params):
     """Ids are whole numbers whatever chose them, and among losses that are no numbers the true actions were found."""
-    broken = jax.tree.map(lambda x: x * jnp.nan, params)
+    broken = jax.tree.map(lambda x: jax.device_put(np.full_like(x, np.nan)), params)
     with pytest.raises(ConfigError, match=r"predictions are not finite \(pusher\); did the model diverge"):
         run(broken)
 
@@ -327,7 +327,7 @@ def test_no_part_of_what_is_predicted_may_be_no_number(wrong, params, monkeypatc
     monkeypatch.setattr(protocol, "rollout", lambda _, prompt, sequences, *__, **___: jnp.zeros((4, 4, 4, 9)))
     monkeypatch.setattr(protocol, "for_each_sequence", lambda *_: found)
     monkeypatch.setattr(protocol, "predict_next_actions", lambda model, tokens, actions, *_: actions)
-    metrics, _ = protocol.make_predictor(CONFIG, TABLE, EVAL, "full")(params, inputs)
+    metrics, _ = jax.jit(protocol.make_predictor(CONFIG, TABLE, EVAL, "full"))(params, inputs)
     finite = [False] * 4 if wrong == "actions" else [True, True, False, True]
     np.testing.assert_array_equal(metrics["finite"], finite)
 
