@@ -127,7 +127,6 @@ def _rows(
 
 def training_loss(result: dict[str, Any]) -> Stat:
     """The mean of a run's last steps. Results of earlier versions hold the loss of every step instead."""
-
     return Stat(**(result.get("training_loss") or last_loss(result["losses"])))
 
 

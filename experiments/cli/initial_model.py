@@ -28,7 +28,6 @@ def setup_of(source: Path, trained: Run, arguments: StudyArguments) -> StudySetu
 
     Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
     """
-
     arguments = arguments.anywhere()
     arguments = dataclasses.replace(arguments, tokenizer=_find_tokenizer(source, trained, arguments))
     setup = make_setup(arguments, trained.model)

@@ -8,7 +8,7 @@ from data_pipelines.loading.selection import Drawn, select_windows
 from data_pipelines.tokens.store import TokenStore
 from experiments.running.trial import Trial, loader_of
 from experiments.terminal.progress import console, tidy_table
-from experiments.terminal.words import counted
+from experiments.terminal.words import OF_MIXTURE, counted, mixture_rows
 
 
 def show_mixture(store: TokenStore, trial: Trial) -> None:
@@ -26,14 +26,7 @@ def show_drawn(drawn: Mapping[str, Drawn], trial: Trial) -> None:
         f"The mixture: windows^(1/{trial.tau:g}) sets each dataset's share of the draws{kept}; passes over its windows in "
         f"{counted(trial.train.steps, 'step')} of {trial.train.batch}"
     )
-    table = tidy_table(title, "dataset", "trajectories", "windows", "share of draws", "passes")
-    for name, one in drawn.items():
-        passes = one.passes(draws)
-        table.add_row(
-            name,
-            f"{one.trajectories:,}",
-            f"{one.windows:,}",
-            f"{one.share:.1%}",
-            f"{passes:,.{0 if passes >= 10 else 1}f}",
-        )
+    table = tidy_table(title, *OF_MIXTURE)
+    for row in mixture_rows(drawn, draws):
+        table.add_row(*row)
     console.print(table)

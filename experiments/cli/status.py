@@ -64,7 +64,6 @@ def status(
 
 def _place(directory: Path, state: State) -> tuple[str, str]:
     """(how far a trial is, where it runs and when it last said so)."""
-
     progress, start = read_progress(directory), read_start(directory)
     done = f"{progress['phase']} {progress['done']:,} of {progress['total']:,}" if progress else ""
     if state.event != RUNNING or start is None:

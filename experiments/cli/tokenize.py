@@ -131,7 +131,6 @@ def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
 
 def show_store(workspace: Workspace, rate: float | None) -> None:
     """What the token store holds, per dataset, and the stride of a study at `rate` Hz (None: native)."""
-
     from data_pipelines.tokens.manifest import FILE
     from data_pipelines.tokens.store import TokenStore
 

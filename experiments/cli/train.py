@@ -31,7 +31,7 @@ from experiments.running.workspace import Workspace
 from experiments.study_setup import UNSET, StudySetup, make_setup
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
 from experiments.terminal.progress import console, say, short, step, wrote
-from experiments.terminal.words import counted, few
+from experiments.terminal.words import counted, few, times
 from hma_jax.config import require
 from hma_jax.training.run_lock import require_plain
 
@@ -393,7 +393,7 @@ def say_data(trial: Trial, prepared: PreparedData) -> None:
     say(
         f"training on {len(used)} of {counted(len(trial.datasets), 'robot')}: {sum(len(s.episodes) for s in used):,} of "
         f"{episodes:,} trajectories{limit}, {windows:,} windows of {trial.model.frames} frames, each "
-        f"seen {passes:,.{0 if passes >= 10 else 1}f} times on average"
+        f"seen {times(passes)} times on average"
     )
     show_drawn(chosen.drawn(), trial)
     for name, reason in chosen.mixture.dropped.items():

@@ -103,7 +103,6 @@ def source_of(name: str, places: Mapping[str, str]) -> Source:
 
 def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
     """The simulated datasets, which must be there. Raises ConfigError with `advice` otherwise."""
-
     sources = [(get_spec(name), workspace.suite / name) for name in study.all_names()]
     missing = [spec.name for spec, path in sources if not path.is_dir()]
     require(not missing, f"{workspace.suite}: {', '.join(missing)} not simulated yet. {advice}")

@@ -72,7 +72,6 @@ def make_store(
 def data_differences(study: Study, workspace: Workspace, data: Sequence[str], tokenizer: Tokenizer) -> list[str]:
     """How the recordings at `data`, and the registry's entries of them, differ from those that the tokens here were
     made from; settings of the store are not compared, nor what cannot be opened."""
-
     try:
         sources = [source_of(name, places) for name, places in group_by_dataset(data).items()]
         lines = _differences(study, workspace, sources, tokenizer)

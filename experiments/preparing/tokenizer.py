@@ -89,7 +89,6 @@ def frames_made_from(
 ) -> dict[str, Any]:
     """Inputs of a stamp that say which frames a tokenizer is trained on and judged by. Recordings are named as in an
     `existing` stamp, which may be of an earlier version; those that are not opened are taken for the same."""
-
     settings, known = study.store, existing.inputs.get("data", {}) if existing else {}
 
     def shards(spec: DatasetSpec, path: Location | Parts | None) -> str:

@@ -179,7 +179,6 @@ def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float 
 
 def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> None:
     """Names the datasets that lose many episodes to evaluation because they have few."""
-
     many = []
     for name, facts in summary.items():
         if get_spec(name).val_split:
@@ -208,7 +207,6 @@ def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> No
 
 def say_alone(summary: dict[str, dict[str, int]]) -> None:
     """Names the robots of one training episode: of no other one can a control take their actions."""
-
     alone = [
         name
         for name, facts in summary.items()

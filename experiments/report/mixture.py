@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from data_pipelines.loading.selection import Drawn
 from experiments.report.pieces import table
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of, trial_id
 from experiments.sweeps.sweep import POINT, Sweep
-from experiments.terminal.words import counted
+from experiments.terminal.words import OF_MIXTURE, counted, mixture_rows
 
 NOTABLE = 0.01
 """Change of a dataset's share of the draws along an axis from which on it is told."""
@@ -32,26 +33,16 @@ class PointData:
 def describe_mixture(trial: Trial, result: Mapping[str, Any]) -> str:
     """A line per dataset of how much there is of it and how often it was drawn; '' for one dataset, and for results of
     earlier versions, which do not say it."""
-    mixture, draws = result.get("mixture", {}), trial.train.steps * trial.train.batch
-    if len(mixture) < 2:
+    draws = trial.train.steps * trial.train.batch
+    drawn = {name: Drawn(result["trajectories"][name], **one) for name, one in result.get("mixture", {}).items()}
+    if len(drawn) < 2:
         return ""
-    lines = []
-    for name, one in mixture.items():
-        passes = one["share"] * draws / one["windows"] if one["windows"] else 0.0
-        cells = (result["trajectories"][name], one["windows"])
-        lines.append(
-            [
-                html.escape(name),
-                *(f"{n:,}" for n in cells),
-                f"{one['share']:.1%}",
-                f"{passes:,.{0 if passes >= 10 else 1}f}",
-            ]
-        )
+    lines = [[html.escape(name), *cells] for name, *cells in mixture_rows(drawn, draws)]
     counts = "windows of all trajectories" if trial.weighed == "all" else "windows"
     return (
         f"<p>A dataset with n {counts} is drawn with a probability in proportion to n<sup>1/{trial.tau:g}</sup>. Passes: how often "
         f"each of its windows is seen in {counted(trial.train.steps, 'step')} of {trial.train.batch}.</p>"
-        + table(["dataset", "trajectories", "windows", "share of draws", "passes"], lines)
+        + table(OF_MIXTURE, lines)
     )
 
 

@@ -325,7 +325,6 @@ def last_loss(losses: Sequence[float]) -> dict[str, Any]:
 
 def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
     """Writes windows.parquet and, where there are samples, samples.npz into `directory`, in place of others."""
-
     evaluation.windows.save(directory / FILE, directory.name)
     if evaluation.samples:
         write_samples(directory / SAMPLES, evaluation.samples)

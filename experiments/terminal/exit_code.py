@@ -123,7 +123,6 @@ def _end_together(error: BaseException | None = None, code: int = Exit.DONE, sho
 
 def _exit_code(error: Exception) -> Exit | None:
     """None for what is not the user's business: a bug, shown with its traceback."""
-
     if isinstance(error, ConfigError):
         return Exit.REFUSED
     if isinstance(error, TrialsFailed):
@@ -155,7 +154,6 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 def _words(error: Exception, skipping: str) -> str:
     """The message of an error, and what it cannot know: how its advice is followed from here."""
-
     if isinstance(error, EpisodeError) and skipping:
         return f"{error} (Here: {skipping}.)"
     if isinstance(error, OSError) and error.strerror:

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from data_pipelines.loading.selection import Drawn
+
+OF_MIXTURE = ("dataset", "trajectories", "windows", "share of draws", "passes")
+"""Columns of `mixture_rows`."""
 
 
 def few(names: Sequence[str]) -> str:
@@ -19,6 +26,19 @@ def counted(n: int, thing: str) -> str:
 def in_thousands(n: int) -> str:
     """'48.0 k', '1.2 M'."""
     return f"{n / 1e6:,.1f} M" if n >= 1e6 else f"{n / 1e3:,.1f} k"
+
+
+def times(passes: float) -> str:
+    """How often something is seen: '12', '3.4'."""
+    return f"{passes:,.{0 if passes >= 10 else 1}f}"
+
+
+def mixture_rows(drawn: Mapping[str, Drawn], draws: int) -> list[list[str]]:
+    """How much there is of each dataset, and how often a training run of `draws` windows sees it."""
+    return [
+        [name, f"{one.trajectories:,}", f"{one.windows:,}", f"{one.share:.1%}", times(one.passes(draws))]
+        for name, one in drawn.items()
+    ]
 
 
 def duration(seconds: float) -> str:

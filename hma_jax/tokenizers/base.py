@@ -168,10 +168,16 @@ class Tokenizer(abc.ABC):
     def require_tokens(self, tokens: np.ndarray, what: str, advice: str) -> None:
         """Raises ConfigError, which begins with `what` made them and ends with `advice`, for values that are no tokens.
         Compiled programs do not look: what they make is checked where it comes to the host."""
-        low, high = tokens.min(), tokens.max()
-        good = np.isfinite([low, high]).all() if self.channels else 0 <= low <= high < self.vocab_size
         wanted = "finite numbers" if self.channels else f"in [0, {self.vocab_size})"
-        require(bool(good), f"{what} gives values from {low} to {high}; tokens must be {wanted}{advice}")
+        require(
+            self._are_tokens(tokens),
+            f"{what} gives values from {tokens.min()} to {tokens.max()}; tokens must be {wanted}{advice}",
+        )
+
+    def _are_tokens(self, values: np.ndarray) -> bool:
+        if self.channels:
+            return bool(np.isfinite(values).all())
+        return bool(0 <= values.min(initial=0) and values.max(initial=0) < self.vocab_size)
 
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         """Pure: `decode` without its checks of the tokens."""
@@ -186,11 +192,10 @@ class Tokenizer(abc.ABC):
             tokens.dtype.kind in "iu" and tokens.ndim == 2 and tokens.shape[1] == self.tokens,
             f"the tokenizer decodes ids, integers [B, {self.tokens}], got {tokens.dtype} {list(tokens.shape)}",
         )
-        low, high = int(tokens.min(initial=0)), int(tokens.max(initial=0))
         require(
-            low >= 0 and high < self.vocab_size,
-            f"token ids must lie in [0, {self.vocab_size}), got {low} to {high}; do they contain a mask id, or were "
-            "they made by another tokenizer?",
+            self._are_tokens(tokens),
+            f"token ids must lie in [0, {self.vocab_size}), got {tokens.min(initial=0)} to {tokens.max(initial=0)}; do "
+            "they contain a mask id, or were they made by another tokenizer?",
         )
         return tokens.astype(np.int32)
 
@@ -202,7 +207,7 @@ class Tokenizer(abc.ABC):
             f"got {tokens.dtype} {list(tokens.shape)}",
         )
         tokens = tokens.astype(np.float32)
-        require(bool(np.isfinite(tokens).all()), "latents are not finite; did the model diverge?")
+        require(self._are_tokens(tokens), "latents are not finite; did the model diverge?")
         return tokens
 
     # --- Devices -----------------------------------------------------------------------------

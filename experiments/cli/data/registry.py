@@ -50,7 +50,6 @@ def data_list(
         mixture: List only the datasets of this mixture: dataset5, 10, 20, 30, 40, dataset40_published or dataset30_vae.
         registry: TOML file with your own registry entries.
     """
-
     use_entries(registry)
     chosen = get_mixture(mixture) if mixture else None
     shown = 0
