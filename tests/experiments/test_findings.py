@@ -13,6 +13,7 @@ import pytest
 from scipy import stats
 
 from experiments.analysis.compare import Side, overall_difference
+from experiments.analysis.controllability import ROUNDING
 from experiments.analysis.preregistered import FILE, Expected, read_expected
 from experiments.analysis.rows import OVERALL, CurvePoint, all_series, curve, difference
 from experiments.applications.detector import CLOSE_PX
@@ -266,18 +267,27 @@ def exponents() -> list[float]:
     return found
 
 
-def test_how_many_robots_a_deaf_model_has_far_from_zero_is_as_findings_say():
+def test_how_many_robots_a_deaf_model_has_far_above_zero_is_as_findings_say():
     with open(RESULTS / "cpu-full" / "controllability.csv", newline="") as file:
-        rows = [r for r in csv.DictReader(file) if (r["role"], r["metric"]) == (CONTROL, "action_nats")]
-    rows = [r for r in rows if float(r["sem"]) > 0]
-    chance = [2 * stats.t.sf(3, int(r["episodes"]) - 1) for r in rows]  # of one robot, either side
-    none = np.prod([1 - p for p in chance])
-    one = sum(none * p / (1 - p) for p in chance)
-    found = sum(abs(float(r["errors"])) > 3 for r in rows)
+        rows = [r for r in csv.DictReader(file) if r["role"] == CONTROL and float(r["sem"]) > ROUNDING]
     page = " ".join(findings().split())
-    assert len(rows) == 36 and f"action-nats beyond 3 of them on {found} of the 36" in page
-    assert f"has {sum(chance):.1f} of them beyond 3 standard errors, either side" in page
-    assert f"two or more come in {100 * (1 - none - one):.0f} of 100 cases" in page
+
+    def counted(metric: str, bound: int) -> tuple[int, float, float]:
+        """How many robots are above this many standard errors, how many by chance, and how often as many by chance."""
+        own = [r for r in rows if r["metric"] == metric]
+        assert len(own) == 36
+        found, chances = sum(float(r["errors"]) > bound for r in own), np.ones(1)
+        by_chance = [stats.t.sf(bound, int(r["episodes"]) - 1) for r in own]
+        for p in by_chance:
+            chances = np.convolve(chances, [1 - p, p])
+        return found, sum(by_chance), 100 * chances[found:].sum()
+
+    nats, expected, often = counted("action_nats", 3)
+    assert f"action-nats beyond 3 of them on {nats} of the 36" in page
+    assert f"{expected:.1f} of them beyond 3 standard errors (two or more in {often:.0f} of 100 cases)" in page
+    psnr, expected, often = counted("delta_psnr", 2)
+    assert f"ΔPSNR beyond 2 on {psnr} (one of these at 2.01" in page and (nats, psnr) == (2, 4)
+    assert f"{expected:.1f} beyond 2 (four or more in {often:.0f} of 100)" in page
 
 
 @pytest.mark.parametrize("study", ["cpu", "cpu-full", "cpu-full-continuous", "cpu-full-horizon"])
