@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from experiments.running.machine import describe_machine
+from experiments.terminal.program import command_line
 from hma_jax.config import require
 from hma_jax.config.json import completed, diff, identity_of, to_dict
 from hma_jax.model.params import Params
@@ -18,6 +21,9 @@ from hma_jax.runtime.files import write_file
 from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"
+PROVENANCE = "provenance.jsonl"
+"""Beside it: a line for every start of a command on this directory. Results may be of several."""
+
 SIMULATOR = "simulator"
 """The field of what a simulator's results depend on besides its weights."""
 
@@ -61,8 +67,12 @@ def pin_settings(
             f"{path} does not contain the decoding of frames and the robots' action ranges: choose another --out, or, "
             "if you know that neither has changed, remove this file",
         )
-        return
-    write_settings(out, run, simulator, *settings, file=file)
+    else:
+        write_settings(out, run, simulator, *settings, file=file)
+    began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    start = {"began": began, "command": command_line(), "settings": file, **describe_machine(jax.devices())}
+    with open(out / PROVENANCE, "a") as lines:
+        lines.write(json.dumps(start) + "\n")
 
 
 def write_settings(out: Path, run: Path, simulator: Simulator, *settings: Any, file: str = FILE) -> None:

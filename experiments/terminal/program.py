@@ -18,4 +18,7 @@ def run_sweep(axis: str) -> NoReturn:
 
 def command_line() -> str:
     """The command as typed, whichever way the program was started."""
-    return shlex.join([PROGRAM, *sys.argv[1:]])
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    module = spec.name if spec else ""
+    own = module.startswith("experiments.") and not module.startswith("experiments.cli")
+    return shlex.join([*(["python", "-m", module] if own else [PROGRAM]), *sys.argv[1:]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ import pytest
 
 from experiments.applications import own_policy
 from experiments.applications.settings_file import hash_of, pin_settings
+from experiments.running.machine import git_commit
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.config.base import later
 from hma_jax.config.json import completed, to_dict
@@ -46,6 +48,21 @@ def test_what_was_made_otherwise_is_refused_by_name(tmp_path):
     with pytest.raises(ConfigError, match="weights: "):
         pin_settings(out, Path("elsewhere/model"), other, SETTINGS)
     assert (out / "settings.json").read_text() == before
+
+
+def test_every_start_leaves_commit_machine_and_command_beside_the_settings(tmp_path, monkeypatch):
+    """Trials are added to a directory by later commits, and its settings do not say by which."""
+    monkeypatch.setattr(sys, "argv", ["somewhere/plan_actions.py", "runs/a model", "--out", "out"])
+    module = SimpleNamespace(__spec__=SimpleNamespace(name="experiments.applications.plan_actions"))
+    monkeypatch.setitem(sys.modules, "__main__", module)
+    for _ in range(2):
+        pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS)
+    with pytest.raises(ConfigError, match="search"):
+        pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS | {"search": {"candidates": 5}})
+    first, second = map(json.loads, (tmp_path / "provenance.jsonl").read_text().splitlines())
+    assert first["command"] == "python -m experiments.applications.plan_actions 'runs/a model' --out out"
+    assert first["commit"] == git_commit() and first["processor"] and first["settings"] == "settings.json"
+    assert second["began"] >= first["began"]
 
 
 def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(tmp_path):
