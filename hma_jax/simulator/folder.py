@@ -32,8 +32,9 @@ ROBOTS = "robots.json"
 TOKENIZER = "tokenizer"
 DECODE = "decode.json"
 
-DEFAULT_DECODE = DecodeConfig(sampler=SamplerConfig("dpm++", 12))
-"""How frames are decoded without a decode.json. Latents take fewer evaluations of the denoiser than in evaluation."""
+DEFAULT_DECODE = DecodeConfig(sampler=SamplerConfig("dpm++", 12, temperature=0.0))
+"""How frames are decoded without a decode.json: greedily, also latents, which take fewer evaluations of the denoiser
+than in evaluation."""
 
 
 def find_tokenizer(directory: Path, run: Run, given: Path | None) -> Tokenizer:

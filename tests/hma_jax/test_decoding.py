@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
+from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, SamplerConfig
 from hma_jax.generation import decoding
 from hma_jax.generation.decoding import Frame, masked_counts, sample_tokens, unmask
-from hma_jax.simulator.folder import DEFAULT_DECODE, change_decode
+from hma_jax.simulator.folder import DEFAULT_DECODE, change_decode, find_decode
 from tests.tiny import DIFFUSION, model_config
 
 
@@ -147,7 +147,14 @@ def test_frames_are_not_filled_in_ways_that_their_tokens_do_not_have(diffusion, 
 
 def test_a_temperature_is_that_of_token_ids_and_of_latents():
     """Asked for greedy frames, models on latents sampled theirs."""
-    greedy = change_decode(DEFAULT_DECODE, 0.0, unmask_steps=5, slide=None)
-    latents = replace(DEFAULT_DECODE.sampler, temperature=0.0)
-    assert greedy == replace(DEFAULT_DECODE, unmask_steps=5, temperature=0.0, sampler=latents)
+    warm = change_decode(DEFAULT_DECODE, 0.7, unmask_steps=5, slide=None)
+    latents = replace(DEFAULT_DECODE.sampler, temperature=0.7)
+    assert warm == replace(DEFAULT_DECODE, unmask_steps=5, temperature=0.7, sampler=latents)
     assert change_decode(DEFAULT_DECODE) == DEFAULT_DECODE
+
+
+def test_without_a_file_frames_are_decoded_greedily_as_they_are_judged(tmp_path):
+    """Ids were, but latents were sampled."""
+    found = find_decode(tmp_path)
+    assert found == change_decode(found, 0.0)
+    assert found.sampler.temperature == EvalConfig().decode.sampler.temperature
