@@ -25,9 +25,9 @@ def check(
     """Find action dimensions that a model ignores, or uses with the wrong sign, scale or position.
 
     Held-out windows are evaluated with the recorded actions, and again with one action dimension held constant,
-    negated, scaled or swapped with another. The table says how much each dimension is worth: by how many nats per
-    token the loss rises when it is held constant. Robots with too few held-out episodes are left out and listed.
-    Writes RUN/check.json.
+    negated, scaled or swapped with another. The table says how much each dimension is worth: by how much
+    the loss rises when it is held constant, in nats per token (of a model on latents: in units of its diffusion loss).
+    Robots with too few held-out episodes are left out and listed. Writes RUN/check.json.
 
     Args:
         run: Directory of a training run.
