@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from data_pipelines.publishing.files import publish
 from data_pipelines.registry import DatasetSpec
 from experiments.preparing.made_from import ORIGIN, MadeFrom, Step, differences, read_stamp, require_same
@@ -44,6 +46,9 @@ tokenizers."""
 
 JUDGED = "judged_on.json"
 """Beside a tokenizer that was given: by which frames it was judged, as the inputs of a stamp."""
+
+USUAL_STD = (0.5, 2.0)
+"""The standard deviations of latents that are taken for about 1; others are told."""
 
 
 def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
@@ -93,7 +98,8 @@ def judge_tokenizer(
     study: Study, workspace: Workspace, sources: Sequence[Source], *, threads: int | None = None
 ) -> None:
     """How well the workspace's tokenizer, which was given, reconstructs frames that the study holds out: said, and
-    written beside it; nothing is done if it was judged by the same frames. `threads` as in `make_frame_loader`."""
+    written beside it; nothing is done if it was judged by the same frames. A note tells latents of an unusual scale.
+    `threads` as in `make_frame_loader`."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     place, sources = workspace.tokenizer, seen(study, sources)
@@ -106,7 +112,14 @@ def judge_tokenizer(
     held_out = make_frames(study, sources, tokenizer.image_size, split="val", threads=threads)
     with step("judge the tokenizer") as update:
         quality = reconstruction_psnr(tokenizer, held_out, lambda done, total: update(done, total, "frames"))
+        std = float(np.std(tokenizer.encode(next(held_out)), dtype=np.float64)) if tokenizer.channels else 1.0
     save_quality(quality, place)
+    if not USUAL_STD[0] <= std <= USUAL_STD[1]:
+        say(
+            f"note: the tokenizer's latents have a standard deviation of {std:.3g} in held-out frames, but a model expects "
+            "about 1: it learns others badly, and generates none beyond model.diffusion.clip. Let the tokenizer divide its "
+            'latents by it (docs/own_data.md, "Your own tokenizer")'
+        )
     MadeFrom(frames).save(place, JUDGED)
 
 

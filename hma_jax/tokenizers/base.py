@@ -27,6 +27,9 @@ from hma_jax.runtime.sharding import BATCH, replicated
 PIECE = 64
 """Images per call of a jitted encoder or decoder; smaller batches are padded to it."""
 
+LARGEST_LATENT = float(np.finfo(np.float16).max)
+"""Token stores keep latents in half precision, where a larger one would be infinite."""
+
 PIXELS = 2**18
 """Pixels that go through a large network at once: four images of 256 x 256."""
 
@@ -168,7 +171,7 @@ class Tokenizer(abc.ABC):
     def require_tokens(self, tokens: np.ndarray, what: str, advice: str) -> None:
         """Raises ConfigError, which begins with `what` made them and ends with `advice`, for values that are no tokens.
         Compiled programs do not look: what they make is checked where it comes to the host."""
-        wanted = "finite numbers" if self.channels else f"in [0, {self.vocab_size})"
+        wanted = f"finite numbers within ±{LARGEST_LATENT:,.0f}" if self.channels else f"in [0, {self.vocab_size})"
         require(
             self._are_tokens(tokens),
             f"{what} gives values from {tokens.min()} to {tokens.max()}; tokens must be {wanted}{advice}",
@@ -176,7 +179,7 @@ class Tokenizer(abc.ABC):
 
     def _are_tokens(self, values: np.ndarray) -> bool:
         if self.channels:
-            return bool(np.isfinite(values).all())
+            return bool((np.abs(values) <= LARGEST_LATENT).all())  # NaN is not
         return bool(0 <= values.min(initial=0) and values.max(initial=0) < self.vocab_size)
 
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
@@ -207,7 +210,7 @@ class Tokenizer(abc.ABC):
             f"got {tokens.dtype} {list(tokens.shape)}",
         )
         tokens = tokens.astype(np.float32)
-        require(self._are_tokens(tokens), "latents are not finite; did the model diverge?")
+        require(bool(np.isfinite(tokens).all()), "latents are not finite; did the model diverge?")
         return tokens
 
     # --- Devices -----------------------------------------------------------------------------

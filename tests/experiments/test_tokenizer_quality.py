@@ -11,6 +11,7 @@ import pytest
 
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.sampling.splits import HeldOut
+from experiments.preparing import given_tokenizer
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import MadeFrom
 from experiments.preparing.tokenizer import reconstruction_psnr
@@ -114,3 +115,25 @@ def test_a_tokenizer_is_trained_on_what_the_store_does_not_hold_out_and_judged_o
         expected = {"held_out": held_out} | kept | same | {"split": split, "start_step": start}
         assert {name: getattr(loader, name) for name in expected} == expected
     assert judged == [test]
+
+
+@pytest.mark.parametrize(
+    ("channels", "scale", "said"),
+    [
+        (3, 1.0, ""),
+        (3, 5.5, "note: the tokenizer's latents have a standard deviation of 5.5"),
+        (3, 0.01, "standard deviation of 0.01 in"),
+        (0, 5.5, ""),  # ids
+    ],
+)
+def test_latents_of_an_unusual_scale_are_told(channels, scale, said, tmp_path, monkeypatch, capsys):
+    """Models of them were trained in vain, without a word."""
+    tokenizer = SimpleNamespace(channels=channels, image_size=8, encode=lambda signs: scale * signs)
+    monkeypatch.setattr("hma_jax.tokenizers.io.load_tokenizer", lambda _: tokenizer)
+    monkeypatch.setattr(given_tokenizer, "make_frames", lambda *_, **__: iter([np.float32([-1, 1])]))
+    monkeypatch.setattr(given_tokenizer, "reconstruction_psnr", lambda *_: Stat(20.0, 0.1, 8, 2))
+    workspace = Workspace(tmp_path)
+    workspace.tokenizer.mkdir()
+    given_tokenizer.judge_tokenizer(SMOKE, workspace, [])
+    told = " ".join(capsys.readouterr().out.split())
+    assert said in told and ("standard deviation" in told) == bool(said)

@@ -260,6 +260,16 @@ def test_latents_of_a_model_that_are_no_numbers_are_no_fault_of_the_decoder(tmp_
     assert np.asarray(jax.jit(tokenizer.decode_fn)({}, latents)).mean((1, 2, 3)).tolist() == [128, 0]
 
 
+def test_latents_that_the_store_cannot_hold_are_refused(tmp_path, bright):
+    """They were stored as infinite ones."""
+    np.save(bright / "gain.npy", np.float32(1e5))
+    for folder in (write(tmp_path / "mine", HOST, it=("/ 128", "* 1e5")), bright):
+        with pytest.raises(
+            ConfigError, match="encode gives values from .* to .*; tokens must be finite numbers within ±65,504"
+        ):
+            try_out(PythonTokenizer(None, folder))
+
+
 def test_images_of_jax_code_must_be_numbers(bright):
     write(bright, JAX, it=('tokens / params["gain"]', 'tokens / params["gain"] * np.float32([1, 1, np.nan])'))
     with pytest.raises(ConfigError, match="decode gives values that are not finite in 2 of 2 images"):
