@@ -12,7 +12,8 @@ from experiments.cli.arguments import ReplaceArguments, ReplaceOptions, RunningA
 from experiments.preparing.made_from import Step
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.study_setup import StudyArguments, StudySetup, make_setup
-from experiments.sweeps.registry import AXES, is_file, plan_asked
+from experiments.sweeps.registry import AXES, is_file, join_axes, plan_asked, plan_sweeps
+from experiments.sweeps.sweep import unique_trials
 from experiments.terminal.progress import console
 from hma_jax.config import ConfigError, require
 
@@ -112,7 +113,8 @@ def _dry_run(
     from experiments.dry_run.plan_table import Devices, plan_table
     from experiments.dry_run.trainable import check_launched
     from experiments.preparing.sources import check_entries
-    from experiments.run_study import find_earlier
+    from experiments.run_study import find_earlier, require_agreement
+    from experiments.running.provenance import trial_closure
 
     study, given = setup.study, bool(setup.data)
     sweeps = plan_asked(study, axes, setup.workspace.root)
@@ -126,4 +128,8 @@ def _dry_run(
     console.print(plan_table(study, sweeps, devices, given=given, trained=setup.tokenizer is None, done=done))
     say_notes(setup, sweeps, launcher_options)
     with refusal_as_note():
-        find_earlier(setup, sweeps, replace)
+        earlier = find_earlier(setup, sweeps, replace)
+        every = join_axes(study, setup.workspace.root, earlier.axes if earlier else (), axes)
+        planned = plan_sweeps(study, tuple(every.values()))
+        shown, asked = (unique_trials(some, done.provenance) for some in (planned, sweeps))
+        require_agreement(setup.workspace, shown, asked, trial_closure(), running.accept_code)

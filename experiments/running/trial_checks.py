@@ -67,9 +67,10 @@ def require_one_closure(trials: Path, ids: Iterable[str], now: Closure | None, a
             "this study would contain trials that ran different versions of the code:\n  "
             + "\n  ".join(describe(groups))
             + (
-                "\nNothing was run. If the change alters no result, add --accept-code: the report then says how many "
-                "versions ran. If it does, raise RESULTS_VERSION (experiments/running/results_version.py): trials of "
-                "the earlier version then run again. Or go back to the earlier code"
+                "\nNothing was run. CHANGELOG.md says what has to be made again after an update. If the change alters no "
+                "result, add --accept-code: the report then says how many versions ran. If it does and is your own, raise "
+                "RESULTS_VERSION (experiments/running/results_version.py): trials of the earlier version then run "
+                "again. Or go back to the earlier code"
             )
         )
 

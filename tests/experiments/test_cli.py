@@ -331,6 +331,20 @@ def test_a_study_remembers_the_command_that_runs_all_of_it(no_trials, tmp_path, 
     assert load_record(Workspace(tmp_path / "plain")).command == "hma study --preset smoke --out plain"
 
 
+def test_a_dry_run_says_that_trials_ran_other_sources_as_the_command_does(no_trials, tmp_path, capsys):
+    """Those of its other axes too; the command says so only once all is prepared."""
+    study = make_setup(StudyArguments("smoke", tmp_path)).study
+    finished_study(tmp_path, study, axes=("settings",))  # by sources that are not these
+    save_record(Workspace(tmp_path), record_of(study, ("settings",)))
+    command = ["sweep", "conditioning", "--preset", "smoke", "--out", str(tmp_path)]
+    for options, refused in (([], True), (["--accept-code"], False)):
+        assert main([*command, *options, "--dry-run"]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("this command would be refused: " in said) == ("to be run; differs in experiments" in said) == refused
+        assert ("CHANGELOG.md" in said) == refused
+    assert main(command) == 2 and "CHANGELOG.md" in capsys.readouterr().err
+
+
 def test_a_refused_command_leaves_the_axes_of_a_study_alone(no_trials, tmp_path, monkeypatch):
     path, out = tmp_path / "mine.py", tmp_path / "out"
     path.write_text("from dataclasses import replace\nfrom experiments.sweeps import settings\n"
