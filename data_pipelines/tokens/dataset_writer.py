@@ -31,12 +31,18 @@ from data_pipelines.tokens.part_files import Part, PartFacts, read_part
 from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, locks_of
 from data_pipelines.tokens.row_sample import merge_samples
 from hma_jax.config import ConfigError, require
-from hma_jax.config.json import diff, stable_hash, to_dict
+from hma_jax.config.json import diff, identity_of, stable_hash
 from hma_jax.runtime.files import IO_ERRNOS
 from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
 """Bytes of records in one part, which is the most work that a killed process loses."""
+
+FORMERLY_NAMED = frozenset(
+    "rate angles angle_form angle_unit episodes median_steps mean_steps val_split image_corrections joins "
+    "max_val_fraction action_quantiles runs recipe".split()
+)
+"""Fields that earlier versions hashed with any value; a field that is added is none of them."""
 
 
 def write_dataset(
@@ -135,10 +141,9 @@ def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
 
 
 def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
-    """Where the parts of a plan are made: where an earlier version began to, whose name for it hashes all fields, if it
-    did."""
-    job = [plan, list(parts)]
-    work, former = (root / f".{plan.spec.name}.{stable_hash(named)[:12]}" for named in (job, to_dict(job)))
+    """Where the parts of a plan are made: where an earlier version began to, if it did."""
+    hashes = (stable_hash(identity_of([plan, list(parts)], named))[:12] for named in ((), FORMERLY_NAMED))
+    work, former = (root / f".{plan.spec.name}.{hash}" for hash in hashes)
     return former if former.exists() else work
 
 

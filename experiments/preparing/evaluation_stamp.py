@@ -3,7 +3,7 @@ replace them unless that is asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 STAMP = "evaluation.made_from.json"
+
+FORMERLY_NAMED = frozenset(
+    "weight_cap time_shift recall chain_factors own_past_rounds displaced_past change_weight matrices".split()
+)
+"""Fields that earlier versions hashed with any value; a field that is added is none of them."""
 
 
 def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedData, config: EvalConfig) -> MadeFrom:
@@ -35,7 +40,7 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
         for name in names
     }
     inputs = {
-        "model": _hash_model(trained, identity_of),
+        "model": _hash_model(trained),
         "weights": trained.weights,
         "tokenizer": prepared.tokenizer.identity,
         "frames": prepared.manifest.frames,
@@ -50,10 +55,11 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
     return MadeFrom(inputs, recorded)
 
 
-def _hash_model(trained: Run, plain: Callable[[Any], Any]) -> str:
-    """A hash of what a run was trained to be, whatever its number of steps; `plain` writes its settings as JSON."""
-    train = {key: value for key, value in plain(trained.train).items() if key != "steps"}
-    return stable_hash({"model": plain(trained.model), "train": train, "provenance": trained.provenance})
+def _hash_model(trained: Run, named: Collection[str] = ()) -> str:
+    """A hash of what a run was trained to be, whatever its number of steps."""
+    model, train = (identity_of(config, named) for config in (trained.model, trained.train))
+    del train["steps"]
+    return stable_hash({"model": model, "train": train, "provenance": trained.provenance})
 
 
 def require_same_evaluation(place: Path, wanted: MadeFrom, trained: Run) -> None:
@@ -61,7 +67,8 @@ def require_same_evaluation(place: Path, wanted: MadeFrom, trained: Run) -> None
     existing = read_stamp(place, STAMP)
     if existing is not None:
         known = existing.inputs | {"eval": _protocol(existing.inputs.get("eval", {}))}
-        if known.get("model") == _hash_model(trained, to_dict):  # as earlier versions wrote it: of all fields
+        formers = (FORMERLY_NAMED, FORMERLY_NAMED - {"displaced_past"})  # the first versions did not have this one
+        if known.get("model") in [_hash_model(trained, named) for named in formers]:
             known["model"] = wanted.inputs["model"]
         lines = differences(known, wanted.inputs)
     else:

@@ -13,6 +13,7 @@ import json
 import sys
 import types
 import typing
+from collections.abc import Collection
 from typing import Any, Literal
 
 from hma_jax.config.base import BEFORE, require, require_choice
@@ -23,28 +24,30 @@ INFINITE = ("Infinity", "-Infinity")
 
 def to_dict(config: Any) -> Any:
     """Plain JSON types from a config (dataclasses, tuples and scalars, nested)."""
-    return _plain(config, whole=True)
+    return _plain(config)
 
 
-def identity_of(config: Any) -> Any:
+def identity_of(config: Any, named: Collection[str] = ()) -> Any:
     """What `config` is called and compared by: `to_dict` without the fields that came later (`base.later`) where they
-    have the value that computes what was computed before. Equal for equal results, whatever fields are added."""
-    return _plain(config, whole=False)
+    have the value that computes what was computed before. Equal for equal results, whatever fields are added. Fields
+    `named` stay with any value, as in names that earlier versions gave."""
+    return _plain(config, named)
 
 
-def _plain(config: Any, whole: bool) -> Any:
+def _plain(config: Any, named: Collection[str] | None = None) -> Any:
+    """`named` None: with all fields."""
     if config is None or isinstance(config, (str, int, float)):  # most of what there is
         return config
     if dataclasses.is_dataclass(config):
-        values = {f.name: _plain(getattr(config, f.name), whole) for f in dataclasses.fields(config)}
-        for f in () if whole else dataclasses.fields(config):
-            if BEFORE in f.metadata and values[f.name] == _plain(f.metadata[BEFORE], whole):
+        values = {f.name: _plain(getattr(config, f.name), named) for f in dataclasses.fields(config)}
+        for f in () if named is None else dataclasses.fields(config):
+            if BEFORE in f.metadata and f.name not in named and values[f.name] == _plain(f.metadata[BEFORE], named):
                 del values[f.name]
         return values
     if isinstance(config, (tuple, list)):
-        return [_plain(v, whole) for v in config]
+        return [_plain(v, named) for v in config]
     if isinstance(config, dict):
-        return {k: _plain(v, whole) for k, v in config.items()}
+        return {k: _plain(v, named) for k, v in config.items()}
     return config
 
 

@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,15 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.output_lock import lock_output
+from data_pipelines.registry import DatasetSpec
 from data_pipelines.tokens import dataset_writer
 from data_pipelines.tokens.beside import beside
 from data_pipelines.tokens.dataset_writer import cut_parts
 from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, read_moments
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
-from hma_jax.config.json import stable_hash, to_dict
+from hma_jax.config.base import later
+from hma_jax.config.json import identity_of, to_dict
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.tokens.job_process import SPEC, contents, run, start
 
@@ -83,10 +86,18 @@ def test_finished_parts_are_not_made_again(rlds, tmp_path):
 
 
 def test_what_an_earlier_version_began_is_finished(rlds, undisturbed, tmp_path, monkeypatch):
-    """Its name for the same job was of all fields of the plan, also those that came later."""
-    monkeypatch.setattr(dataset_writer, "stable_hash", lambda job: stable_hash(to_dict(job)))
+    """Its name for the same job was of all fields that the plan had then, whatever is added to it."""
+
+    @dataclass(frozen=True)
+    class More(DatasetSpec):
+        added: float = later(0.0)
+
+    def with_one_more(job, named):
+        return identity_of([replace(job[0], spec=More(**vars(job[0].spec))), job[1]], named)
+
+    monkeypatch.setattr(dataset_writer, "identity_of", lambda job, _: to_dict(job))
     begin(rlds, tmp_path)
-    monkeypatch.undo()
+    monkeypatch.setattr(dataset_writer, "identity_of", with_one_more)
     first = []
     run(rlds, tmp_path, progress=lambda done, total: first.append(done))
     assert first[0] >= 6 and contents(tmp_path) == undisturbed
