@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.applications.check import choose_robots, shortage, verdict
+from experiments.applications.check import check_run, choose_robots, shortage, verdict
 from experiments.cli.check import check
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
-from hma_jax.evaluation.effects import Difference, Effect
+from hma_jax.evaluation.effects import Change, Difference, Effect
+from hma_jax.model.embodiments import EmbodimentTable
 from tests.data_pipelines.windows.test_evalset import small_store
 from tests.experiments.applications.runs import make_run
 
@@ -93,3 +97,43 @@ def test_a_policy_has_no_frames_to_be_judged(tmp_path):
 @pytest.mark.parametrize(("sem", "said"), [(0.034, "no effect found"), (0.004, "as recorded")])
 def test_a_dimension_with_too_little_data_is_not_called_ignored(sem, said):
     assert verdict(Effect(0, Difference(0.039, sem, 8), None, None), ["x"]) == said
+
+
+def test_every_window_is_judged_under_its_own_actions_in_the_order_in_which_they_are_executed(tmp_path, monkeypatch):
+    """The fixture's tokens and actions both say (episode, step). Another robot of the model has wider actions."""
+    store = small_store(tmp_path, lengths=(20,) * 40, min_val=10)
+    (toy,) = store.embodiment_table(("toy",), rate=1.0).entries
+    table = EmbodimentTable((replace(toy, name="wide", action_dim=5, mean=(9.0,) * 5, std=(1.0,) * 5), toy))
+
+    def differing(params, batch, rows):
+        """Per window: by how much the actions differ from those that its tokens were recorded with."""
+        executed = 256 * rows[..., [0, 3]] + rows[..., [1, 4]]  # of the two native steps of a frame
+        recorded = batch["tokens"][..., :1] + jnp.arange(2)
+        return jnp.abs(executed - recorded).sum((1, 2)) + jnp.abs(rows[..., 6:]).sum((1, 2))
+
+    monkeypatch.setattr("experiments.applications.check.make_loss", lambda *_: differing)
+    monkeypatch.setattr("experiments.applications.check.find_effects", lambda *given: given)
+    run = SimpleNamespace(train=TrainConfig())
+    model = SimpleNamespace(config=None, table=table, run=run, execution=None, params=None)
+    prepared = SimpleNamespace(store=store, manifest=freeze_manifest(store, ("toy",), 4, 64, 0, rate=1.0))
+    judge, actions, mean, episode = check_run(tmp_path, model, prepared, ["toy"], 64)["toy"]
+    ((_, frozen),) = ((d.dataset, d.windows) for d in prepared.manifest.datasets)
+    assert episode == [store.manifest("toy").val.episodes[i] for i, _ in frozen] and len(frozen) > 16  # two batches
+    assert actions.shape[1:] == (4, 2, 3)
+    np.testing.assert_allclose(mean, toy.mean, rtol=1e-6)
+    assert judge(actions).tolist() == [0] * len(frozen)
+    assert judge(actions + np.array([0, 1, 0], np.float32)).tolist() == [4 * 2] * len(frozen)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (Change(0, "negated"), ["negated"]),
+        (Change(0, "scaled", 10.0), ["about 10 times too small"]),  # the frames fit ten times what was given
+        (Change(0, "scaled", 1 / 3), ["about 3 times too large"]),
+        (Change(0, "swapped", other=1), ["swapped with y", "swapped with x"]),
+    ],
+)
+def test_a_verdict_says_what_is_wrong_with_the_actions(change, said):
+    sure = Difference(-1.0, 0.1, 8)
+    assert [verdict(Effect(d, sure, change, sure), ["x", "y"]) for d in change.dimensions] == said
