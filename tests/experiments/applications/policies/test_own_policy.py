@@ -69,6 +69,10 @@ def test_windows_are_parts_of_episodes_with_the_actions_given_at_their_frames():
         assert actions.shape == (model.config.frames, 14) and len(at) == model.config.frames
         for part in (actions[:, :7], actions[:, 7:]):
             np.testing.assert_array_equal(part, demos.actions[episode, at])
+    ends = {
+        int(window[-1, 0]) % 100 for batch, _ in zip(make(0), range(20), strict=False) for window in batch["tokens"]
+    }
+    assert ends == set(range(model.config.frames - 1, 6))
 
 
 def test_heads_are_added_and_nothing_else_changes():

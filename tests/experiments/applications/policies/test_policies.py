@@ -10,14 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipelines.suite.simulator import SuiteSimulator, suite_robot
+from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot
+from data_pipelines.suite.tasks import Reach
 from data_pipelines.suite.world import World
 from experiments.applications.judging.rollouts import run
 from experiments.applications.policies import RandomPolicy, diffusion, find_task, load_policy, record, save_policy
-from experiments.applications.policies.acting import Scale, scale_of
+from experiments.applications.policies.acting import Scale, make_examples, scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
 from experiments.applications.policies.closed_loop import goal_distance, run_policy, start_seeds
-from experiments.applications.policies.demonstrations import load_demonstrations, save_demonstrations
+from experiments.applications.policies.demonstrations import Demonstrations, load_demonstrations, save_demonstrations
 from experiments.applications.policies.diffusion import (
     DiffusionConfig,
     DiffusionPolicy,
@@ -67,6 +68,24 @@ def test_experts_succeed_more_often_than_play_and_their_episodes_end_soon_after(
 def test_only_successes_are_recorded_where_that_is_asked(demos):
     found = record(TASK, 10, noise=0.4, image_size=8, only_successes=True, seed=3)
     assert len(found) == 10 == len(set(found.seeds.tolist())) and found.successes.all()
+
+
+def test_as_many_are_recorded_as_were_asked_for_where_noises_share_them_unevenly():
+    found = record(TASK, 3, noise=(0.0, 0.4), image_size=8, seed=3)
+    assert len(found) == 3 == len(set(found.seeds.tolist()))
+
+
+def test_an_example_is_the_frames_seen_and_the_actions_from_there_on():
+    """Padding, whose actions are 0, is no part of it nor of the scale."""
+    images, actions = np.zeros((2, 3, 8, 8, 3), np.uint8), np.array([[[1], [2], [3]], [[11], [12], [0]]], np.float32)
+    known = np.zeros((2, 3), bool), np.zeros(2, bool), np.zeros(2, np.int64)
+    demos = Demonstrations(images, actions, np.array([3, 2]), *known)
+    scale, examples = scale_of(demos), make_examples(demos, frames=2, chunk=2, size=8)
+    assert (scale.mean, scale.low, scale.high) == ((pytest.approx(5.8),), (1,), (12,))
+    assert examples["episode"].tolist() == [0, 0, 0, 1, 1]
+    assert examples["seen"].tolist() == [[0, 0], [0, 1], [1, 2], [0, 0], [0, 1]]
+    expected = [[1, 2], [2, 3], [3, 3], [11, 12], [12, 12]]
+    np.testing.assert_allclose(examples["chunk"] * scale.std[0] + scale.mean[0], expected, rtol=1e-6)
 
 
 def test_demonstrations_are_kept_in_a_file(demos, tmp_path):
@@ -127,6 +146,16 @@ def test_whole_chunks_of_a_policy_are_executed_action_by_action():
     )
     np.testing.assert_array_equal(held.images, repeated.images)
     assert held.actions.shape == (2, 4, 4) and (held.images != made.images).any()
+
+
+@pytest.mark.parametrize("name", ["own", "reach"])
+def test_the_distance_from_a_goal_is_that_of_the_farthest_tool(name):
+    robot = next(r for r, spec in SPECS.items() if len(spec.body.tools) == 2 and isinstance(spec.task, Reach))
+    task = find_task(robot, name)
+    world = World(task.spec, start_seeds(task, 3))
+    away = np.linalg.norm(world.tools - world.goals, axis=-1)
+    assert away.shape == (3, 2) and (np.ptp(away, axis=1) > 0).all()
+    np.testing.assert_array_equal(goal_distance(world), away.max(1))
 
 
 def test_cloning_learns_and_is_a_function_of_its_seed(demos):
@@ -197,6 +226,27 @@ def test_an_episode_that_begins_anew_forgets_its_past_and_the_others_keep_theirs
     assert [len(left) for left in policy._left] == [2, 1]
 
 
+def test_a_new_chunk_is_planned_when_as_many_actions_as_configured_were_executed(monkeypatch, demos):
+    config, planned = BcConfig(encoder=SMALL, chunk=3, execute=2), []
+    policy = ClonedPolicy(config, {}, Scale((0.0,), (1.0,), (0.0,), (99.0,)))
+    monkeypatch.setattr(policy, "plan", lambda *_: planned.append(0) or np.arange(3.0)[None] + 10 * len(planned))
+    assert [policy.act(demos.images[:1, 0]).item() for _ in range(5)] == [10, 11, 20, 21, 30]
+
+
+def test_what_a_diffusion_policy_draws_depends_on_seed_and_step(demos):
+    config = DiffusionConfig(encoder=SMALL, frames=1, chunk=1, execute=1, samples=2)
+    policy = DiffusionPolicy(config, init_diffusion(config, 4, 0), scale_of(demos))
+
+    def act(*seeds: int) -> list[np.ndarray]:
+        policy.reset(seeds=seeds)
+        return [policy.act(demos.images[[0, 0], 0]) for _ in range(2)]
+
+    (first, second), again, (exchanged, _) = act(1, 2), act(1, 2), act(2, 1)
+    np.testing.assert_array_equal([first, second], again)
+    np.testing.assert_array_equal(exchanged, first[::-1])
+    assert (first[0] != first[1]).any() and (first != second).any(1).all()
+
+
 def test_random_actions_depend_on_the_seed_of_an_episode_alone():
     policy, images = RandomPolicy(ROBOT, hold=2), np.zeros((2, 8, 8, 3), np.uint8)
     policy.reset(seeds=[1, 2])
@@ -235,6 +285,50 @@ def test_a_denoiser_learns_the_noise_or_the_chunk_as_its_config_says(monkeypatch
     assert losses[0] == 0 and losses[1] == pytest.approx(1, abs=0.1)
     with pytest.raises(ConfigError, match="predicts: .velocity. is not allowed; choose one of noise, chunk"):
         DiffusionConfig(predicts="velocity")
+
+
+def test_the_share_of_signal_falls_as_a_squared_cosine():
+    """Nichol and Dhariwal 2021, equation 17; saved policies were trained with it."""
+    at = (np.arange(5) / 4 + 0.008) / 1.008 * np.pi / 2
+    np.testing.assert_allclose(diffusion.signal(4)[:3], (np.cos(at) ** 2 / np.cos(at[0]) ** 2)[1:4], rtol=1e-5)
+    assert diffusion.signal(4)[3] == np.float32(1e-4)
+
+
+def test_limits_of_a_chunk_are_those_of_each_action_in_turn():
+    scale = Scale((0.0, 1.0), (1.0, 2.0), (-1.0, -3.0), (2.0, 5.0))
+    of = lambda limits: diffusion.bounds(DiffusionConfig(chunk=2, limits=limits), scale).tolist()  # noqa: E731
+    assert of("range") == [[-1, -2, -1, -2], [2, 2, 2, 2]]
+    assert of("spread") == [[-3] * 4, [3] * 4]
+
+
+@pytest.mark.parametrize("given", [0.5, 9.0], ids=["within the limits", "beyond them"])
+def test_noise_is_added_in_training_as_drawing_takes_it_away(monkeypatch, demos, given):
+    """Who knows all chunks knows the noise: those beyond the limits are learnt as the limit, here 3."""
+    config = DiffusionConfig(encoder=SMALL, limits="spread", fit=FitConfig(steps=1, batch=16))
+    kept, examples, losses = jnp.asarray(diffusion.signal(config.levels)), diffusion.make_examples, []
+
+    def exact(params, seen, noised, level):
+        share = kept[level.astype(int)][:, None]
+        return (noised - jnp.sqrt(share) * min(given, diffusion.SPREAD)) / jnp.sqrt(1 - share)
+
+    def alike(*asked):
+        made = examples(*asked)
+        return made | {"chunk": np.full_like(made["chunk"], given)}
+
+    monkeypatch.setattr(diffusion, "denoise", exact)
+    monkeypatch.setattr(diffusion, "make_examples", alike)
+    train_diffusion(demos, config, 0, lambda done, total, note: losses.append(float(note.split()[1])))
+    assert losses == [pytest.approx(0, abs=1e-3)]
+
+
+def test_drawing_begins_at_the_strongest_noise_and_ends_at_the_weakest(monkeypatch):
+    """A denoiser says the level here, and what it says last is drawn."""
+    monkeypatch.setattr(diffusion, "denoise", lambda params, seen, noised, level: 0 * noised + level[:, None])
+    frames, limits = jnp.zeros((1, 2, 8, 8, 3)), np.array([[-200.0], [200.0]]) * np.ones(16)
+    for samples, last in ((1, 99), (2, 0)):
+        config = DiffusionConfig(encoder=SMALL, samples=samples, predicts="chunk")
+        drawn = diffusion.draw(init_diffusion(config, 4, 0), config, frames, jnp.ones((1, 16)), limits)
+        np.testing.assert_allclose(drawn, np.full((1, 16), last), atol=1e-4)
 
 
 def test_an_action_that_is_demonstrated_seldom_can_be_given(monkeypatch, demos):
