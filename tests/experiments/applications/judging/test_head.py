@@ -1,0 +1,38 @@
+"""What a success head is trained on, and what it is asked."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from experiments.applications.judging import head as of_head
+from experiments.applications.judging.head import HeadConfig, SuccessHead, fit_heads, train_head
+from experiments.applications.policies.network import EncoderConfig
+
+CONFIG = HeadConfig(encoder=EncoderConfig(8, (4, 4, 4), 8))
+
+
+def test_a_head_is_trained_and_asked_with_the_first_frame_before_the_present_one(monkeypatch):
+    """Every fourth pair is learnt as the tokenizer shows it, here by 100 brighter."""
+    levels = np.arange(12, dtype=np.uint8).reshape(2, 6)
+    images = np.broadcast_to(levels[..., None, None, None], (2, 6, 8, 8, 3)).copy()
+    lengths = np.array([6, 5])
+    steps = np.nonzero(np.arange(6) < lengths[:, None])
+    demos = SimpleNamespace(images=images, reached=levels > 2, steps=lambda: steps)
+    monkeypatch.setattr(of_head, "fit_heads", lambda *given: {CONFIG.fit.steps: given})
+    pairs, labels, *_ = train_head(demos, CONFIG, 0, lambda shown: shown + 100, lambda *_: None)
+    first, present = pairs[:, :, 0, 0, 0].T.tolist()
+    brighter = [100 * (i % 4 == 0) for i in range(11)]
+    assert present == np.add(np.arange(11), brighter).tolist() and labels.tolist() == (np.arange(11) > 2).tolist()
+    assert first == np.add([0] * 6 + [6] * 5, brighter).tolist()
+
+    asked = SuccessHead(CONFIG, {})
+    asked.predict_pairs = lambda pairs: pairs[:, 1, 0, 0, 0] - 10.0 * pairs[:, 0, 0, 0, 0]
+    np.testing.assert_array_equal(asked.probabilities(images, images[:, :1]), levels - 10.0 * levels[:, :1])
+
+
+def test_frames_with_success_weigh_as_much_together_as_those_without(monkeypatch):
+    monkeypatch.setattr(of_head, "fit", lambda params, loss, data, *_: {0: data})
+    monkeypatch.setattr(of_head, "SuccessHead", lambda config, data: data)
+    labels = np.array([True, False, False, False, False])
+    data = fit_heads(np.zeros((5, 2, 8, 8, 3), np.uint8), labels, CONFIG, 0, lambda *_: None)[0]
+    np.testing.assert_allclose(data["weight"], [2.5, 0.625, 0.625, 0.625, 0.625])
