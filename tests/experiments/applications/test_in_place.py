@@ -106,6 +106,8 @@ def test_false_detections_are_told_apart_by_why_nothing_is_seen():
     assert kinds == {
         "ghosts_absent": 0.0, "absent": 20, "ghosts_hidden": 1.0, "hidden": 3, "ghosts_partly": 1.0, "partly": 1,
     }  # fmt: skip
+    # What is in sight it places exactly and does not report.
+    assert [objects[name] for name in ("frames", "found", "within_2px", "median_px")] == [6, 0, 0, 0]
 
 
 def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monkeypatch):

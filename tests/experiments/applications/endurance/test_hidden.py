@@ -81,3 +81,33 @@ def test_a_row_says_how_far_its_object_moved_since_it_was_last_seen():
     event = hidden.Event("control", episode, 3, point, 0, lag)
     (row,) = hidden.judge(simulator, detector, spec, rollout, [event])
     assert row["moved_px"] == pytest.approx(far[episode].max()) and row["moved_px"] > 4
+
+
+def test_the_model_is_judged_at_the_end_of_each_event_under_the_actions_recorded_until_then():
+    """Events of different lengths are made in one batch."""
+    spec, points = SPECS[ROBOT.name], len(point_names(SPECS[ROBOT.name]))
+    rollout, given = simulate(spec, episode_seeds(spec, 2, 0, "val")), []
+
+    def show(made: int) -> np.ndarray:
+        return np.full((2, 64, 64, 3), made, np.uint8)
+
+    def step(actions: list[np.ndarray]) -> np.ndarray:
+        given.append(np.stack(actions))
+        return show(len(given))
+
+    def detect(robot: str, images: np.ndarray) -> Detections:
+        return Detections(np.zeros((1, points, 2)), np.full((1, points), images[0, 0, 0, 0] / 255))
+
+    starts = []
+    simulator = SimpleNamespace(
+        robots={ROBOT.name: ROBOT}, tokenizer=SimpleNamespace(image_size=64), step=step,
+        reset=lambda these, **_: starts.extend(these) or show(0),
+    )  # fmt: skip
+    events = [hidden.Event("hidden", 0, 3, 1, 2, 4), hidden.Event("control", 1, 5, 1, 0, 7)]
+    rows = hidden.judge(simulator, SimpleNamespace(detect=detect), spec, rollout, events)
+    assert [row["confidence"] for row in rows] == [4 / 255, 7 / 255]
+    assert [(len(start.images), len(start.actions)) for start in starts] == [(4, 3), (6, 5)]
+    for b, event in enumerate(events):
+        recorded = rollout.actions[event.episode, event.start : event.start + event.lag]
+        executed = np.stack(given)[: event.lag, b]
+        np.testing.assert_array_equal(executed, ROBOT.clip_to_range(recorded, "clip")[0])

@@ -84,17 +84,18 @@ def test_a_robot_that_is_turned_otherwise_still_steers():
 
 
 def test_rows_are_of_whole_parts_and_are_read_again(tmp_path):
-    films = {"a": film(), "b": film(psnr=np.full(N, 24.0))}
+    films = {"a": film(), "b": film(psnr=np.full(N, 24.0)), "c": film()}
     save_films(films, tmp_path / "x" / "films.npz")
     again = load_films(tmp_path / "x" / "films.npz")
     for f in dataclasses.fields(Film):
         np.testing.assert_allclose(getattr(again["b"], f.name), getattr(films["b"], f.name), rtol=1e-6)
-    rows = rows_of("v", "behaviour", 0, again, {"a": 4.0, "b": 6.0}, {"a": 1, "b": 1}, seconds=10.0)
+    rows = rows_of("v", "behaviour", 0, again, {"a": 4.0, "b": 6.0, "c": 7.0}, dict.fromkeys("abc", 1), seconds=10.0)
     assert [r["part"] for r in rows if r["robot"] == "a"] == [1, 2, 3, 4, 5]
     assert [r["part"] for r in rows if r["robot"] == "b"] == [1, 2, 3]  # 20 frames of 60 are left: too few
-    write_rows(tmp_path / "rows.csv", rows)
+    assert [r["part"] for r in rows if r["robot"] == "c"] == [1, 2, 3]  # 60 of 70 are not
+    write_rows(tmp_path / "rows.csv", [r for r in rows if r["robot"] != "c"])
     mean, half, n = over_robots([r for r in read_rows(tmp_path / "rows.csv") if r["part"] == 1], "psnr")
-    assert (mean, n) == (22.0, 2) and half > 4  # of two robots little is known
+    assert (mean, n) == (22.0, 2) and half == pytest.approx(12.7062 * 2, rel=1e-5)  # of two robots little is known
 
 
 def test_a_drive_too_short_for_a_row_is_refused_before_it_is_made(monkeypatch):
@@ -136,3 +137,8 @@ def test_events_are_of_what_vanishes_and_comes_back():
     assert [(e.episode, e.start, e.gone, e.lag) for e in hidden] == [(0, 5, 5, 6)]
     (control,) = [e for e in events if e.kind == "control"]
     assert (control.episode, control.start, control.lag) == (3, 5, 6), "the model has seen as many frames of it"
+    share[3, 11, 1] = 0.0  # when it is judged
+    assert [e.kind for e in find_events(share, np.full(4, 20), 1, np.random.default_rng(0))] == ["hidden"]
+    share[3, 11, 1] = 1.0
+    ended = np.array([20, 20, 20, 11])  # the frame before
+    assert [e.kind for e in find_events(share, ended, 1, np.random.default_rng(0))] == ["hidden"]
