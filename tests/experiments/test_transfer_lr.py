@@ -112,7 +112,7 @@ def test_optima_line_up_with_mup_and_cost_nothing(tmp_path):
         found = optima[POINT, series]
         assert (found.x, found.penalty, found.edge) == (RATE, 0.0, "")
     wide = optima[STANDARD, "width 32"]
-    assert wide.x == RATE / 2 and wide.transferred_x == RATE and wide.penalty > 0.05
+    assert wide.x == RATE / 2 and wide.transferred_x == RATE and wide.moved == -1 and wide.penalty > 0.05
     assert optima[STANDARD, "width 16"].penalty == 0.0  # its own optimum
     assert wide.penalty_low < wide.penalty < wide.penalty_high
     training = optima_of(rows, TRAINING_LOSS)

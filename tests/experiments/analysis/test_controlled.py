@@ -65,6 +65,15 @@ def test_retrieval_that_never_failed_might_have():
     assert count_following(own, "retrieval") == (3, 3)
 
 
+def test_a_deaf_model_s_retrieval_is_that_of_the_windows_that_have_other_actions():
+    table = model(1.0)
+    alone = np.arange(len(table)) % 2 == 0
+    metrics = {name: np.where(alone, np.nan, table.metrics[name]) for name in ("retrieval", "retrieval_chance")}
+    rows = controllability({0: replace(table, metrics=table.metrics | metrics)}, rate=2.0)
+    own = [row for row in rows if row.metric == "retrieval"]
+    assert [(row.n, row.deaf) for row in own] == [(int(alone.sum()) // 3, 1 / 16)] * 3
+
+
 def test_a_robot_without_actions_is_never_there_by_chance():
     """It has the value of a deaf model in every window; it was counted as one that might be far from it."""
     table = judged(np.random.default_rng(3), robots=6, episodes=4)

@@ -98,6 +98,13 @@ def test_the_mean_over_robots_holds_its_truth():
     assert 0.92 * 400 <= hits <= 0.98 * 400 and normal < 0.90 * 400
 
 
+def test_the_degrees_of_freedom_over_robots_are_satterthwaite_s():
+    """Variances 1 and 4 with 3 and 5 degrees of freedom have 5^2 / (1^2 / 3 + 4^2 / 5)."""
+    interval = overall([Stat(1.0, 1.0, 8, 4), Stat(2.0, 2.0, 12, 6)])
+    half = critical(25 / (1 / 3 + 16 / 5)) * math.sqrt(5) / 2
+    assert (interval.low, interval.high) == (pytest.approx(1.5 - half), pytest.approx(1.5 + half))
+
+
 def test_episode_ids_carry_the_error():
     """Shuffled over the windows of a robot, each episode looks like all of it, and the error is a fraction."""
     table = judged(np.random.default_rng(0), episodes=20, each=8, of_window=0.1)
