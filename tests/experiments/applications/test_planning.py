@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -89,6 +90,20 @@ def test_the_unit_of_costs_does_not_matter():
         for by in (1, 1000)
     ]
     np.testing.assert_allclose(*plans)
+
+
+def test_mppi_weighs_candidates_by_their_costs_in_standard_deviations():
+    """Each weighs exp(-cost / temperature), as in Williams et al. 2017."""
+    config, batches = replace(CONFIG, iterations=1, temperature=0.3), []
+    costs = np.random.default_rng(1).exponential(size=16)
+    found = plan_mppi(lambda c: batches.append(c) or costs, config, np.zeros((3, 2)), np.random.default_rng(0))
+    weights = np.exp(-costs / costs.std() / 0.3)
+    np.testing.assert_allclose(found, np.einsum("b,bka->ka", weights / weights.sum(), batches[0]))
+
+
+def test_starts_that_are_skipped_are_those_of_an_earlier_run():
+    first, others = Settings(starts=2).start_seeds(), Settings(starts=2, skip=2).start_seeds()
+    np.testing.assert_array_equal(np.concatenate([first, others]), Settings(starts=4).start_seeds())
 
 
 @pytest.mark.parametrize("by", SEARCHES)
