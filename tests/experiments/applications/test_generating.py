@@ -18,6 +18,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.source import SUCCESS_KEY, find_instructions
 from data_pipelines.suite.generate import generate_suite
 from data_pipelines.tokens.store import TokenStore
+from experiments.applications.generating import compare as comparing
 from experiments.applications.generating import source as source_module
 from experiments.applications.generating import trajectories as trajectories_module
 from experiments.applications.generating.survey import survey
@@ -25,6 +26,7 @@ from experiments.applications.generating.trajectories import describe, describe_
 from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
+from hma_jax.evaluation.metrics import MAX_PSNR
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.folder import save_robots
 from hma_jax.simulator.robots import Robot
@@ -395,3 +397,16 @@ def test_clips_that_cannot_be_written_are_refused_at_once(run, recorded, tmp_pat
     said = " ".join(capsys.readouterr().err.split())
     assert "--clips 1 needs the package 'av'" in said and "hma-jax[convert]" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_generated_frames_and_a_still_are_compared_with_what_was_recorded_after_the_given_ones(tmp_path, monkeypatch):
+    recorded = np.broadcast_to(np.uint8([0, 10, 20, 40])[:, None, None, None], (4, 8, 8, 3))
+    generated = recorded + np.uint8([0, 0, 5, 5])[:, None, None, None]
+    pairs = [comparing.Pair(7, generated, recorded), comparing.Pair(9, recorded, recorded)]
+    monkeypatch.setattr(comparing, "RldsDataset", lambda _: pairs)
+    monkeypatch.setattr(comparing, "read_pairs", lambda *_: iter(pairs))
+    found = comparing.compare(tmp_path / "data", None, given=2, clips=0, rate=2.0)
+    off, still = 20 * np.log10(255 / 5), 20 * np.log10(255 / np.array([10.0, 30.0]))
+    assert (found.generated.mean, found.still.mean) == pytest.approx(((off + MAX_PSNR) / 2, still.mean()))
+    rows = [line.split(",")[:2] for line in (tmp_path / "psnr.csv").read_text().splitlines()[1:]]
+    assert rows == [["7", "2"], ["7", "3"], ["9", "2"], ["9", "3"]]

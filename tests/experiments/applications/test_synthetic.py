@@ -7,6 +7,7 @@ import sys
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -288,6 +289,22 @@ def test_a_dimension_that_stood_still_in_training_is_not_judged():
             return actions[:, self.t]
 
     np.testing.assert_array_equal(synthetic.action_errors(Exact(), others, scale_of(demos)), 0)
+
+
+def test_errors_and_pictures_are_compared_over_what_was_recorded_after_the_given_frames():
+    """Neither padding nor the given frames, which are the recorded ones, count."""
+    lengths, rng = np.array([6, 4, 5]), np.random.default_rng(0)
+    counts = np.arange(6) < lengths[:, None]
+    images, acted = np.full((3, 6, 8, 8, 3), 100, np.uint8), rng.normal(size=(3, 6, 2)).astype(np.float32)
+    recorded = Demonstrations(images, acted, lengths, counts, lengths > 0, lengths)
+    made = images + np.where(counts & (np.arange(6) >= 2), 10, 0).astype(np.uint8)[..., None, None, None]
+    found = synthetic.quality_of({"recorded": recorded, "generated": replace(recorded, images=made)}, 2)
+    assert found == {"generated": pytest.approx([20 * np.log10(255 / 10)] * 3)}
+
+    scale, frames = scale_of(recorded), iter(range(6))
+    off = np.where(counts, 2, 99)[..., None] * np.array(scale.std)
+    policy = SimpleNamespace(reset=lambda: None, act=lambda _: (t := next(frames), acted[:, t] + off[:, t])[1])
+    np.testing.assert_allclose(synthetic.action_errors(policy, recorded, scale), [4, 4, 4], rtol=1e-4)
 
 
 def test_other_actions_are_another_trajectorys_and_a_shorter_ones_last_is_held():

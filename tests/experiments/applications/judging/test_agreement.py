@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from experiments.applications.judging import agreement
 from experiments.applications.judging.agreement import (
     LEAST_POLICIES,
     LEAST_STARTS,
@@ -57,6 +58,16 @@ def test_intervals_over_starts_hold_what_more_starts_would_show(least, most):
         for name in held:
             held[name] += found[name].low <= MEASURES[name](*rates) <= found[name].high
     assert min(held.values()) >= 20, held
+
+
+def test_an_interval_over_starts_contains_what_was_measured(monkeypatch):
+    """Noise may have put that outside of all true rates that are drawn."""
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(agreement, "draw_rates", lambda measured, noise, draws: rng.random((draws, *measured.shape)))
+    true = rng.random((8, 30)) < np.linspace(0.1, 0.9, 8)[:, None]
+    same, opposite = (agree(true, learned, draws=20).over_starts["pearson"] for learned in (true, ~true))
+    assert same.low < 0.9 < same.high == pytest.approx(same.mean) == 1
+    assert opposite.high > -0.9 > opposite.low == pytest.approx(opposite.mean) == -1
 
 
 def test_starts_that_worlds_share_make_no_correlation_of_policies_that_are_alike():
