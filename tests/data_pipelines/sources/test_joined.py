@@ -190,3 +190,7 @@ def test_damaged_episodes_of_all_parts_count_together_and_say_which_part(tmp_pat
     assert lost.without_location(reason).startswith("two/two-train.tfrecord-00000-of-00001: ")
     with pytest.raises(DataError, match="all: .* more than max_skipped=1"):
         open_source(places["here"], corrupt="skip", max_skipped=1)
+    shard = places["there"].places[0] / "one-train.tfrecord-00000-of-00001"
+    shard.write_bytes(shard.read_bytes()[: shard.stat().st_size // 2])
+    lost = open_source(places["there"], corrupt="skip")  # those of the other part keep their numbers
+    assert len(lost) < 12 and lost.numbers[-6:].tolist() == [6, 7, 8, 9, 10, 11]
