@@ -78,9 +78,11 @@ def lpips(params: Params, kinds: Sequence[jax.Array], truth: jax.Array) -> list[
     the less alike they look.
 
     A kind is as `truth`, or [B, 1, H, W, 3]: one image for all frames of a window. The network sees every image once.
-    `params` are those of `load_lpips`. Raises ConfigError for images of which the network's last layers would see
-    nothing.
+    `params` are those of `load_lpips`. Raises ConfigError for images of another type, and for those of which the
+    network's last layers would see nothing.
     """
+    types = [x.dtype for x in (*kinds, truth)]
+    require(all(x == np.uint8 for x in types), f"LPIPS compares uint8 images, got {', '.join(map(str, types))}")
     windows, frames, *size = truth.shape
     require(
         min(size[:2]) >= SMALLEST_LPIPS_IMAGE and size[2] == 3,

@@ -146,6 +146,14 @@ def test_images_that_the_network_cannot_take_are_refused(weights, shape):
         lpips(weights, [images], images)
 
 
+@pytest.mark.parametrize("types", [("f4", "u1"), ("u1", "f4"), ("f4", "f4"), ("i4", "u1")])
+def test_images_of_other_numbers_are_refused(weights, types):
+    """Images in 0..1 were all alike."""
+    images = [np.zeros((1, 1, 31, 31, 3), kind) for kind in types]
+    with pytest.raises(ConfigError, match="LPIPS compares uint8 images, got .*(float32|int32)"):
+        lpips(weights, images[:1], images[1])
+
+
 def test_the_package_is_read_without_its_code(weights, package):
     package(as_published(weights))
     np.testing.assert_array_equal(load_lpips()["layer3"]["kernel"], weights["layer3"]["kernel"])
