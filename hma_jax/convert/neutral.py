@@ -18,6 +18,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.config.base import require_choice
 from hma_jax.config.json import to_plain_json
 from hma_jax.convert.atomic import atomic_directory
+from hma_jax.convert.run_directory import require_run
 from hma_jax.convert.table import flat, nested
 from hma_jax.convert.tensors import check_tensors, read_finite, read_safetensors, write_safetensors
 from hma_jax.model.hma import declare_model
@@ -35,7 +36,8 @@ def describe_tensors(leaves: Mapping[str, ParamSpec]) -> dict[str, dict[str, Any
 
 
 def write_neutral(run: Run, directory: Path) -> None:
-    """Raises ConfigError if `directory` exists."""
+    """Raises ConfigError if `directory` exists, and as `require_run`."""
+    require_run(run)
     arrays = {path: np.asarray(x) for path, x in flat(run.params).items()}
     description = {
         "format": FORMAT,

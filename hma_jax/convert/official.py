@@ -34,6 +34,7 @@ from hma_jax.convert.official_config import (
     write_config,
 )
 from hma_jax.convert.release_limits import ATTENTION_SCALE, loads_in_release, released_form, require_official
+from hma_jax.convert.run_directory import require_run
 from hma_jax.convert.table import flat, from_official, nested, official_parts, to_official
 from hma_jax.convert.tensors import Stored, check_tensors, read_finite, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
@@ -204,8 +205,9 @@ def _variant(config: dict[str, Any]) -> str:
 def write_official(run: Run, directory: Path) -> list[str]:
     """Writes config.json and model.safetensors; returns remarks for the user.
 
-    Raises ConfigError if `directory` exists or the release could not compute the model.
+    Raises ConfigError if `directory` exists or the release could not compute the model, and as `require_run`.
     """
+    require_run(run)
     config = official_config(run)
     tensors, remarks = official_tensors(run)
     if not loads_in_release(config):

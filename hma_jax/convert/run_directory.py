@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from hma_jax.config import require
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.files import write_file
@@ -17,12 +18,22 @@ from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState, state_shapes
 
 
+def require_run(run: object) -> None:
+    """Raises ConfigError for anything but a Run with the parameters of its checkpoint. A Model is none, and that in a
+    Model in bfloat16 has rounded ones."""
+    give = "give load_run(RUN, 'auto') of hma_jax.training.runs"
+    require(isinstance(run, Run), f"what is converted is a Run, not a {type(run).__name__}; {give}")
+    rounded = {str(x.dtype) for x in jax.tree.leaves(run.params)} - {"float32"}
+    require(not rounded, f"these parameters are {', '.join(sorted(rounded))}, rounded for inference; {give}")
+
+
 def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None) -> None:
     """Writes a checkpoint of step 0 with a fresh optimiser state, and `texts`, files by name, into the run directory.
     Where the weights were trained, `converted` in its provenance says at which step they were and which ones.
 
-    Raises ConfigError if `directory` exists.
+    Raises ConfigError if `directory` exists, and as `require_run`.
     """
+    require_run(run)
     with atomic_directory(directory) as temporary:
         converted = {"converted": {"step": run.step, "weights": run.weights}} if run.step else {}
         meta = describe_run(run.model, run.train, run.table, run.provenance | converted)

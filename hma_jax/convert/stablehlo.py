@@ -23,6 +23,7 @@ from hma_jax.config import ConfigError, DecodeConfig, Dtype, ExecutionConfig, Ma
 from hma_jax.config.json import to_dict, to_plain_json
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.convert.neutral import describe_tensors
+from hma_jax.convert.run_directory import require_run
 from hma_jax.convert.table import flat, nested
 from hma_jax.convert.tensors import write_safetensors
 from hma_jax.generation import rollout
@@ -98,7 +99,8 @@ def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConf
 
 
 def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
-    """Raises ConfigError if `directory` exists or the model predicts no frames."""
+    """Raises ConfigError if `directory` exists or the model predicts no frames, and as `require_run`."""
+    require_run(run)
     require_frames(run, "generate")
     # Most parameters of a continuous model are action heads.
     run = replace(run, model=replace(run.model, action_heads=False))

@@ -63,7 +63,7 @@ class Model:
     It can be pickled; where it is unpickled, its parameters lie on the default device.
     """
 
-    run: Run  # with parameters as `model.params.inference_params` makes them
+    run: Run  # with parameters as `model.params.inference_params` makes them; what is converted is that of `load_run`
     declared: Declared[HMA]
     execution: ExecutionConfig
 

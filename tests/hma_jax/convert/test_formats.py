@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from hma_jax.convert import (
     read_neutral,
     read_official,
     write_neutral,
+    write_official,
     write_run,
     write_stablehlo,
 )
@@ -32,7 +34,7 @@ from hma_jax.generation import rollout
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import inference_params
-from hma_jax.training.runs import Run, load_run
+from hma_jax.training.runs import Model, Run, load_run
 from hma_jax.training.train import train_model
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
 from tests.tiny import TABLE, batches, lively_params, model_config, random_batch, shallow_config, train_config
@@ -167,6 +169,18 @@ def test_weights_that_are_not_finite_are_refused_by_name(tmp_path):
     write_neutral(run, tmp_path / "out")
     with pytest.raises(ConfigError, match="model.safetensors: embed/mask contains values that are not finite"):
         read_neutral(tmp_path / "out")
+
+
+@pytest.mark.parametrize("write", [write_neutral, write_official, write_run, partial(write_stablehlo, config=None)])
+def test_what_is_converted_is_a_run_with_the_weights_of_its_checkpoint(write, tmp_path):
+    """A model was an AttributeError, and one in bfloat16 was written as if its weights had not been rounded."""
+    run, execution = small_run(), ExecutionConfig(dtype="bfloat16")
+    declared = declare_model(run.model, run.table, execution)
+    model = Model(replace(run, params=inference_params(declared, run.params, "bfloat16")), declared, execution)
+    for wrong, message in ((model, "is a Run, not a Model"), (model.run, "parameters are bfloat16, rounded for")):
+        with pytest.raises(ConfigError, match=rf"{message}.*give load_run\(RUN, 'auto'\) of hma_jax.training.runs"):
+            write(wrong, directory=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o007, 0o660)])
