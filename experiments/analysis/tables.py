@@ -45,18 +45,19 @@ def read_trial(directory: Path) -> FinishedTrial:
     return FinishedTrial(directory.name, *trial_in(directory), windows)
 
 
-def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, FinishedTrial]:
+def read_trials(trials: str | Path, ids: Iterable[str] | None = None) -> dict[str, FinishedTrial]:
     """The finished ones among `ids` (None: all in the directory), by id and sorted by it. Raises ConfigError."""
+    trials = Path(trials)
     chosen = [p.name for p in trials.iterdir()] if ids is None else ids
     return {id: read_trial(trials / id) for id in sorted(chosen) if (trials / id / RESULT).exists()}
 
 
-def read_side(path: Path) -> Side:
+def read_side(path: str | Path) -> Side:
     """What `hma compare` takes: a study (its reference trials, by seed), a finished trial, or an evaluated model.
 
     Raises ConfigError for what is none of them, or whose trials have no result.
     """
-    path = path.resolve()  # a trial's directory bears its id; '.' and links do not
+    path = Path(path).resolve()  # a trial's directory bears its id; '.' and links do not
     workspace = Workspace(path)
     if workspace.record.exists():
         record = load_record(workspace)

@@ -28,7 +28,7 @@ def two_seeds(tmp_path):
 def test_finished_trials_come_back_with_every_window(tmp_path):
     directories, tables = two_seeds(tmp_path)
     (tmp_path / "unfinished").mkdir()
-    found = read_trials(tmp_path)
+    found = read_trials(str(tmp_path))
     assert sorted(found) == list(found) == sorted(d.name for d in directories)
     for directory, table in zip(directories, tables, strict=True):
         one = found[directory.name]
