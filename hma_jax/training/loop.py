@@ -21,7 +21,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -115,7 +115,7 @@ def fit(
     step_fn: Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]],
     shapes: Any,
     make_state: Callable[[], Any],
-    make_batches: Callable[[int], Iterator[Any]],
+    make_batches: Callable[[int], Iterable[Any]],
     *,
     steps: int,
     run_dir: str | Path,
@@ -130,12 +130,17 @@ def fit(
     `step_fn(state, batch) -> (state, metrics)` is a jitted pure function that donates its
     state, a named tuple; `metrics` holds scalars, one of them 'loss', and checks (`state.FINITE`).
     `shapes` are the state's, with shardings; `make_state()` is called only when nothing is restored,
-    so that there never are two. `make_batches(start)` yields host batches from step `start` on.
+    so that there never are two. `make_batches(start)` gives host batches from step `start` on.
     With several processes (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin
     with this start. When any of them is asked to stop, or a save by the minute is due, all do so after the same step.
     Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy, and ConfigError for batches that end before
-    the steps do.
+    the steps do, or that are given instead of a function that makes them.
     """
+    require(
+        callable(make_batches),
+        "make_batches must be a function: make_batches(start) gives the batches from step `start` on; got a "
+        f"{type(make_batches).__name__}",
+    )
     run_dir, clock = Path(run_dir), options.clock
     # One writer per run: of several processes only process 0 takes the lock and writes the log.
     with (
@@ -170,7 +175,7 @@ def fit(
             if start >= steps:
                 return FitResult(state, log.losses, 0.0, 0.0, start)
             log.write_start(_describe_start(start, info.execution))
-            batches = make_batches(start)
+            batches = iter(make_batches(start))
             batch = put_batch(_next(batches, start, steps))
             began = clock()
             compiled = step_fn.lower(state, batch).compile()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -42,7 +42,7 @@ def train_model(
     model: ModelConfig,
     table: EmbodimentTable,
     config: TrainConfig,
-    make_batches: Callable[[int], Iterator[dict[str, np.ndarray]]],
+    make_batches: Callable[[int], Iterable[dict[str, np.ndarray]]],
     *,
     run_dir: str | Path,
     provenance: dict[str, Any],
@@ -56,7 +56,7 @@ def train_model(
 ) -> FitResult:
     """Trains to `config.steps`, resuming what is in `run_dir`.
 
-    `make_batches(start)` yields this process's rows (`runtime.rows.own_rows`) of the global batches from step `start`
+    `make_batches(start)` gives this process's rows (`runtime.rows.own_rows`) of the global batches from step `start`
     on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what data the
     batches come from; resuming on other data is refused, and `modernise_provenance` brings a provenance that an earlier
     version wrote to today's form before the two are compared. `execution` and `validation` may differ when a run

@@ -164,6 +164,14 @@ def test_batches_that_end_too_soon_and_options_that_cannot_work_are_told_in_word
             LoopOptions(**{name: 0})
 
 
+def test_batches_may_be_a_list_but_come_from_a_function(tmp_path: Path):
+    few = list(itertools.islice(toy_batches(0), 6))
+    assert len(fit_toy(tmp_path / "a", 6, make=lambda start: few[start:]).losses) == 6
+    with pytest.raises(ConfigError, match="make_batches must be a function: .*; got a list_iterator"):
+        fit_toy(tmp_path / "b", 6, make=iter(few))
+    assert not (tmp_path / "b").exists()
+
+
 def test_timing_and_utilisation_are_of_steps_alone(tmp_path: Path):
     clock = Clock()
 
