@@ -49,7 +49,7 @@ def test_rates_agree_for_as_long_as_is_said_and_no_longer(schedule, fewer, more)
 def test_a_branch_is_byte_equal_to_a_run_of_its_own(tmp_path: Path):
     """The checkpoint before the decay stays, though the newest ones alone would be kept."""
     alone = train(tmp_path / "alone", 12)
-    train(tmp_path / "short", 6, checkpoint_every=1, keep_checkpoints=1, keep_steps=(3,))
+    train(tmp_path / "short", 6, keep_checkpoints=1, keep_steps=(3,))
     assert list_steps(tmp_path / "short" / CHECKPOINTS) == [3, 6]
     assert begin_from(tmp_path / "short", tmp_path / "branch", 5) == 3
     branch = train(tmp_path / "branch", 12)
@@ -72,10 +72,17 @@ def test_a_branch_is_on_the_disk_before_its_checkpoint_is_seen(tmp_path: Path, m
     assert done == ["metrics.jsonl", "branch", "state", ".3.copied", "rename", CHECKPOINTS]
 
 
-def test_a_run_does_not_go_on_from_where_another_had_begun_to_decay(tmp_path: Path):
-    train(tmp_path / "short", 6)
-    assert last_step(tmp_path / "short", 5) == 0
-    assert begin_from(tmp_path / "short", tmp_path / "branch", 6) == 6
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of six steps, saved at its end."""
+    run_dir = tmp_path_factory.mktemp("runs") / "short"
+    train(run_dir, 6)
+    return run_dir
+
+
+def test_a_run_does_not_go_on_from_where_another_had_begun_to_decay(short: Path, tmp_path: Path):
+    assert last_step(short, 5) == 0
+    assert begin_from(short, tmp_path / "branch", 6) == 6
     with pytest.raises(CheckpointError, match="train.steps: 6 -> 12"):
         train(tmp_path / "branch", 12)
 
@@ -120,14 +127,8 @@ def test_what_cannot_be_branched(tmp_path: Path):
     assert (new / FILE).exists() and branch(source, new, 3) == 3, "one that was cut short is made again"
 
 
-def test_a_relative_path_is_branched_without_warnings(tmp_path: Path, monkeypatch, caplog):
+def test_a_relative_path_is_branched_without_warnings(short: Path, tmp_path: Path, monkeypatch, caplog):
     """Orbax warns of paths that are not absolute, once for every item."""
-    train(tmp_path / "source", 6)
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(short.parent)
     caplog.clear()
-    assert branch(Path("source"), Path("new")) == 6 and not caplog.records
-
-
-def test_checkpoints_of_every_so_many_steps_stay(tmp_path: Path):
-    train(tmp_path, 6, checkpoint_every=1, keep_every=2)
-    assert list_steps(tmp_path / CHECKPOINTS) == [2, 4, 5, 6]
+    assert branch(Path("short"), Path("new")) == 6 and not caplog.records

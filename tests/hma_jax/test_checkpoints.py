@@ -20,6 +20,7 @@ from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
 from hma_jax.training.hashes import NAME, Damaged, ReadError, verify, write_list
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import find_damage, list_steps, load_items
+from hma_jax.training.state import TrainState
 from tests.toy import fit_toy, toy_shapes, toy_state
 
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
@@ -37,8 +38,15 @@ def flip(path: Path, at: int | None = None) -> None:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 6 steps with checkpoints at 4 and 6."""
     run_dir = tmp_path_factory.mktemp("run")
-    fit_toy(run_dir, 6, options=EVERY_TWO)
+    fit_toy(run_dir, 6, options=LoopOptions(checkpoint_every=4, log_every=1))
     return run_dir
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
+    """(a run of 9 steps that nothing happened to, its last state)."""
+    run_dir = tmp_path_factory.mktemp("whole")
+    return run_dir, fit_toy(run_dir, 9, options=LoopOptions(log_every=1)).state
 
 
 @pytest.fixture
@@ -165,7 +173,7 @@ def test_what_one_of_several_processes_cannot_read_ends_all_of_them_alike(kind, 
 
 @pytest.mark.parametrize("item", ["params", "opt_state", "_CHECKPOINT_METADATA"])
 def test_a_run_goes_on_from_before_the_damage_when_told_to_and_ends_as_if_nothing_had_been(
-    item: str, run_dir: Path, tmp_path: Path
+    item: str, run_dir: Path, whole: tuple[Path, TrainState]
 ):
     checkpoint = run_dir / "checkpoints" / "6"
     flip(next(checkpoint / name for name in reversed(files_of(checkpoint)) if name.startswith(item)))
@@ -174,10 +182,9 @@ def test_a_run_goes_on_from_before_the_damage_when_told_to_and_ends_as_if_nothin
     assert list_steps(run_dir / "damaged") == [6] and find_damage(run_dir / "damaged" / "6") is not None
     # The damaged one is not counted among those that are kept, and not taken for the latest.
     assert list_steps(run_dir / "checkpoints") == [8, 9]
-    whole = fit_toy(tmp_path / "whole", 9, options=EVERY_TWO)
-    same = [(d / "metrics.jsonl").read_bytes() for d in (run_dir, tmp_path / "whole")]
+    same = [(d / "metrics.jsonl").read_bytes() for d in (run_dir, whole[0])]
     assert same[0] == same[1]
-    for a, b in zip(jax.tree.leaves(resumed.state), jax.tree.leaves(whole.state), strict=True):
+    for a, b in zip(jax.tree.leaves(resumed.state), jax.tree.leaves(whole[1]), strict=True):
         assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
 
 
@@ -288,6 +295,7 @@ def fail(monkeypatch: pytest.MonkeyPatch, code: int, times: int) -> list[Path]:
 
     monkeypatch.setattr(module, "sync_tree", sync_tree)
     monkeypatch.setattr(module, "LONGEST_PAUSE", 0.0)
+    monkeypatch.setattr(module, "TRIES", 4)
     return tried
 
 
@@ -347,10 +355,10 @@ def test_a_save_removes_what_saves_left_behind_and_nothing_else(run_dir: Path):
 def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path):
     """Runs in such directories ended well, and no checkpoint of theirs could be read."""
     with pytest.raises(ConfigError, match=r"a path with \[2\] cannot hold checkpoints.*choose another"):
-        fit_toy(tmp_path / "a [2]" / "run", 4, options=EVERY_TWO)
+        fit_toy(tmp_path / "a [2]" / "run", 2)
     assert not (tmp_path / "a [2]" / "run" / "checkpoints").exists()
-    fit_toy(tmp_path / "what? a[*b" / "run", 4, options=EVERY_TWO)
-    assert fit_toy(tmp_path / "what? a[*b" / "run", 6, options=EVERY_TWO).resumed_from == 4
+    fit_toy(tmp_path / "what? a[*b" / "run", 2)
+    assert fit_toy(tmp_path / "what? a[*b" / "run", 3).resumed_from == 2
 
 
 def test_what_one_of_several_processes_cannot_write_is_the_error_of_all(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from orbax.checkpoint._src.path.atomicity import AtomicRenameTemporaryPath
 
 from hma_jax.training.checkpoints import Checkpoints, SaveError
-from hma_jax.training.loop import LoopOptions
+from hma_jax.training.loop import FitResult, LoopOptions
 from hma_jax.training.reading import find_damage, list_steps
 from tests.toy import fit_toy, toy_state
 
@@ -36,9 +36,16 @@ def dies_in_save(monkeypatch: pytest.MonkeyPatch):
     return at
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> FitResult:
+    """Eight steps that nothing interrupted."""
+    return fit_toy(tmp_path_factory.mktemp("whole"), 8, options=LoopOptions(log_every=1))
+
+
 @pytest.mark.parametrize("options", [EVERY_TWO, EVERY_TWO_KEEP_ONE], ids=["two kept", "one kept"])
-def test_a_death_inside_a_save_falls_back_to_the_checkpoint_before(options, tmp_path: Path, dies_in_save, monkeypatch):
-    whole = fit_toy(tmp_path / "whole", 8, options=options)
+def test_a_death_inside_a_save_falls_back_to_the_checkpoint_before(
+    options, whole: FitResult, tmp_path: Path, dies_in_save, monkeypatch
+):
     run, checkpoints = tmp_path / "run", tmp_path / "run" / "checkpoints"
     dies_in_save(6)
     with pytest.raises(SaveError, match="step 6 could not be written .* it continues from step 4, the last complete"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import multiprocessing
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -19,20 +18,11 @@ from hma_jax.runtime import locks
 from hma_jax.runtime.locks import Held, Holder, exclusive, find_held
 from hma_jax.runtime.outputs import make_directory
 from hma_jax.training.run_lock import locked_run
-
-
-def hold(path: Path, ready) -> None:
-    with exclusive(path, lease=True, remove=True):
-        ready.set()
-        time.sleep(60)
+from tests.holding import start_holder
 
 
 def test_the_holder_is_named_and_its_death_frees_the_lock(tmp_path: Path):
-    context = multiprocessing.get_context("spawn")
-    ready = context.Event()
-    holder = context.Process(target=hold, args=(tmp_path / "lock", ready))
-    holder.start()
-    assert ready.wait(60)
+    holder = start_holder(exclusive, tmp_path / "lock", lease=True, remove=True)
     with pytest.raises(Held, match=f"held by process {holder.pid} on ") as held, exclusive(tmp_path / "lock"):
         pass
     assert held.value.holder.process == holder.pid and isinstance(held.value, ConfigError)

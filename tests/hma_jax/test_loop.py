@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import json
 import math
-import multiprocessing
 import os
 import signal
 from dataclasses import replace
@@ -22,9 +21,12 @@ from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions, ValidationHook
 from hma_jax.training.reading import list_steps
 from hma_jax.training.run_lock import RunBusy, locked_run
+from tests.holding import start_holder
 from tests.toy import fit_toy, toy_batches, toy_step
 
 EVERY_STEP = LoopOptions(checkpoint_every=1, log_every=1)
+LOGGED = LoopOptions(log_every=1)
+"""One save, at the end: a save takes longer than all steps of these runs."""
 
 
 def lines(path: Path) -> list[dict]:
@@ -51,7 +53,7 @@ def spoilt(what: str, at: int, value: float):
     return step
 
 
-@pytest.mark.parametrize("at", [4, 6], ids=["in the middle", "at the very last step"])
+@pytest.mark.parametrize("at", [2, 3], ids=["in the middle", "at the very last step"])
 @pytest.mark.parametrize(
     ("what", "value", "message"),
     [
@@ -62,28 +64,28 @@ def spoilt(what: str, at: int, value: float):
 )
 def test_what_is_not_finite_is_never_saved(what, value, message, at, tmp_path: Path):
     with pytest.raises(DivergedError, match=message.format(at)):
-        fit_toy(tmp_path, step=spoilt(what, at, value), options=EVERY_STEP)
+        fit_toy(tmp_path, 3, step=spoilt(what, at, value), options=EVERY_STEP)
     assert list_steps(tmp_path / "checkpoints")[-1] == at - 1
     assert [line["step"] for line in lines(tmp_path / "metrics.jsonl")] == list(range(1, at))
-    resumed = fit_toy(tmp_path, options=EVERY_STEP)
-    assert resumed.resumed_from == at - 1 and len(resumed.losses) == 6
+    resumed = fit_toy(tmp_path, 3, options=LOGGED)
+    assert resumed.resumed_from == at - 1 and len(resumed.losses) == 3
 
 
 def test_the_records_of_the_batch_that_was_not_finite_are_named(tmp_path: Path):
     def make(start: int):
         for index, batch in enumerate(toy_batches(start), start):
-            yield np.full_like(batch, math.nan) if index == 3 else batch
+            yield np.full_like(batch, math.nan) if index == 1 else batch
 
     def records(index: int) -> list[str]:
         return [f"record {10 * index + row}" for row in range(6)]
 
-    with pytest.raises(DivergedError, match="loss is nan at step 4; its batch was record 30; record 31; .* and 2 more"):
+    with pytest.raises(DivergedError, match="loss is nan at step 2; its batch was record 10; record 11; .* and 2 more"):
         fit_toy(tmp_path, make=make, records=records, options=EVERY_STEP)
     said = json.loads((tmp_path / "diverged.json").read_text())
     assert said == {
-        "step": 4,
-        "what": "the loss is nan at step 4",
-        "records": [f"record {30 + row}" for row in range(6)],
+        "step": 2,
+        "what": "the loss is nan at step 2",
+        "records": [f"record {10 + row}" for row in range(6)],
     }
 
 
@@ -135,8 +137,13 @@ def test_a_run_is_saved_by_steps_and_by_minutes(every, minutes, saved, tmp_path:
 
 
 def test_as_many_checkpoints_are_kept_as_asked_for(tmp_path: Path):
-    fit_toy(tmp_path, options=LoopOptions(checkpoint_every=1, keep_checkpoints=3))
-    assert list_steps(tmp_path / "checkpoints") == [4, 5, 6]
+    fit_toy(tmp_path, 4, options=LoopOptions(checkpoint_every=1, keep_checkpoints=3))
+    assert list_steps(tmp_path / "checkpoints") == [2, 3, 4]
+
+
+def test_checkpoints_of_every_so_many_steps_stay(tmp_path: Path):
+    fit_toy(tmp_path, 4, options=LoopOptions(checkpoint_every=1, keep_every=2))
+    assert list_steps(tmp_path / "checkpoints") == [2, 3, 4]
 
 
 # --- Timing ----------------------------------------------------------------------------------
@@ -234,7 +241,7 @@ def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path)
 
 def test_a_log_that_is_cut_is_on_the_disk_before_the_old_one_is_gone(tmp_path: Path, monkeypatch):
     """Otherwise a loss of power leaves it empty."""
-    fit_toy(tmp_path, 3, options=EVERY_STEP)
+    fit_toy(tmp_path, 3, options=LOGGED)
     log = tmp_path / "metrics.jsonl"
     whole, place = log.read_bytes(), log.stat().st_ino
     fit_toy(tmp_path, 3)
@@ -250,42 +257,32 @@ def test_a_log_that_is_cut_is_on_the_disk_before_the_old_one_is_gone(tmp_path: P
 
 
 def test_a_run_whose_log_is_lost_or_damaged_goes_on_from_its_checkpoint(tmp_path: Path, caplog):
-    fit_toy(tmp_path, 6, options=EVERY_STEP)
+    fit_toy(tmp_path, 6, options=LOGGED)
     log = tmp_path / "metrics.jsonl"
     content = log.read_bytes()
     log.write_bytes(content[:30] + bytes(60) + content[90:])  # a page of zeros
     kept = sum(b"\0" not in line for line in log.read_bytes().splitlines())
     with pytest.raises(ConfigError, match=f"has only {kept} of the 6 steps .*bring the file back, or remove"):
-        fit_toy(tmp_path, 8, options=replace(EVERY_STEP, whole_log=True))
-    assert fit_toy(tmp_path, 8, options=EVERY_STEP).resumed_from == 6
+        fit_toy(tmp_path, 8, options=replace(LOGGED, whole_log=True))
+    assert fit_toy(tmp_path, 8, options=LOGGED).resumed_from == 6
     assert f"metrics.jsonl has only {kept} of the 6 steps" in caplog.text
     assert [line["step"] for line in lines(log)][-2:] == [7, 8] and len(lines(log)) == kept + 2
     assert lines(tmp_path / "execution.jsonl")[-1]["steps_missing_in_log"] == 6 - kept
 
     log.unlink()
-    assert len(fit_toy(tmp_path, 9, options=EVERY_STEP).losses) == 1
+    assert len(fit_toy(tmp_path, 9, options=LOGGED).losses) == 1
 
 
 # --- One process at a time -------------------------------------------------------------------
 
 
-def hold(run_dir: Path, ready, done) -> None:
-    with locked_run(run_dir):
-        ready.set()
-        done.wait(60)
-
-
 def test_a_run_that_another_process_trains_is_refused_by_its_name(tmp_path: Path):
-    context = multiprocessing.get_context("spawn")
-    ready, done = context.Event(), context.Event()
-    holder = context.Process(target=hold, args=(tmp_path, ready, done))
-    holder.start()
-    assert ready.wait(60)
+    holder = start_holder(locked_run, tmp_path)
     with pytest.raises(RunBusy, match=f"process {holder.pid} on .*; wait for it or stop it"):
         fit_toy(tmp_path)
     assert not (tmp_path / "metrics.jsonl").exists()
-    os.kill(holder.pid, 9)  # the lock dies with its process
-    holder.join(60)
+    holder.kill()  # the lock dies with its process
+    holder.join()
     assert fit_toy(tmp_path).resumed_from == 0
 
 

@@ -59,9 +59,9 @@ def dying_batches(after: int):
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory):
-    """(directory, result) of a run that nothing happened to."""
+    """(directory, result) of a run that nothing happened to, saved at its end."""
     run_dir = tmp_path_factory.mktemp("unbroken")
-    return run_dir, train(run_dir)
+    return run_dir, train(run_dir, options=LoopOptions(log_every=1))
 
 
 @pytest.mark.exact
@@ -109,12 +109,12 @@ def test_a_constant_rate_run_may_be_lengthened_and_another_not(tmp_path: Path):
         train(tmp_path / "cosine", config=train_config(steps=8, optimizer=cosine))
 
 
-def test_a_checkpoint_of_another_configuration_is_refused_by_name(tmp_path: Path):
-    train(tmp_path)
+def test_a_checkpoint_of_another_configuration_is_refused_by_name(unbroken):
+    run_dir, _ = unbroken
     with pytest.raises(CheckpointError, match="train.seed: 0 -> 1"):
-        train(tmp_path, config=train_config(seed=1))
+        train(run_dir, config=train_config(seed=1))
     with pytest.raises(CheckpointError, match="provenance.data: 'random' -> 'other'"):
-        train(tmp_path, provenance={"data": "other"})
+        train(run_dir, provenance={"data": "other"})
 
 
 @pytest.mark.slow  # resuming exactly is tested after errors and kills, what a signal does in test_faults
@@ -179,9 +179,9 @@ def test_training_lowers_the_loss_on_a_repeated_batch(tmp_path: Path):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_a_run_reads_back_with_everything_it_needs(tmp_path: Path):
-    result = train(tmp_path)
-    run = load_run(tmp_path)
+def test_a_run_reads_back_with_everything_it_needs(unbroken):
+    run_dir, result = unbroken
+    run = load_run(run_dir)
     assert run.model == MODEL and run.train == train_config() and run.table == TABLE
     assert run.step == 6 and run.provenance == {"data": "random"}
     assert equal_trees(run.params, result.state.params)
@@ -206,14 +206,14 @@ def test_every_step_counts_robots_that_were_present(tmp_path: Path):
         for batch in usual(start):
             yield batch | {"embodiment": np.zeros_like(batch["embodiment"])}
 
-    state = train(tmp_path, make=only_pusher).state
+    state = train(tmp_path, make=only_pusher, options=LoopOptions()).state
     assert state.opt_state.count_E["always"].tolist() == [6, 0, 0]
 
 
 def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):
     given = declare_model(MODEL, TABLE).init(7)
     before = [np.array(x) for x in jax.tree.leaves(given)]
-    result = train(tmp_path, initial=given)
+    result = train(tmp_path, initial=given, options=LoopOptions())
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))
     assert equal_trees(given, before) and not equal_trees(given, result.state.params)
 

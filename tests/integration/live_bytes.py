@@ -1,6 +1,7 @@
-"""Trains two steps in the run directory given, or two more; prints the most bytes of live arrays per byte of
-one training state, as a JSON line. Steps only add: what is held does not depend on what they compute."""
+"""Trains two steps in the run directory given, then two more; prints a JSON line for each time: the most bytes of live
+arrays per byte of one training state. Steps only add: what is held does not depend on what they compute."""
 
+import gc
 import json
 import sys
 from pathlib import Path
@@ -26,17 +27,21 @@ def make_adding_step(*_):
 
 if __name__ == "__main__":
     train.make_train_step = make_adding_step
-    model = model_config(width=64, layers=4)
-    run_dir = Path(sys.argv[1])
-    steps = 4 if run_dir.exists() else 2
+    model, run_dir = model_config(width=64, layers=4), Path(sys.argv[1])
+    one = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state_shapes(declare_model(model, TABLE), TABLE)))
 
     def make(start: int):
         measure()  # the state is there, nothing has been computed
         yield from batches(model)(start)
 
-    # Saved at the end only: while a save is under way, its copy on the host counts as live arrays on a CPU.
-    result = train.train_model(
-        model, TABLE, train_config(steps=steps), make, run_dir=run_dir, provenance={}, progress=measure
-    )
-    one = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state_shapes(declare_model(model, TABLE), TABLE)))
-    print(json.dumps({"resumed_from": result.resumed_from, "states": max(seen) / one, "state_bytes": one}))
+    def start(steps: int) -> int:
+        config = train_config(steps=steps)
+        # Saved at the end only: while a save is under way, its copy on the host counts as live arrays on a CPU.
+        result = train.train_model(model, TABLE, config, make, run_dir=run_dir, provenance={}, progress=measure)
+        return result.resumed_from
+
+    for steps in (2, 4):
+        seen.clear()
+        resumed_from = start(steps)
+        print(json.dumps({"resumed_from": resumed_from, "states": max(seen) / one, "state_bytes": one}))
+        gc.collect()  # what is left of the first state would count beside the second

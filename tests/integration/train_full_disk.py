@@ -19,7 +19,7 @@ CAPABILITIES_OF_NOBODY = (0x20080522, 0), (0, 0, 0, 0, 0, 0)
 
 
 def fill(step: int, steps: int, metrics: dict) -> None:
-    if step != 3 or len(sys.argv) < 3:
+    if step != 3:
         return
     checkpoints = Path(sys.argv[1]) / "checkpoints"
     while not (checkpoints / "2" / NAME).exists():  # it is saved in the background
@@ -43,7 +43,7 @@ if __name__ == "__main__":
     sys.unraisablehook = lambda _: None  # as `hma` does: writers in the background complain once more at the end
     become_nobody()
     try:
-        print(fit_toy(Path(sys.argv[1]), options=LoopOptions(checkpoint_every=2), progress=fill).resumed_from)
+        fit_toy(Path(sys.argv[1]), options=LoopOptions(checkpoint_every=2), progress=fill)
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

@@ -32,16 +32,21 @@ def run_on(devices: int, program: str, *arguments: str) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_a_weight_whose_heads_are_split_gets_its_gradient_where_they_are():
+@pytest.fixture(scope="module")
+def communicated() -> dict[str, Any]:
+    return run_on(8, "communicated")
+
+
+def test_a_weight_whose_heads_are_split_gets_its_gradient_where_they_are(communicated):
     """Each device computed that of all heads, from the activations of all devices."""
-    found = run_on(8, "communicated", "product")
+    found = communicated["product"]
     assert found["kinds"] == {"all-reduce": 1}
     assert found["temporary"] < 2**17
 
 
-def test_each_device_makes_its_share_of_muon_s_matrices_orthogonal():
+def test_each_device_makes_its_share_of_muon_s_matrices_orthogonal(communicated):
     """Products of matrices in parts gathered all matrices on every device, fifteen times."""
-    found = run_on(8, "communicated", "muon")
+    found = communicated["muon"]
     assert found["kinds"] == {"all-to-all": 4, "all-gather": 1}  # there and back along fsdp and tensor; back along data
     matrices = 4 * 6 * 64 * 128
     assert found["temporary"] < 4 * matrices / 3  # bytes: three matrices of 24, a few times

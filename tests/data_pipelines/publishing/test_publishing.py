@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import time
-from pathlib import Path
-
 import pytest
 
 from data_pipelines.publishing import files
@@ -16,26 +12,18 @@ from data_pipelines.publishing.output_lock import find_held_lock, lock_output
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
 from tests.full_disk import full_disk
+from tests.holding import start_holder
 from tests.written import record_writes
 
 
-def hold(place: Path, ready) -> None:
-    with lock_output(place) as lock:
-        (lock.scratch / "half").touch()
-        ready.set()
-        time.sleep(60)
-
-
 def test_scratch_of_the_living_is_kept_and_that_of_the_dead_removed(tmp_path):
-    context = multiprocessing.get_context("spawn")
-    ready = context.Event()
-    process = context.Process(target=hold, args=(tmp_path / "thing", ready))
-    process.start()
-    assert ready.wait(60)
+    process = start_holder(lock_output, tmp_path / "thing")
+    (scratch,) = tmp_path.glob("thing.scratch.*")
+    (scratch / "half").touch()
     with pytest.raises(Held, match=f"process {process.pid}"), lock_output(tmp_path / "thing"):
         pass
     with lock_output(tmp_path / "other"):  # of something else: nobody's business
-        assert len(list(tmp_path.glob("thing.scratch.*/half"))) == 1
+        assert (scratch / "half").exists()
     assert find_held_lock(tmp_path).holder.process == process.pid
     process.kill()
     process.join()
