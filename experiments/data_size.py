@@ -21,9 +21,19 @@ class DataSize:
     """The size of one dataset."""
 
     episodes: int  # damaged and held-out ones included; 0: nothing says it
+    tokenised: int  # of these, all but those that `StoreConfig.max_train` leaves out; where that is not known, at most
     trained: int | None = None  # trajectories to train on; None: nothing says how many are held out
     skipped: int = 0  # left out as damaged, of those to train on or held out
     mean_steps: float = 0.0  # native frames of an episode, as its files say; 0: they do not
+
+
+def make_size(spec: DatasetSpec, amount: HeldOut, episodes: int, val: int | None, mean_steps: float = 0.0) -> DataSize:
+    """The size of a dataset of so many `episodes`, `val` of them held out (None: nothing says how many), of which none
+    is damaged."""
+    if val is None:
+        return DataSize(episodes, min(episodes, sum(amount.used(episodes, episodes, True))), mean_steps=mean_steps)
+    train, val = amount.used(episodes - val, val, bool(spec.val_split))
+    return DataSize(episodes, train + val, train, mean_steps=mean_steps)
 
 
 _known: dict[str, DataSize] = {}
@@ -43,7 +53,7 @@ def size_of(spec: DatasetSpec, held_out: HeldOut) -> DataSize:
 def size_by_entry(spec: DatasetSpec, held_out: HeldOut) -> DataSize:
     """As the registry says, as if no episode was damaged and joined datasets were one."""
     unknown = not spec.episodes or spec.val_split
-    return DataSize(spec.episodes, None if unknown else spec.episodes - held_out.count(spec.episodes))
+    return make_size(spec, held_out, spec.episodes, None if unknown else held_out.count(spec.episodes))
 
 
 def are_counted(names: Sequence[str]) -> bool:
@@ -83,5 +93,6 @@ def sizes_by_tokens(data_summary: Path) -> dict[str, DataSize]:
     for name, facts in data.items():
         held_out, skipped = facts.get("held_out"), facts.get("skipped", 0)
         if held_out is not None:
-            found[name] = DataSize(facts["episodes"] + held_out + skipped, usable[name], skipped)
+            tokenised = facts["episodes"] + held_out + skipped
+            found[name] = DataSize(tokenised + facts.get("left_out", 0), tokenised, usable[name], skipped)
     return found

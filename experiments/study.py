@@ -29,7 +29,7 @@ from hma_jax.config import (
     check_objective,
     require,
 )
-from hma_jax.config.base import require_seed
+from hma_jax.config.base import later, require_seed
 
 SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
@@ -62,6 +62,9 @@ class StoreConfig:
     max_val: int = HeldOut.max_val  # largest number of held-out episodes per dataset
     # Largest fraction of a dataset that is held out; takes precedence over min_val.
     max_val_fraction: float = HeldOut.max_val_fraction
+    # Largest number of training episodes per dataset, chosen by hash as by --trajectories; others are not tokenised.
+    # Of a split that an entry holds out, at most max_val episodes are tokenised then. null: all episodes.
+    max_train: int | None = later(None)
     frame_step: int | None = None  # store every N-th native frame; 1: all; null: those of the study's rate
     corrupt: Literal["raise", "skip"] = "raise"  # at a damaged record, stop with an error, or leave it out and count it
     max_skipped: float = 16.0  # largest number of damaged episodes per dataset to leave out; below 1: a fraction
@@ -81,7 +84,7 @@ class StoreConfig:
 
     @property
     def held_out(self) -> HeldOut:
-        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
+        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, self.max_train)
 
 
 @dataclass(frozen=True)
@@ -302,7 +305,7 @@ def most_trajectories(study: Study, by_entries: bool = False) -> int | None:
     find_size = size_by_entry if by_entries else size_of
     specs = [find_spec(name) for name in study.dataset_names()]
     sizes = [spec and find_size(spec, study.store.held_out) for spec in specs]
-    counts = [size.skipped + (size.trained or size.episodes) if size else 0 for size in sizes]
+    counts = [size.skipped + (size.trained or size.tokenised) if size else 0 for size in sizes]
     return max(counts) if all(counts) else None
 
 

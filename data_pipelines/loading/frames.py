@@ -20,7 +20,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.mixture import make_mixture
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.sampling.splits import HeldOut, held_out_episodes
+from data_pipelines.sampling.splits import HeldOut, used_episodes
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.joined import Parts
 from data_pipelines.sources.open import open_source
@@ -53,7 +53,7 @@ def make_frame_loader(
     """Endless batches of frames, uint8 [B, image_size, image_size, 3].
 
     Datasets are drawn with p ∝ episodes^(1/tau), episodes and frames within them uniformly.
-    Held-out episodes are those that the token store holds out under the same `held_out`. `threads` (default: as many as
+    The episodes of a split are those that the token store has under the same `held_out`. `threads` (default: as many as
     cores, up to 8) read and decode; they change no frame.
     Raises ConfigError and DataError as `open_source` does.
     """
@@ -64,12 +64,11 @@ def make_frame_loader(
     for spec, directory in datasets:
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-        all_held_out = held_out_episodes(spec, source.runs, held_out)
-        mask = all_held_out[source.numbers]
-        episodes = np.flatnonzero(mask if split == "val" else ~mask)
+        all_trained, all_held_out = used_episodes(spec, source.runs, held_out)
+        episodes = np.flatnonzero((all_held_out if split == "val" else all_trained)[source.numbers])
         counts[spec.name] = len(episodes)
         if not len(episodes):
-            why = f": {_why_none_held_out(spec, all_held_out, len(mask), held_out)}" if split == "val" else ""
+            why = f": {_why_none_held_out(spec, all_held_out, len(source), held_out)}" if split == "val" else ""
             reasons[spec.name] = f"it has no {split} episode{why}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)

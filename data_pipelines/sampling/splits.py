@@ -17,16 +17,20 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.sources.identity import EpisodeRun, episode_ids, runs_of_parts
 from hma_jax.config import require
+from hma_jax.config.base import later
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How many episodes of a dataset are held out, as the settings of a study and of a token store call it."""
+    """How many episodes of a dataset are held out, and at most trained on, as the settings of a study and of a token
+    store call it."""
 
     val_fraction: float = 0.05  # of all episodes
     min_val: int = 2
     max_val: int = 200
     max_val_fraction: float = 0.25  # takes precedence over min_val
+    # Of those that are not held out; None: all. With it max_val also bounds a split that the entry holds out.
+    max_train: int | None = later(None)
 
     def count(self, episodes: int) -> int:
         """`val_fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_val_fraction`.
@@ -43,6 +47,15 @@ class HeldOut:
         require(0 <= fraction < 1, f"{group}val_fraction must lie in [0, 1), got {fraction:g}")
         require(0 <= low <= high, f"{group}min_val must lie between 0 and {group}max_val, {high}, got {low}")
         require(0 < most <= 0.5, f"{group}max_val_fraction must lie in (0, 0.5], got {most:g}")
+        train = self.max_train
+        require(train is None or train >= 1, f"{group}max_train must be at least 1, got {train}")
+
+    def used(self, train: int, val: int, own_split: bool) -> tuple[int, int]:
+        """How many of `train` episodes and of `val` held-out ones are used; `own_split`: the entry of the dataset says
+        which split is held out."""
+        if self.max_train is None:
+            return train, val
+        return min(train, self.max_train), min(val, self.max_val) if own_split else val
 
 
 def held_out_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: HeldOut) -> np.ndarray:
@@ -65,6 +78,23 @@ def held_out_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: Hel
     return np.repeat(own, [run.count for run in runs])
 
 
+def used_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: HeldOut) -> tuple[np.ndarray, np.ndarray]:
+    """(bool, bool) [episodes that `runs` name], True for those to train on, and for those held out. Without
+    `amount.max_train` each episode is one of both.
+
+    With it, those to train on are what a run that is limited to as many trajectories draws with seed 0, if all are long
+    enough for a window. Who is held out stays the same; of a split that the entry names at most `amount.max_val` are
+    used, so that a part of a large dataset does not bring all of that with it. Raises what `held_out_episodes` does.
+    """
+    val = held_out_episodes(spec, runs, amount)
+    train = ~val
+    if amount.max_train is None:
+        return train, val
+    ids = episode_ids(runs)
+    most = amount.used(int(train.sum()), int(val.sum()), bool(spec.val_split))
+    return drawn(spec.name, ids, train, most[0], subset_salt(0)), drawn(spec.name, ids, val, most[1], "held-out")
+
+
 def held_out(dataset: str, ids: np.ndarray, amount: HeldOut) -> np.ndarray:
     """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 
@@ -83,10 +113,19 @@ def subset(
     `members`: bool per entry of `ids`, the episodes to draw from; `present`: numbers of those that were not skipped. A
     skipped episode that is drawn is not replaced by another.
     """
-    numbers = np.flatnonzero(members)
-    drawn = np.zeros(len(ids), bool)
-    drawn[numbers[smallest_hashes(dataset, ids[numbers], count, salt)]] = True
-    return np.flatnonzero(drawn[present])
+    return np.flatnonzero(drawn(dataset, ids, members, count, salt)[present])
+
+
+def subset_salt(seed: int) -> str:
+    """The `salt` of the subsets of trajectories that a run of this seed trains on."""
+    return f"subset/{seed}"
+
+
+def drawn(dataset: str, ids: np.ndarray, members: np.ndarray, count: int | None, salt: str) -> np.ndarray:
+    """bool per entry of `ids`: which `count` (None: all) of the `members` (bool per entry) are drawn."""
+    numbers, mask = np.flatnonzero(members), np.zeros(len(ids), bool)
+    mask[numbers[smallest_hashes(dataset, ids[numbers], count, salt)]] = True
+    return mask
 
 
 def smallest_hashes(dataset: str, episodes: np.ndarray, count: int | None, salt: str) -> np.ndarray:

@@ -22,7 +22,7 @@ from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, hash_episodes, hash_meta
 from data_pipelines.sources.rlds.listing import list_files
-from data_pipelines.sources.rlds.schema import field_slice, step_key
+from data_pipelines.sources.rlds.schema import field_slice, of_a_part, step_key
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
     MAX_SKIPPED,
@@ -59,7 +59,11 @@ class LeRobotDataset(EpisodeSource):
         max_skipped: float = MAX_SKIPPED,
     ):
         super().__init__(corrupt, max_skipped)
-        require(split == "train", f"{root}: no split {split!r}; a LeRobot dataset has only 'train'.")
+        require(
+            split == "train",
+            f"{root}: no split {split!r}; a LeRobot dataset has only 'train': correct it where it was given, with --split "
+            f"or in the dataset's registry entry.{of_a_part(split)}",
+        )
         self.location, self.split = Path(root), split
         self.schema = self.location / "meta" / "info.json"
         self.name = lerobot_name(self.location)

@@ -29,6 +29,7 @@ from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import quote
 from data_pipelines.sources.convertible import Episode, Layout, UnitError, choose, require_module
 from data_pipelines.sources.rlds.location import is_io_error, retry
+from data_pipelines.sources.rlds.schema import of_a_part
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.video import shrink
@@ -291,7 +292,7 @@ def _demonstrations(path: Path, file: Any, filter_key: str | None) -> dict[str, 
     masks = sorted(file["mask"]) if wanted and "mask" in file else []
     for mask in wanted:
         if mask not in masks:
-            raise ConfigError(f"{path}: no mask {mask!r}; it has {', '.join(masks) or 'none'}.")
+            raise ConfigError(f"{path}: no mask {mask!r}; it has {', '.join(masks) or 'none'}.{of_a_part(mask)}")
         chosen = [n.decode() if isinstance(n, bytes) else str(n) for n in file["mask"][mask][()]]
         missing = sorted(set(chosen) - set(names))
         if missing:

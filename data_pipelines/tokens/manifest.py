@@ -68,6 +68,7 @@ class JobSettings:
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
     max_val_fraction: float = later(0.5)  # limits min_val too; new stores take that of `HeldOut`
+    max_train: int | None = later(None)  # where that leaves episodes out
 
     def __post_init__(self):
         self.held_out.check()
@@ -79,7 +80,7 @@ class JobSettings:
 
     @property
     def held_out(self) -> HeldOut:
-        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
+        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, self.max_train)
 
 
 @dataclass(frozen=True)
@@ -157,9 +158,14 @@ class Manifest:
         return sum(entry.episodes for entry in self.skipped)
 
     @property
+    def left_out(self) -> int:
+        """Episodes of the source that `settings.max_train` leaves out."""
+        return sum(self.episodes_of_parts) - len(self.train.episodes) - len(self.val.episodes) - self.skipped_count
+
+    @property
     def episodes_of_parts(self) -> list[int]:
-        """How many episodes the source has, left out ones counted; of a joined dataset, each part of it."""
-        if self.spec.joins:
+        """How many episodes the source has, left out and skipped ones counted; of a joined dataset, each part of it."""
+        if self.runs:
             return [sum(run.count for run in own) for own in runs_of_parts(self.runs).values()]
         return [len(self.train.episodes) + len(self.val.episodes) + self.skipped_count]
 

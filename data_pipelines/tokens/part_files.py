@@ -45,7 +45,7 @@ PartItem = tuple[str, StoredEpisode] | SkippedEpisodes
 
 @dataclass(frozen=True)
 class Part:
-    """Part `number` of `count`: the episodes [first, end) of the source."""
+    """Part `number` of `count`: of the episodes that are read of the source, those from `first` to before `end`."""
 
     number: int
     count: int

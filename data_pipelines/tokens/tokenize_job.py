@@ -11,7 +11,7 @@ and offset.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from data_pipelines.errors import EpisodeError
+from data_pipelines.errors import MAX_LISTED, EpisodeError
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sampling.splits import HeldOut, held_out_episodes
+from data_pipelines.sampling.splits import HeldOut, used_episodes
+from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import decoding_threads, fit_image
-from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, count_skippable
 from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, recorded_source, write_dataset
 from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
@@ -93,18 +94,14 @@ def tokenize_dataset(
     )  # fmt: skip
     watch = TurnWatch(spec, warn or (lambda _: None))
     work = _Work(source, plan, tokenizer, batch, threads or decoding_threads(), watch)
-    skipped = [
-        SkippedEpisodes(source.without_location(reason), episodes=count)
-        for reason, count in sorted(source.skipped.items())
-    ]
     try:
         manifest = write_dataset(
             store_root,
             plan,
-            cut_parts(source.sizes(), part_size),
+            cut_parts(source.sizes()[work.episodes], part_size),
             work.make,
-            skipped=skipped,
-            max_skipped=source.max_skipped if corrupt == "skip" else 0,
+            skipped=work.skipped,
+            max_skipped=count_skippable(max_skipped, work.wanted) if corrupt == "skip" else 0,
             overwrite=overwrite,
             wait=wait,
             progress=progress,
@@ -130,6 +127,7 @@ def plan_dataset(
 
     Raises ConfigError for settings that cannot work."""
     frame_step = resolve_frame_step(spec, frame_step, rate)
+    held_out = _without_idle_limit(spec, source.runs, held_out)
     return Manifest(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
@@ -156,12 +154,21 @@ def plan_again(
     """The plan for an `existing` dataset by its entry and settings of now, of the same recordings by the same
     tokenizer: no source is opened. Raises ConfigError for settings that cannot work."""
     joins = existing.spec.joins if spec.joins else ()  # those that are given
+    held_out = _without_idle_limit(existing.spec, existing.runs, held_out)
     return replace(
         existing,
         spec=replace(spec.facts(), joins=joins),
         settings=replace(existing.settings, **to_dict(held_out), frame_step=resolve_frame_step(spec, frame_step, rate)),
         recipe=RECIPE_VERSION,
     )
+
+
+def _without_idle_limit(spec: DatasetSpec, runs: Sequence[EpisodeRun], held_out: HeldOut) -> HeldOut:
+    """The same amounts, without a `max_train` that leaves no episode out: the store is the one without it."""
+    if held_out.max_train is None or not runs:
+        return held_out
+    train, val = used_episodes(spec, runs, held_out)
+    return replace(held_out, max_train=None) if (train | val).all() else held_out
 
 
 def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | None) -> int:
@@ -209,13 +216,27 @@ class _Work:
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
         self._numbers = source.numbers
-        self._is_val = held_out_episodes(plan.spec, source.runs, plan.settings.held_out)[self._numbers]
+        train, val = used_episodes(plan.spec, source.runs, plan.settings.held_out)
+        self._is_val = val[self._numbers]
+        self.episodes = np.flatnonzero((train | val)[self._numbers])
+        """int64: positions in the source of those that are read. Parts are ranges of them."""
+        self.wanted = int((train | val).sum())
+        """How many there should be, unreadable ones counted."""
+
+    @property
+    def skipped(self) -> list[SkippedEpisodes]:
+        """What the source cannot give of the wanted episodes, before one is opened."""
+        reasons = {self._source.without_location(why): n for why, n in sorted(self._source.skipped.items())}
+        if self._plan.settings.max_train is None:
+            return [SkippedEpisodes(why, episodes=n) for why, n in reasons.items()]
+        missing = self.wanted - len(self.episodes)  # of these it is not known which reason is whose
+        return [SkippedEpisodes(" ".join([*reasons][:MAX_LISTED]), episodes=missing)] if missing else []
 
     def make(self, part: Part) -> Iterator[PartItem]:
         """The episodes of a part, in order. An unusable one is skipped, or raised, as the source's policy says."""
         spec, size = self._plan.spec, self._plan.tokenizer.image_size
         items = frames_ahead(
-            part.episodes,
+            self.episodes[part.first : part.end].tolist(),
             lambda i: self._source.open_episode(i, spec.image_key, spec.action_keys),
             lambda image: spec.correct(fit_image(image, size)),
             3 * size * size,

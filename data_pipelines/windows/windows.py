@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.sampling.splits import held_out_episodes, smallest_hashes, subset
+from data_pipelines.sampling.splits import smallest_hashes, subset, subset_salt, used_episodes
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.tokens.manifest import Manifest
 from data_pipelines.tokens.store import TokenStore
@@ -162,7 +162,7 @@ def _windows(
     steps = np.asarray(manifest.split(split).steps, np.int64)
     counts = slicer.count(steps, min_real)
     usable = np.flatnonzero(counts)
-    chosen = usable if limit is None else _chosen(manifest, split, counts > 0, limit, f"subset/{seed}")
+    chosen = usable if limit is None else _chosen(manifest, split, counts > 0, limit, subset_salt(seed))
     return WindowSet(
         name=name,
         split=split,
@@ -186,7 +186,7 @@ def _chosen(manifest: Manifest, split: str, usable: np.ndarray, limit: int, salt
     if not manifest.runs:  # a store that names episodes by their number
         return at[smallest_hashes(name, present[at], limit, salt)]
     ids = episode_ids(manifest.runs)
-    is_val = held_out_episodes(manifest.spec, manifest.runs, manifest.settings.held_out)
-    members = is_val == (split == "val")
+    train, val = used_episodes(manifest.spec, manifest.runs, manifest.settings.held_out)
+    members = val if split == "val" else train
     members[present[~usable]] = False
     return at[subset(name, ids, members, present[at], limit, salt)]

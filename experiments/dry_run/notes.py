@@ -48,7 +48,9 @@ def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
     widest = max(trials, key=lambda trial: (trial.model.width, trial.model.layers, len(trial.datasets)))
     caps = [trial.max_trajectories for trial in trials]
     some = any(trial.capped for trial in trials)  # a cap that holds for some datasets leaves the others whole
-    most = "all" if None in caps or some else f"at most {max(caps):,}"
+    most = None if None in caps or some else max(caps)
+    tokenised = setup.study.store.max_train
+    most = min((n for n in (most, tokenised) if n is not None), default=None)
     steps = sorted({trial.train.steps for trial in trials})
     longest = f"{'up to ' * (len(steps) > 1)}{counted(steps[-1], 'step')}"
     models = "a model of" if len({trial.model for trial in trials}) == 1 else "models of up to"
@@ -57,7 +59,8 @@ def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
     advice = f". It is made for a processor: on a GPU or TPU take --preset {instead}" if instead else ""
     say(
         f"note: preset {name} trains {models} {in_thousands(count_parameters(widest))} parameters on images of {height} x "
-        f"{width} pixels, for {longest} of {counted(widest.train.batch, 'window')}, with {most} "
+        f"{width} pixels, for {longest} of {counted(widest.train.batch, 'window')}, with "
+        f"{'all' if most is None else f'at most {most:,}'} "
         f"trajectories of each dataset{advice}"
     )
 
@@ -133,7 +136,7 @@ def _say_unused(study: Study) -> None:
     """A line on datasets that have more trajectories to train on than a trial takes, as far as it is known how many."""
     counts, names = study.trajectory_counts, study.dataset_names()
     sizes = {name: size_of(get_spec(name), study.store.held_out) for name in names}
-    larger = {name: size.episodes for name, size in sizes.items() if (size.trained or size.episodes) > counts[-1]}
+    larger = {name: size.tokenised for name, size in sizes.items() if (size.trained or size.tokenised) > counts[-1]}
     if larger:
         having = few([f"{name} has {have:,}" for name, have in larger.items()])
         every = ",".join(map(str, (*counts, max(larger.values()))))

@@ -49,7 +49,7 @@ class PreparingCost:
 @dataclass(frozen=True)
 class Frames:
     native: float
-    kept: float  # at the study's rate
+    kept: float  # at the study's rate, of the episodes that are tokenised
     simulated: bool
 
 
@@ -76,8 +76,8 @@ def estimate_preparing(
 
 
 def count_frames(study: Study, name: str) -> Frames | None:
-    """Number of frames of all episodes of a dataset, held-out ones included; None where nothing says
-    it."""
+    """Number of frames of the episodes of a dataset that tokens are made of, held-out ones included; None where
+    nothing says it."""
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
@@ -86,15 +86,18 @@ def count_frames(study: Study, name: str) -> Frames | None:
     if robot is not None:
         low, high = robot.seconds
         seconds = (high - low) / math.log(high / low) if high > low else low  # lengths are uniform in the logarithm
-        count = episode_count(robot, study.suite.scale, study.suite.fewest) + study.suite.validation
-        native = count * seconds * robot.hz
+        train = episode_count(robot, study.suite.scale, study.suite.fewest)
+        made = train + study.suite.validation
+        count = sum(study.store.held_out.used(train, study.suite.validation, bool(spec.val_split)))
+        native = made * seconds * robot.hz
     else:
         size = size_of(spec, study.store.held_out)
-        native = size.episodes * (size.mean_steps or spec.mean_steps or spec.median_steps)
+        made = count = size.tokenised
+        native = count * (size.mean_steps or spec.mean_steps or spec.median_steps)
         if not native:
             return None
     every = study.store.frame_step or spec.stride_at(study.rate)
-    return Frames(native, native / every, robot is not None)
+    return Frames(native, native * (count / made) / every, robot is not None)
 
 
 @functools.cache

@@ -180,7 +180,8 @@ def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[So
     more = [
         f"store.{name}: {trained_with[name]} -> {value}"
         for name, value in to_dict(study.store.held_out).items()
-        if value > trained_with.get(name, math.inf)
+        if name != "max_train"  # which changes nothing of what is held out
+        and value > trained_with.get(name, math.inf)
     ]
     if data and more:
         say(

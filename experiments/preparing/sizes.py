@@ -8,7 +8,7 @@ from dataclasses import replace
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec, find_spec
 from data_pipelines.sampling.splits import HeldOut
-from experiments.data_size import DataSize, sizes_by_tokens
+from experiments.data_size import DataSize, make_size, sizes_by_tokens
 from experiments.preparing.sources import group_by_dataset
 from experiments.running.workspace import Workspace
 from experiments.terminal.progress import say
@@ -28,14 +28,14 @@ def find_sizes(
     datasets: Mapping[str, Mapping[str, str]], held_out: HeldOut, workspace: Workspace
 ) -> dict[str, DataSize]:
     """The sizes of `datasets`, as `group_by_dataset` gives them, whose files say how many episodes there are or whose
-    tokens are in `workspace`: tokens that were made of as many episodes."""
+    tokens are in `workspace`: tokens that were made of as many episodes, of a dataset of as many."""
     by_tokens, sizes, others = sizes_by_tokens(workspace.data_summary), {}, []
     for name, places in datasets.items():
         spec, tokens = find_spec(name), by_tokens.get(name)
         files = spec and size_by_files(spec, places, held_out)
         if files and spec.episodes not in (0, files.episodes):
             others.append(f"{name} has {files.episodes:,} (not {spec.episodes:,})")
-        if files and tokens and files.episodes == tokens.episodes:
+        if files and tokens and (files.episodes, files.tokenised) == (tokens.episodes, tokens.tokenised):
             tokens = replace(tokens, mean_steps=files.mean_steps)
         elif files:
             tokens = None
@@ -59,10 +59,10 @@ def size_by_files(spec: DatasetSpec, places: Mapping[str, str], held_out: HeldOu
     if not all(parts):
         return None
     episodes = sum(part.episodes for part in parts)
-    trained = None
+    kept = None
     if not spec.val_split:
-        trained = episodes - sum(held_out.count(part.episodes) for part in parts)
+        kept = sum(held_out.count(part.episodes) for part in parts)
     elif all(val):
-        trained = episodes - sum(one.episodes for one in val)
+        kept = sum(one.episodes for one in val)
     steps = sum(part.episodes * part.mean_steps for part in parts) if all(part.mean_steps for part in parts) else 0
-    return DataSize(episodes, trained, mean_steps=steps / episodes)
+    return make_size(spec, held_out, episodes, kept, steps / episodes)

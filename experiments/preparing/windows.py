@@ -160,7 +160,7 @@ def _differences(existing: EvalManifest, wanted: EvalManifest) -> list[str]:
 
 def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float | None) -> dict[str, dict[str, int]]:
     """Per dataset: training episodes, those too short for a window or for a whole one, windows, episodes held out
-    and skipped."""
+    and skipped, and those that `StoreConfig.max_train` left out, if it did."""
     from data_pipelines.windows.windows import train_windows
 
     summary = {}
@@ -174,6 +174,8 @@ def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float 
             "held_out": len(manifest.val.episodes),
             "skipped": manifest.skipped_count,
         }
+        if manifest.left_out:
+            summary[name]["left_out"] = manifest.left_out
     return summary
 
 
@@ -183,7 +185,8 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
     for name, facts in summary.items():
         if get_spec(name).val_split:
             continue  # none of them was taken from what is trained on
-        held_out, episodes = facts["held_out"], facts["held_out"] + facts["episodes"]
+        held_out = facts["held_out"]
+        episodes = held_out + facts["episodes"] + facts.get("left_out", 0)
         if held_out > HELD_OUT * episodes and held_out > round(settings.val_fraction * episodes):
             many.append(f"{held_out} of {episodes} episodes of {name}")
     if many:
@@ -226,6 +229,9 @@ def _remark(name: str, facts: dict[str, int], no_evaluation: str) -> None:
         remarks.append(f"{facts['too_short']} of {facts['episodes']} training episodes are too short for any window")
     if facts["skipped"]:
         remarks.append(f"{facts['skipped']} damaged episodes are left out, and not replaced in subsets")
+    if left_out := facts.get("left_out"):
+        used = facts["episodes"] + facts["held_out"]
+        remarks.append(f"store.max_train leaves out {left_out:,} episodes; {used:,} are used, held-out ones included")
     if no_evaluation:
         remarks.append(f"it is not evaluated: {no_evaluation}")
     if remarks:

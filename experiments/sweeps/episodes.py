@@ -64,7 +64,8 @@ def count_episodes(study: Study, cap: int | None) -> int:
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
-    episodes = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
+    counts = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
+    episodes = {name: study.store.held_out.used(count, 0, True)[0] for name, count in counts.items()}
     given = [get_spec(name) for name in study.dataset_names() if name not in episodes]
     trained = {spec.name: size_of(spec, study.store.held_out).trained for spec in given}
     known = {name: count for name, count in trained.items() if count is not None}

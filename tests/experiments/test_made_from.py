@@ -13,6 +13,7 @@ from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
 from data_pipelines.windows.evalset import ChoiceSettings, DatasetWindows, EvalManifest
 from experiments.cli.main import main
+from experiments.data_size import sizes_by_tokens
 from experiments.preparing import given_tokenizer
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import (
@@ -123,6 +124,7 @@ def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
         (["--set", "tau=2"], "tokenizer", "tau: 3.0 -> 2.0"),
         (["--set", "tokenizer.channels=8"], "tokenizer", "tokenizer.channels: 16 -> 8"),
         (["--set", "store.min_val=1"], "tokenizer", "store.min_val: 2 -> 1"),
+        (["--set", "store.max_train=4"], "tokenizer", "store.max_train: None -> 4"),
         (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 3 -> 1 (berkeley_gnm_cory_hall, "),
         (["--set", "eval.windows_per_dataset=1"], "windows", "eval.windows_per_dataset: 2 -> 1"),
         (["--set", "eval.seed=7"], "windows", "eval.seed: 0 -> 7"),
@@ -300,6 +302,18 @@ def test_the_tokenizer_that_is_there_can_be_given(hma, out):
 
 
 # --- Sources and earlier versions --------------------------------------------------------------
+
+
+def test_another_part_of_the_data_is_tokenised_by_the_tokenizer_that_is_there(hma, out):
+    """As the page on own data says it."""
+    limit = ["--set", "store.max_train=4", "--tokenizer", str(out / "tokenizer")]
+    code, said = hma("tokenize", *limit)
+    assert code == 2 and "store.max_train: None -> 4 (" in said and "--replace tokens" in said
+    code, said = hma("tokenize", *limit, "--replace", "tokens")
+    assert code == 0 and "may have been trained on" not in said
+    assert f"{ARM.name}: store.max_train leaves out 2 episodes; 6 are used" in " ".join(said.split())
+    size = sizes_by_tokens(out / "data.json")[ARM.name]
+    assert (size.episodes, size.tokenised) == (8, 6)
 
 
 def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypatch):

@@ -13,6 +13,7 @@ from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
+from experiments.data_size import size_by_entry, size_of
 from experiments.dry_run.cost import count_parameters
 from experiments.dry_run.notes import say_scale
 from experiments.dry_run.preparing_cost import count_frames, estimate_preparing
@@ -118,6 +119,18 @@ def test_held_out_trajectories_are_not_called_unused(data, capsys, tmp_path):
     words = ("sweep", "width", "--dry-run", *data, "--out", str(tmp_path), "--set")
     assert len(said_by(capsys, *words, "trajectory_counts=94800")) == 1
     assert len(said_by(capsys, *words, "trajectory_counts=94799")) == 2
+
+
+def test_a_dry_run_plans_with_the_part_of_a_dataset_that_is_tokenised(data, capsys, tmp_path):
+    """The 200 that are held out of 95,000 come on top."""
+    words = ("sweep", "width", "--dry-run", *data, "--out", str(tmp_path), "--set")
+    (scale,) = said_by(capsys, *words, "store.max_train=100")  # none that a trial would not use
+    assert "with at most 100 trajectories of each dataset" in scale
+    directories, registry = tuple(data[1:3]), Path(data[-1])
+    study = make_setup(StudyArguments("cpu", tmp_path, directories, registry, set=("store.max_train=100",))).study
+    sizes = [size_of(get_spec(name), study.store.held_out) for name in ("large", "small")]
+    assert [(size.episodes, size.tokenised, size.trained) for size in sizes] == [(95_000, 300, 100), (4, 4, 3)]
+    assert size_by_entry(replace(get_spec("large"), episodes=1000), study.store.held_out).tokenised == 150
 
 
 def test_it_is_said_which_points_an_axis_does_not_have(capsys, tmp_path):

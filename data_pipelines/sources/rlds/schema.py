@@ -143,7 +143,7 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
         require(
             part in info.splits,
             f"{info.name}: no split {part!r} in {directory}; it has {listing(sorted(info.splits))}. Choose one with "
-            "--split, or, if the command has no such option, with split in the dataset's registry entry.",
+            f"--split, or, if the command has no such option, with split in the dataset's registry entry.{of_a_part(part)}",
         )
     try:
         shards = [name for part in parts for name in info.shard_names(part)]
@@ -158,6 +158,15 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
         shard_splits=[part for part in parts for _ in info.splits[part].shard_lengths],
         file_format=info.file_format,
     )
+
+
+def of_a_part(split: str) -> str:
+    """The end of a message that refuses `split`: what to do where it is a part of one, such as "train[:5]"; ''
+    otherwise."""
+    whole, _, part = split.partition("[")
+    if not part:
+        return ""
+    return f" Of a split no part can be named: give {whole!r}, and tokenise N of its episodes with --set store.max_train=N."
 
 
 def read_features(directory: Location) -> dict[str, FlatFeature]:

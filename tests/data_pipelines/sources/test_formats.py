@@ -626,8 +626,11 @@ def test_what_is_no_dataset_is_named(tmp_path):
     (tmp_path / "x.hdf5").write_bytes(b"no file of this kind")
     with pytest.raises(DataError, match="x.hdf5: not a readable HDF5 file"):
         open_source(tmp_path / "x.hdf5")
-    with pytest.raises(ConfigError, match="no split 'test'"):
-        open_source(write_lerobot(tmp_path / "toy-arm", "v2.1"), "test")
+    arm = write_lerobot(tmp_path / "toy-arm", "v2.1")
+    with pytest.raises(ConfigError, match="no split 'test'.* or in the dataset's registry entry\\.$"):
+        open_source(arm, "test")
+    with pytest.raises(ConfigError, match=r"no split 'train\[:4\]'.* give 'train', .* --set store\.max_train=N\.$"):
+        open_source(arm, "train[:4]")
 
 
 def test_corrupt_records_are_episode_errors():

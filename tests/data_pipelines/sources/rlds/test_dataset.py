@@ -190,6 +190,8 @@ def test_flipped_bit_in_a_record(directory):
 def test_unknown_split(directory):
     with pytest.raises(ConfigError, match="no split 'test'.*; it has train"):
         RldsDataset(directory, "test")
+    with pytest.raises(ConfigError, match=r"no split 'train\[:5\]'.* give 'train', .* --set store\.max_train=N\.$"):
+        RldsDataset(directory, "train[:5]")
 
 
 def test_wrong_image_key_lists_the_images(directory):
