@@ -1,13 +1,16 @@
 """Validation of names and relative paths read from untrusted files, before they become paths on this machine.
 
-Owns what a dataset may be called and what a path inside a dataset may look like. Only the text of a path is
-checked: symbolic links are followed, as download caches consist of them.
+Owns what a dataset may be called, by which file one of a token store is recognised, and what a path inside a dataset
+may look like. Only the text of a path is checked: symbolic links are followed, as download caches consist of them.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+
+MANIFEST = "manifest.json"
+"""The file that every dataset of a token store has."""
 
 MAX_NAME_LENGTH = 128
 MAX_PATH_LENGTH = 1024

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from data_pipelines.errors import MAX_LISTED, DataError, UnreachableError
+from data_pipelines.errors import MAX_LISTED, DataError, NoDatasetError, UnreachableError
+from data_pipelines.names import MANIFEST
 from data_pipelines.sources.joined import JoinedSource, Parts
 from data_pipelines.sources.lerobot_dataset import LeRobotDataset, lerobot_name
 from data_pipelines.sources.lerobot_meta import read_info
@@ -67,6 +68,12 @@ def find_format(location: str | Location) -> str:
         except UnreachableError:
             raise
         except DataError as error:
+            if _holds_tokens(place):
+                raise NoDatasetError(
+                    f"{place}: a token store, not recordings. Give the directory of the recordings: tokens that were made "
+                    "of them are used where --out is the directory of their study. To train on tokens that were imported: "
+                    'docs/own_data.md, "Training on tokens of the release".'
+                ) from error
             raise type(error)(f"{error}{_meant(place)}") from error
     require(
         found == "rlds" or not is_remote(place),
@@ -80,6 +87,14 @@ def _signs(place: Location) -> str:
     if place.suffix in HDF5 and (is_remote(place) or place.is_file()):
         return "robomimic"
     return "lerobot" if (place / "meta" / "info.json").is_file() else "rlds"
+
+
+def _holds_tokens(place: Path) -> bool:
+    """Whether a path is a token store, or a dataset of one."""
+    try:
+        return (place / MANIFEST).is_file() or any((p / MANIFEST).is_file() for p in place.iterdir())
+    except OSError:  # a file, a missing directory, or one that may not be read
+        return False
 
 
 def _meant(place: Path) -> str:

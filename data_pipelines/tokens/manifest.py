@@ -18,6 +18,7 @@ import numpy as np
 
 from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
+from data_pipelines.names import MANIFEST
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources.identity import EpisodeRun, runs_of_parts
@@ -29,7 +30,7 @@ from hma_jax.config.json import identity_of, stable_hash
 from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import Embodiment
 
-FILE = "manifest.json"
+FILE = MANIFEST
 SPLITS = ("train", "val")
 COLUMNS_FILE = "episodes.columns"
 EPISODE_COLUMNS = ("episodes", "steps")

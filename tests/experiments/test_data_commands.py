@@ -183,7 +183,7 @@ def test_token_folders_are_imported_in_pairs(tmp_path, capsys):
     out = said(capsys)
     assert "toy_arm: 3 + 3 episodes, 16 tokens per frame, ids of 262,144, by magvit magvit2.ckpt" in out
     assert "toy_leg: 3 + 3 episodes, 4 tokens per frame, latents of 16 values" in out
-    assert "note: without --tokenizer" in out
+    assert "note: without --tokenizer" in out and f"next: train on {tmp_path}/store with the program of docs/" in out
     assert TokenStore(tmp_path / "store").names == ("toy_arm", "toy_leg")
     assert main(["data", "import-tokens", *folders, "--store", str(tmp_path), "--name", "x", "--hz", "4"]) == 2
     assert "--name can be given for one dataset, not for 2" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from data_pipelines.sources.settings import (
     RobomimicSettings,
 )
 from experiments.study_setup import UNSET, command
-from experiments.terminal.progress import say, step, wrote
+from experiments.terminal.progress import say, short, step, wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -189,8 +189,8 @@ def import_tokens(
     """Read token folders of the official release (video.bin, actions, segment_ids.bin) into a token store.
 
     A dataset is a pair of folders whose names end in _train and _val; give either of them. The tokens are stored
-    unchanged. The store is for your own programs (data_pipelines.loading.loader.make_loader); other commands make
-    tokens from recordings themselves.
+    unchanged. The store is for a program of your own, such as the one of docs/own_data.md that trains a model on it;
+    other commands make tokens from recordings themselves.
 
     Args:
         folders: Folders to read.
@@ -235,3 +235,4 @@ def import_tokens(
         wrote(store / spec.name)
     if tokenizer is None:
         say("note: without --tokenizer no frames are stored, so evaluation in pixels cannot use these datasets")
+    say(f'next: train on {short(store)} with the program of docs/own_data.md, "Training on tokens of the release"')

@@ -21,6 +21,7 @@ from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, N
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
+from data_pipelines.names import MANIFEST
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources import lerobot_dataset, lerobot_meta
@@ -631,6 +632,16 @@ def test_what_is_no_dataset_is_named(tmp_path):
         open_source(arm, "test")
     with pytest.raises(ConfigError, match=r"no split 'train\[:4\]'.* give 'train', .* --set store\.max_train=N\.$"):
         open_source(arm, "train[:4]")
+
+
+def test_a_token_store_is_no_dataset_and_told_as_such(tmp_path):
+    """It was called a directory of foreign files."""
+    own = tmp_path / "tokens" / "toy"
+    own.mkdir(parents=True)
+    (own / MANIFEST).write_text("{}")
+    for place in (own, own.parent):
+        with pytest.raises(NoDatasetError, match=rf"^{place}: a token store, not recordings\. .* docs/own_data\.md"):
+            open_source(place)
 
 
 def test_corrupt_records_are_episode_errors():
