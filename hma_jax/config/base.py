@@ -5,13 +5,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 BEFORE = "before"
 """The key of a field's metadata under which `later` keeps its value."""
+
+SCALARS = (bool, int, float, str)
+"""Types of a single value that are checked, as no other but configs and tuples is."""
+
+UNIONS = (typing.Union, types.UnionType)
 
 
 class ConfigError(ValueError):
@@ -54,41 +60,97 @@ def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
 
 
 def check_fields(config: Any, infinite_allowed: tuple[str, ...] = ()) -> None:
-    """Raises ConfigError for a field of a dataclass that is not among the choices of its type (a Literal, one or None,
-    or a tuple of such), and for a number that is not finite. Fields in `infinite_allowed` may be infinite: no limit.
+    """Raises ConfigError for a field of a dataclass whose value is not of its declared type (`as_declared`), and for a
+    number that is not finite. Fields in `infinite_allowed` may be infinite: no limit.
 
-    A list is replaced by a tuple: configurations are hashed, as keys of compiled programs."""
+    A list is replaced by a tuple: configurations are hashed, as keys of compiled programs. A number of NumPy is
+    replaced by Python's, which JSON has."""
     where = type(config).__name__
-    for name, value in list(vars(config).items()):
-        if isinstance(value, list):
-            object.__setattr__(config, name, tuple(value))
-    for name, choices, several in _choices(type(config)):
+    for name, hint in hints_of(type(config)).items():
         value = getattr(config, name)
-        for one in value if several else (value,):
-            require_choice(one, choices, f"{where}.{name}")
-    for name, value in vars(config).items():
+        if type(value) is not hint:  # of most it is
+            value = as_declared(hint, value, f"{where}.{name}", _as_made)
+            object.__setattr__(config, name, value)
         finite = (
             not isinstance(value, float) or math.isfinite(value) or (name in infinite_allowed and value == math.inf)
         )
         require(finite, f"{where}.{name} must be finite, got {value}")
 
 
-@functools.cache
-def _choices(cls: type) -> tuple[tuple[str, tuple[Any, ...], bool], ...]:
-    """(field, its choices, whether it is a tuple of them) of every field with choices."""
-    found = []
-    for name, hint in typing.get_type_hints(cls).items():
-        several = typing.get_origin(hint) is tuple
-        choices = _of_literals(typing.get_args(hint)[0] if several else hint)
-        if choices:
-            found.append((name, choices, several))
-    return tuple(found)
+@functools.cache  # by class; thousands are made and read
+def hints_of(cls: type) -> dict[str, Any]:
+    """The types of a dataclass's fields, by their names."""
+    hints = typing.get_type_hints(cls)
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls)}
 
 
-def _of_literals(hint: Any) -> tuple[Any, ...]:
-    """The values of a Literal, or of `Literal | None`; empty for other types."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+def as_declared(hint: Any, value: Any, where: str, plain: Callable[[Any, Any, str], Any]) -> Any:
+    """`value` for a field of type `hint`: a choice of a Literal, a tuple (from a list too), of a union the member that
+    `value` looks like. Of other types it is what `plain(hint, value, where)` returns. Raises ConfigError, which begins
+    with `where`."""
+    if choices := _choices(hint):
+        require_choice(value, choices, where)
+        return value
+    origin = typing.get_origin(hint)
+    if origin in UNIONS:
+        if value is None and type(None) in typing.get_args(hint):
+            return None
         options = [option for option in typing.get_args(hint) if option is not type(None)]
-        choices = _of_literals(options[0]) if len(options) == 1 else ()
+        return as_declared(_member(options, value, where), value, where, plain)
+    if origin is tuple:
+        require(isinstance(value, (list, tuple)), f"{where}: expected a list, got {value!r}")
+        args = typing.get_args(hint)
+        if len(args) == 2 and args[1] is Ellipsis:
+            args = (args[0],) * len(value)
+        require(len(value) == len(args), f"{where}: expected {len(args)} values, got {value!r}")
+        return tuple(as_declared(a, v, where, plain) for a, v in zip(args, value, strict=True))
+    return plain(hint, value, where)
+
+
+def as_scalar(hint: type, value: Any, where: str) -> Any:
+    """`value` for a field of one of the types `SCALARS`. A number of NumPy becomes Python's, and 1000.0 becomes 1000
+    where `hint` is int; 1 stays 1 where it is float. Raises ConfigError, which begins with `where`, for all else: no
+    bool is a number, and no number a bool."""
+    given = value
+    if getattr(value, "shape", None) == ():
+        value = value.item()  # of NumPy, or an array of one number
+    if hint is int and isinstance(value, float) and value.is_integer():
+        value = int(value)
+    kinds = (int, float) if hint is float else hint
+    fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
+    require(fits, f"{where}: expected {hint.__name__}, got {given!r}")
+    whole = hint is float and isinstance(value, int)
+    require(not whole or abs(value) <= sys.float_info.max, f"{where}: the number is too large for a float")
+    return value
+
+
+def _as_made(hint: Any, value: Any, where: str) -> Any:
+    if hint in SCALARS:
+        return as_scalar(hint, value, where)
+    fits = not dataclasses.is_dataclass(hint) or isinstance(value, hint)
+    require(fits, f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
+    return value
+
+
+def _member(options: list[Any], value: Any, where: str) -> Any:
+    """The member of a union that `value` is meant for: the tuple if it is a list, its class, or among configs the one
+    with the same `kind`; else the first."""
+    for option in options:
+        kinds = (list, tuple) if typing.get_origin(option) is tuple else option
+        if isinstance(kinds, (type, tuple)) and isinstance(value, kinds):
+            return option
+    if len(options) == 1 or not isinstance(value, dict) or "kind" not in value:
+        return options[0]
+    kinds = {option.kind: option for option in options if hasattr(option, "kind")}
+    require(value["kind"] in kinds, f"{where}: unknown kind {value['kind']!r}; known: {', '.join(kinds)}")
+    return kinds[value["kind"]]
+
+
+@functools.cache
+def _choices(hint: Any) -> tuple[Any, ...]:
+    """The values of a Literal, or of `Literal | None`; empty for other types."""
+    if typing.get_origin(hint) in UNIONS:
+        options = [option for option in typing.get_args(hint) if option is not type(None)]
+        choices = _choices(options[0]) if len(options) == 1 else ()
         return (*choices, None) if choices else ()
     return typing.get_args(hint) if typing.get_origin(hint) is Literal else ()

@@ -7,16 +7,12 @@ nothing here knows a field by name.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import json
-import sys
-import types
-import typing
 from collections.abc import Collection
-from typing import Any, Literal
+from typing import Any
 
-from hma_jax.config.base import BEFORE, require, require_choice
+from hma_jax.config.base import BEFORE, SCALARS, as_declared, as_scalar, hints_of, require
 
 INFINITE = ("Infinity", "-Infinity")
 """Numbers that `to_plain_json` writes as strings."""
@@ -70,7 +66,7 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
     Unknown keys, missing ones without a default, values of the wrong kind and choices that are not on offer raise
     ConfigError naming the field.
     """
-    hints = _hints(cls)
+    hints = hints_of(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}
     where = where or cls.__name__
     require(isinstance(values, dict), f"{where}: expected named fields ({', '.join(known)}), got {values!r}")
@@ -83,54 +79,15 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
     ]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
     before = {n: f.metadata[BEFORE] for n, f in known.items() if BEFORE in f.metadata and n not in values}
-    return cls(**before, **{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
-
-
-_hints = functools.cache(typing.get_type_hints)  # by class; thousands are read
+    return cls(**before, **{n: as_declared(hints[n], v, f"{where}.{n}", _decode) for n, v in values.items()})
 
 
 def _decode(hint: Any, value: Any, where: str) -> Any:
-    origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None:
-            return None
-        options = [a for a in typing.get_args(hint) if a is not type(None)]
-        return _decode(_by_kind(options, value, where), value, where)
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)
-    if origin is Literal:
-        require_choice(value, typing.get_args(hint), where)
-        return value
-    if origin is tuple:
-        require(isinstance(value, (list, tuple)), f"{where}: expected a list, got {value!r}")
-        args = typing.get_args(hint)
-        if len(args) == 2 and args[1] is Ellipsis:
-            args = (args[0],) * len(value)
-        require(len(value) == len(args), f"{where}: expected {len(args)} values, got {value!r}")
-        return tuple(_decode(a, v, where) for a, v in zip(args, value, strict=True))
-    if hint in (bool, int, float, str):
-        if hint is float and value in INFINITE:
-            return float(value)
-        kinds = (int, float) if hint is float else hint
-        fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
-        require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
-        whole = hint is float and isinstance(value, int)
-        require(not whole or abs(value) <= sys.float_info.max, f"{where}: the number is too large for a float")
-        return hint(value)
-    return value
-
-
-def _by_kind(options: list[Any], value: Any, where: str) -> Any:
-    """The member of a union that `value` is decoded as: among configs the one with the same `kind` (default: the
-    first), or the tuple if `value` is a list."""
-    tuples = [option for option in options if typing.get_origin(option) is tuple]
-    if isinstance(value, (list, tuple)) and tuples:
-        return tuples[0]
-    if len(options) == 1 or not isinstance(value, dict) or "kind" not in value:
-        return options[0]
-    kinds = {option.kind: option for option in options if hasattr(option, "kind")}
-    require(value["kind"] in kinds, f"{where}: unknown kind {value['kind']!r}; known: {', '.join(kinds)}")
-    return kinds[value["kind"]]
+    if hint is float:
+        return float(value if value in INFINITE else as_scalar(float, value, where))
+    return as_scalar(hint, value, where) if hint in SCALARS else value
 
 
 def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

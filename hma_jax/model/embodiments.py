@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import ConfigError, require
+from hma_jax.config.base import check_fields
 
 Array = TypeVar("Array", jax.Array, np.ndarray)
 
@@ -50,6 +51,7 @@ class Embodiment:
             values = getattr(self, name)
             if not isinstance(values, tuple):  # lists and arrays are as good, but have no hash
                 object.__setattr__(self, name, tuple(np.asarray(values).tolist()))
+        check_fields(self)
         require(
             len(self.mean) == len(self.std) == self.action_dim,
             f"embodiment {self.name!r}: mean and std must have {self.action_dim} entries, "

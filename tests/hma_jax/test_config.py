@@ -8,6 +8,7 @@ import math
 import typing
 from typing import Literal
 
+import numpy as np
 import pytest
 
 from hma_jax import config
@@ -22,6 +23,7 @@ from hma_jax.config import (
     ModelConfig,
     MupConfig,
     OptimizerConfig,
+    PythonConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
@@ -61,6 +63,61 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         check_fields(Some("c"))
     with pytest.raises(ConfigError, match="Some.several: 3 is not allowed; choose one of 1, 2"):
         check_fields(Some(several=(1, 3)))
+
+
+MADE = [PythonConfig(vocab_size=2) if cls is PythonConfig else cls() for cls in CONFIGS] + [Embodiment(**ARM)]
+SCALARS = [
+    (made, f.name, f.type) for made in MADE for f in dataclasses.fields(made) if f.type in ("bool", "int", "float")
+]
+
+
+def test_numbers_are_pythons_whichever_way_they_are_written():
+    """A run with warmup_steps=1e3 was trained and saved, and then refused whenever it was read."""
+    assert {kind for _, _, kind in SCALARS} == {"bool", "int", "float"} and len(SCALARS) > 100
+    as_good = {"bool": (np.bool_,), "int": (np.int64, np.uint32, float, np.float32), "float": (np.float64, np.array)}
+    for made, name, kind in SCALARS:
+        value = getattr(made, name)
+        for write in as_good[kind]:
+            if write is np.uint32 and value < 0:
+                continue
+            again = dataclasses.replace(made, **{name: write(value)})
+            assert again == made and type(getattr(again, name)) is type(value)
+            assert from_dict(type(made), json.loads(json.dumps(to_dict(again)))) == made
+
+
+def test_values_of_another_type_are_refused_when_a_configuration_is_made():
+    """Each was accepted, and ended in an error that named no field, or in a run that could not be read."""
+    wrong = {"bool": (1, 0.0, "true", None), "int": (2.5, True, "2", None, [2]), "float": (True, "0.1", None, 10**400)}
+    for made, name, kind in SCALARS:
+        for value in wrong[kind]:
+            with pytest.raises(
+                ConfigError, match=rf"^{type(made).__name__}\.{name}: (expected {kind}|the number is too)"
+            ):
+                dataclasses.replace(made, **{name: value})
+    for cls, values, message in (
+        (TrainConfig, {"optimizer": {"learning_rate": 0.1}}, r"optimizer: expected OptimizerConfig, got \{"),
+        (TrainConfig, {"only": "arm"}, "only: expected a list, got 'arm'"),
+        (TrainConfig, {"only": (1,)}, "only: expected str, got 1"),
+        (ModelConfig, {"diffusion": MupConfig()}, "diffusion: expected DiffusionConfig, got MupConfig"),
+        (Magvit2Config, {"image_size": None}, "image_size: expected int, got None"),
+        (Magvit2Config, {"image_size": (64, 64, 3)}, r"image_size: expected 2 values, got \(64, 64, 3\)"),
+    ):
+        with pytest.raises(ConfigError, match=f"^{cls.__name__}.{message}"):
+            cls(**values)
+    assert Magvit2Config(image_size=[64.0, np.int64(128)]).image_size == (64, 128)
+
+
+def test_a_whole_number_for_a_float_is_called_as_ever():
+    """Finished trials are named by the text of it: 8.0 would be another."""
+    assert json.dumps(to_dict(MupConfig(attention_scale=8))["attention_scale"]) == "8"
+    assert stable_hash(MupConfig(attention_scale=8)) != stable_hash(MupConfig(attention_scale=8.0))
+
+
+def test_a_whole_number_that_was_written_as_a_float_is_read():
+    read = from_dict(OptimizerConfig, {"warmup_steps": 1000.0})
+    assert json.dumps(to_dict(read)["warmup_steps"]) == "1000"
+    with pytest.raises(ConfigError, match="OptimizerConfig.warmup_steps: expected int, got 2.5"):
+        from_dict(OptimizerConfig, {"warmup_steps": 2.5})
 
 
 @pytest.mark.parametrize(
