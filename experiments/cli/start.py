@@ -3,13 +3,15 @@
 import faulthandler
 import sys
 
+from experiments.terminal.program import is_program
 from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt
 from hma_jax.runtime.host_memory import collect_rarely, restart_keeping_pages
 
 
 def start() -> None:
     faulthandler.enable()  # what each thread did, when a library ends the process by a signal
-    restart_keeping_pages()
+    if is_program():
+        restart_keeping_pages()
     collect_rarely()
     try:
         with sigterm_as_interrupt():

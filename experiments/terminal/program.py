@@ -1,19 +1,33 @@
-"""The program's name, and how the modules that it imports start it: by becoming it, so that
-nothing imports in a circle."""
+"""The program's name, and how the modules that it imports start it: by its name, so none imports in a circle."""
 
 from __future__ import annotations
 
 import os
+import re
+import runpy
 import shlex
 import sys
-from typing import NoReturn
 
 PROGRAM = "hma"
 
 
-def run_sweep(axis: str) -> NoReturn:
+def run_sweep(axis: str) -> None:
     """The main of an experiment module: `python -m experiments.sweeps.width` is `hma sweep width`."""
-    os.execv(sys.executable, [sys.executable, "-m", "experiments.cli", "sweep", axis, *sys.argv[1:]])
+    before, asked = sys.argv, ["sweep", axis, *sys.argv[1:]]
+    if is_program():
+        os.execv(sys.executable, [sys.executable, "-m", "experiments.cli", *asked])
+    sys.argv = [*before[:1], *asked]
+    try:
+        runpy.run_module("experiments.cli", run_name="__main__")
+    finally:
+        sys.argv = before
+
+
+def is_program() -> bool:
+    """Whether Python was started for this program alone: by its script, or with `-m`. Otherwise, as under `runpy` or
+    `%run` of a notebook, starting another one in this process would lose all that it holds."""
+    started = " ".join(sys.orig_argv[1 : len(sys.orig_argv) - len(sys.argv) + 1])  # without the program's arguments
+    return re.search(rf"(^|[ /]){PROGRAM}$|(^| )-m ?experiments\.[\w.]+$", started) is not None
 
 
 def command_line() -> str:

@@ -41,7 +41,8 @@ _keeps_freed_memory = False
 
 
 def restart_keeping_pages() -> None:
-    """Starts the program of this process again, in this process, with `KEPT_PAGES`. Call it first of all.
+    """Starts the program of this process again, in this process, with `KEPT_PAGES`. Call it first of all, and
+    only where the process is the program's own.
 
     Returns where it is so already: the tunables are set, as the user wants them or by an earlier
     call. Does nothing where the C library is not glibc.

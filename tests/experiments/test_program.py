@@ -1,0 +1,53 @@
+"""How the program and the modules that start it treat the process they run in."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from experiments.terminal.program import is_program
+
+NOTEBOOK = """
+import runpy, sys
+print("first cell", flush=True)
+sys.argv = ["notebook", "--help"]
+try:
+    runpy.run_module({module!r}, run_name="__main__", alter_sys=True)
+except SystemExit as end:
+    print("\\nnext cell", end.code, sys.argv)
+"""
+
+
+@pytest.mark.parametrize("module", ["experiments.cli", "experiments.sweeps.width"])
+def test_a_process_that_runs_a_module_goes_on_after_it(module):
+    """A notebook was replaced by the program, or by itself, and all its variables were lost."""
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
+    command = [sys.executable, "-c", NOTEBOOK.format(module=module)]
+    lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert lines.count("first cell") == 1 and lines[1].startswith("usage: hma")
+    assert lines[-1] == "next cell 0 ['notebook', '--help']"
+
+
+@pytest.mark.parametrize(
+    ("started", "arguments", "program"),
+    [
+        ("python -m experiments.cli", "study --out a", True),
+        ("python -u -X dev -mexperiments.sweeps.width", "", True),
+        ("python /venv/bin/hma", "--help", True),
+        ("python hma", "", True),
+        ("python -m ipykernel_launcher -f kernel.json", None, False),
+        ("python /venv/bin/ipython", None, False),
+        ("python /home/hma/notes.py", "", False),
+        ("python notes.py", "hma", False),
+        ("python", None, False),
+    ],
+)
+def test_a_process_is_the_programs_own_if_python_was_started_for_it(started, arguments, program, monkeypatch):
+    """None: %run puts the arguments of what it runs in place of the notebook's own."""
+    asked = (arguments or "").split()
+    monkeypatch.setattr(sys, "orig_argv", [*started.split(), *asked])
+    monkeypatch.setattr(sys, "argv", ["file", *asked] if arguments is not None else ["file", "--preset", "smoke"])
+    assert is_program() == program
