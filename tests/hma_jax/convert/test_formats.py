@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -222,24 +223,38 @@ assert not [name for name in sys.modules if name.split(".")[0] in ("hma_jax", "e
 """
 
 
-@pytest.mark.parametrize(
-    "changes, decode, frames, dtype",
-    [
-        ({}, DecodeConfig(2, 1.0), 4, "float32"),
-        ({}, DecodeConfig(2, 1.0, slide="streaming"), 7, "bfloat16"),
-        pytest.param(
-            {"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3)), 6, "float32",
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["discrete", "past the window in bfloat16", "continuous, past the window"],
-)  # fmt: skip
-def test_the_program_generates_the_same_frames_where_this_project_is_not_installed(
-    changes, decode, frames, dtype, tmp_path
-):
-    run, config = small_run(**changes), ProgramConfig(batch=2, prompt=2, frames=frames, decode=decode, dtype=dtype)
-    out = tmp_path / "out"
-    write_stablehlo(run, out, config)
+EXPORTED = {
+    "discrete": ({}, DecodeConfig(2, 1.0), 4, "float32"),
+    "past the window in bfloat16": ({}, DecodeConfig(2, 1.0, slide="streaming"), 7, "bfloat16"),
+    "continuous, past the window": (
+        {"diffusion": DIFFUSION},
+        DecodeConfig(2, sampler=SamplerConfig(steps=3)),
+        6,
+        "float32",
+    ),
+}
+"""(changes of the model, decoding, frames, type) of a program."""
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Writes a program of EXPORTED, once; returns its directory."""
+
+    @functools.cache
+    def write(name: str) -> Path:
+        changes, decode, frames, dtype = EXPORTED[name]
+        out = tmp_path_factory.mktemp("exported") / "program"
+        config = ProgramConfig(batch=2, prompt=2, frames=frames, decode=decode, dtype=dtype)
+        write_stablehlo(small_run(**changes), out, config)
+        return out
+
+    return write
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * ("continuous" in n)) for n in EXPORTED])
+def test_the_program_generates_the_same_frames_where_this_project_is_not_installed(name, exported):
+    changes, decode, frames, dtype = EXPORTED[name]
+    run, out = small_run(**changes), exported(name)
     batch = random_batch(0, replace(run.model, frames=frames), 2)
     key = np.array([7, 11], np.uint32)
     given = {
@@ -276,24 +291,16 @@ def test_the_program_generates_the_same_frames_where_this_project_is_not_install
     ],
     ids=["robot", "id"],
 )
-def test_the_page_s_caller_of_a_program_refuses_robots_and_ids_that_there_are_not(zeros, others, program, monkeypatch):
+def test_the_page_s_caller_of_a_program_refuses_robots_and_ids_that_there_are_not(zeros, others, exported, monkeypatch):
     """The program makes frames of them that look like others."""
     (text,) = (one for one in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S) if "export" in one)
-    monkeypatch.chdir(program)
+    monkeypatch.chdir(exported("discrete").parent)
     names: dict = {}
     exec(text, names)
-    assert names["frames"].shape == (1, 1, 9)
+    assert names["frames"].shape == (2, 2, 9)
     assert text.count(zeros) == 1
     with pytest.raises(AssertionError):
         exec(text.replace(zeros, others), {})
-
-
-@pytest.fixture(scope="module")
-def program(tmp_path_factory):
-    """Where `program` is what the page calls so."""
-    folder = tmp_path_factory.mktemp("page")
-    write_stablehlo(small_run(), folder / "program", ProgramConfig(prompt=3, frames=4, platforms=("cpu",)))
-    return folder
 
 
 @pytest.mark.slow
