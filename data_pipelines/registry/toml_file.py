@@ -44,6 +44,11 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
                 )
             if "name" in fields:  # it would be the entry of another dataset than the heading says
                 raise ConfigError(f"{name}: remove name = {fields['name']!r}; the heading is the name of the entry")
+            if isinstance(fields.get("image_key"), list):
+                raise ConfigError(
+                    f"{name}: image_key = {fields['image_key']!r} lists cameras, but a model has one; name one of them. "
+                    "docs/own_data.md says what can be done with several"
+                )
             entry = from_dict(DatasetSpec, {"name": name} | fields, name)
             if entry.angles and "angle_form" not in fields:  # by default they would stay as they are
                 raise ConfigError(f'{name}: angles needs angle_form too; add angle_form = "sine_cosine" or "unwrapped"')

@@ -195,6 +195,14 @@ def test_an_entry_of_ones_own_may_have_its_own_rate(tmp_path):
     assert read == entry and read.stride_at(2.0) == 1
 
 
+def test_several_cameras_in_an_entry_are_refused_with_what_to_do(tmp_path):
+    """It said "expected str", of what other programs take."""
+    entry = to_toml(DatasetSpec("x", "observation/a", ("action",), (1,), 30))
+    (tmp_path / "own.toml").write_text(entry.replace('"observation/a"', '["observation/a", "observation/b"]'))
+    with pytest.raises(ConfigError, match=r"own.toml: x: image_key = \[.*\] lists cameras, .* name one of them. docs/"):
+        load_entries(tmp_path / "own.toml")
+
+
 def test_the_layout_of_actions_is_that_of_keys_and_their_order_alone():
     spec = DatasetSpec("x", "observation/image", ("action/a", "action/b"), (2, 2), 30)
     same = replace(spec, name="y", hz=10, image_key="observation/other", note="words", video_targets=False, rate=5.0)
