@@ -68,9 +68,17 @@ def find_starts(directory: Path) -> tuple[Start, ...]:
 
 
 def find_decode(directory: Path) -> DecodeConfig:
-    """From decode.json, otherwise DEFAULT_DECODE. Raises ConfigError for a file that is damaged."""
+    """From decode.json; what it leaves out is as in DEFAULT_DECODE. Raises ConfigError for a file that is damaged."""
     path = directory / DECODE
-    return from_dict(DecodeConfig, _read(path), str(path)) if path.exists() else DEFAULT_DECODE
+    stated = _read(path) if path.exists() else {}
+    return from_dict(DecodeConfig, _completed(to_dict(DEFAULT_DECODE), stated), str(path))
+
+
+def _completed(usual: Any, stated: Any) -> Any:
+    """`stated`, with what it leaves out of `usual`."""
+    if not (isinstance(usual, dict) and isinstance(stated, dict)):
+        return stated
+    return usual | {name: _completed(usual.get(name), value) for name, value in stated.items()}
 
 
 def change_decode(decode: DecodeConfig, temperature: float | None = None, **fields: Any) -> DecodeConfig:

@@ -1,6 +1,7 @@
 """Learned and true simulators of a run's robots, and the model that is shipped."""
 
 import json
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -26,6 +27,8 @@ from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, save_decode, s
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 from tests.experiments.applications.runs import TABLE, make_run
+
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +95,24 @@ def test_one_robot_that_is_given_leaves_the_others_and_what_is_not_given_as_they
     loaded = Simulator.load(study / "model", robots=[own], decode=None, starts=None)
     assert dict(loaded.robots) == {"pusher_sand": own, "gripper_wood": gripper}
     assert loaded.decode == DecodeConfig(3, temperature=0.5) and loaded.starts == ()
+
+
+def test_a_decoding_that_is_written_by_hand_says_only_what_differs(tmp_path):
+    """Latents were drawn in 100 steps of another sampler as soon as a file said anything else."""
+    (written,) = re.findall(r"^```json\n(.*?)^```", (DOCS / "simulator.md").read_text(), re.MULTILINE | re.DOTALL)
+    for text, meant in (
+        (written, replace(DEFAULT_DECODE, unmask_steps=8, temperature=0.0)),
+        ('{"sampler": {"eta": 0}}', replace(DEFAULT_DECODE, sampler=replace(DEFAULT_DECODE.sampler, eta=0.0))),
+    ):
+        (tmp_path / "decode.json").write_text(text)
+        assert find_decode(tmp_path) == meant
+    for text, message in (
+        ("[8]", "expected named fields"),
+        ('{"steps": 8}', "unknown field.* steps; known: unmask_st"),
+    ):
+        (tmp_path / "decode.json").write_text(text)
+        with pytest.raises(ConfigError, match=rf"decode.json: {message}"):
+            find_decode(tmp_path)
 
 
 def test_robots_and_starts_that_are_given_are_not_taken_from_the_study(run):
