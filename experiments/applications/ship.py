@@ -84,7 +84,9 @@ def ship(
     simulator = load_simulator(source)
     foreign = [name for name, robot in simulator.robots.items() if not in_suite(robot)]
     require(
-        not foreign, f"{', '.join(foreign)}: not robots of the suite, so there is no true simulator to compare with"
+        not foreign,
+        f"{', '.join(foreign)}: not robots of the suite, so there is no true simulator to compare with. A model of them is "
+        "handed on as docs/checkpoints.md says, in A simulator to hand on",
     )
     aside = out.with_name(f".{out.name}.making")
     shutil.rmtree(aside, ignore_errors=True)

@@ -18,6 +18,8 @@ from data_pipelines.true_simulator import TrueSimulator
 from experiments.running.workspace import Workspace
 from hma_jax.config import DecodeConfig, require
 from hma_jax.config.base import require_choice
+from hma_jax.convert import write_run
+from hma_jax.convert.atomic import atomic_directory
 from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, save_decode, save_robots
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot, rest_action
@@ -25,6 +27,7 @@ from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import FILE as STARTS
 from hma_jax.simulator.starts import Start, save_starts
 from hma_jax.tokenizers.io import save_tokenizer
+from hma_jax.training.runs import load_run
 
 if TYPE_CHECKING:
     from hma_jax.model.embodiments import Embodiment
@@ -62,6 +65,19 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
         f"held-out frames in {study.store}. Move the run into the directory of a study that has tokens of its robots",
     )
     return simulator
+
+
+def save_simulator(run: Path | str, out: Path | str) -> None:
+    """Makes `out` a run that is a simulator wherever it is copied to: the weights of `run` (their average where it
+    keeps one), without the optimiser's moments, and what `load_simulator` finds beside it or in its study.
+
+    Raises ConfigError if `out` exists, and as `load_simulator`.
+    """
+    simulator = load_simulator(run)
+    mark_absolute_actions(simulator, run)
+    with atomic_directory(Path(out)) as made:
+        write_run(load_run(run, "auto"), made)
+        save_beside(simulator, made, simulator.decode)
 
 
 def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | None) -> None:

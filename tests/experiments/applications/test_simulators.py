@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments.applications import DRIVEN
 from experiments.applications import ship as ship_module
@@ -129,6 +130,36 @@ def test_neither_world_is_taken_for_one_that_there_is_not(run):
         make_simulator(run, "learnt")
 
 
+def program(containing: str) -> str:
+    """The Python program of docs/checkpoints.md that has this in it."""
+    programs = re.findall(r"^```python\n(.*?)^```", (DOCS / "checkpoints.md").read_text(), re.MULTILINE | re.DOTALL)
+    (found,) = (text for text in programs if containing in text)
+    return found
+
+
+def test_what_is_handed_on_is_a_simulator_elsewhere(run, tmp_path):
+    """By the program of the page. A model of one's own could not be shipped, and nothing said what else to send."""
+    out, expected = tmp_path / "made", load_simulator(run)
+    text = program("save_simulator(").replace('"runs/mine/model"', repr(str(run)))
+    exec(text.replace('"my_robot_simulator"', repr(str(out))), {})
+    handed = Simulator.load(shutil.move(out, tmp_path / "elsewhere"))
+    assert dict(handed.robots) == dict(expected.robots) and handed.decode == expected.decode
+    assert handed.starts == expected.starts and handed.tokenizer.identity == expected.tokenizer.identity
+    jax.tree.map(np.testing.assert_array_equal, handed.model.params, expected.model.params)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere"]
+
+
+def test_a_run_outside_a_study_starts_from_a_picture(run, tmp_path, monkeypatch):
+    """By the program of the page, of a picture that is no square."""
+    monkeypatch.chdir(tmp_path)
+    copied = shutil.copytree(run, tmp_path / "rel")
+    Image.fromarray(np.full((16, 24, 3), 200, np.uint8)).save("table.png")
+    text = program("save_starts(").replace("runs/rel", str(copied))
+    exec(text.replace("language_table", "pusher_sand").replace("256", "8"), {})
+    (start,) = load_simulator(copied, tokenizer=run.parent / "tokenizer").starts
+    assert start == Start("pusher_sand", np.full((1, 8, 8, 3), 200, np.uint8), np.zeros((0, 2)))
+
+
 @pytest.mark.slow
 def test_true_and_learned_are_exchanged_by_one_word(run):
     seen = {}
@@ -213,7 +244,7 @@ def test_what_was_not_shipped_is_not_replaced(run):
 
 def test_a_robot_without_a_truth_to_be_compared_with_is_not_shipped(tmp_path):
     table = EmbodimentTable((*TABLE.entries, Embodiment("stranger", 2, 1, (0.0, 0.0), (1.0, 1.0))))
-    with pytest.raises(ConfigError, match="stranger: not robots of the suite"):
+    with pytest.raises(ConfigError, match=r"stranger: not robots of the suite, .* docs/checkpoints.md says"):
         ship(make_run(tmp_path / "study", table=table), tmp_path / "simulator")
     assert [path.name for path in tmp_path.iterdir()] == ["study"]
 
