@@ -229,8 +229,12 @@ def load_model(run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig
     here.
 
     `weights` are the last ones, their moving average (`ema`), or the average where the run keeps one
-    (`auto`). Raises as `load_run`.
+    (`auto`). Raises as `load_run`, and ConfigError for an `execution` that is none.
     """
+    require(
+        isinstance(execution, ExecutionConfig),
+        f"execution is an ExecutionConfig, such as ExecutionConfig(dtype='bfloat16'), got {execution!r}",
+    )
     run = load_run(run_dir, weights)
     params = inference_params(declare_model(run.model, run.table, execution), run.params, execution.dtype)
     return _rebuild(replace(run, params=jax.device_put(params, default_device())), execution)

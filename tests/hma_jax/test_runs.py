@@ -250,6 +250,11 @@ def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Pat
         load_run(run_dir, "newest")  # gave the average
 
 
+def test_an_execution_that_is_none_is_refused_before_the_run_is_read(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"ExecutionConfig\(dtype='bfloat16'\), got 'bfloat16'"):
+        load_model(tmp_path, "bfloat16")
+
+
 def test_a_run_that_was_shipped_with_its_average_alone_says_so(averaged, tmp_path: Path):
     """As `ship` leaves it: the average is its `params`. It was called the last weights."""
     saved = tmp_path / "run" / "checkpoints"
