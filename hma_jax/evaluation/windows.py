@@ -41,7 +41,7 @@ COLUMNS = ("dataset", "episode", "start", "frames")
 """Fields of a `WindowTable` besides its metrics."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WindowTable:
     """Columns of equal length, a row per window."""
 
@@ -57,6 +57,9 @@ class WindowTable:
 
     def __len__(self) -> int:
         return len(self.dataset)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} windows of {', '.join(self.datasets)}: {', '.join(self.metrics)}>"
 
     @cached_property
     def datasets(self) -> tuple[str, ...]:

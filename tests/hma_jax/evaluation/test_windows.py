@@ -47,6 +47,12 @@ def test_a_table_survives_the_disk_to_the_last_bit(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["more", FILE]
 
 
+def test_a_table_shows_itself_in_a_line():
+    """Not the numbers of every window."""
+    table = join([make_table("arm", 0), make_table("base", 1)])
+    assert repr(table) == "<48 windows of arm, base: psnr, cross_entropy>"
+
+
 def test_any_program_reads_it_as_a_long_table(tmp_path):
     make_table(episodes=1, each=2).save(tmp_path / FILE, "t0")
     table = pq.read_table(tmp_path / FILE)
