@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -22,12 +24,14 @@ from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict, to_dict, to_strict_json
 from hma_jax.evaluation.measures import METRICS
 from hma_jax.evaluation.windows import FILE
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import sync, write_file
 from hma_jax.training.run_lock import CHECKPOINTS, EVALUATION, locked_run
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
+    from experiments.preparing.made_from import MadeFrom
     from experiments.running.run_trial import PreparedData
+    from hma_jax.evaluation.evaluate import Evaluation
     from hma_jax.evaluation.summary import Summary
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.runs import Run
@@ -77,7 +81,7 @@ def evaluate_model(setup: StudySetup, run: Path, weights: Weights, to: Path | No
 
 
 def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: bool) -> None:
-    from experiments.running.run_trial import evaluate_on, open_prepared_data, write_evaluation
+    from experiments.running.run_trial import evaluate_on, open_prepared_data
     from hma_jax.evaluation.parts import Parts
     from hma_jax.runtime.processes import is_writer
     from hma_jax.training.hashes import read_list
@@ -116,13 +120,34 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     of = "" if trained.finished else f" of {trained.train.steps:,}"
     when = f", step {trained.step:,}{of}" if trained.step else ""  # a run that was converted has made no step here
     console.print(table_of(summary, f"{short(run)}{when}{which}"))
-    for name in (STAMP, MEANS):  # if this is killed now, none must stand beside numbers of others
-        (place / name).unlink(missing_ok=True)
-    write_evaluation(place, evaluation)
-    write_file(place / MEANS, to_strict_json(summary.to_dict()))
-    made_from.save(place, STAMP)
+    write_results(place, evaluation, made_from)
     parts.remove()
     wrote(place / MEANS, place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
+
+
+def write_results(place: Path, evaluation: Evaluation, made_from: MadeFrom) -> None:
+    """Writes the files of an evaluation into `place`, where others stay until all of them are on the disk. Raises
+    OSError, which keeps the others."""
+    from experiments.running.run_trial import write_evaluation
+
+    made = place / ".evaluation.tmp"
+    shutil.rmtree(made, ignore_errors=True)  # a killed process left it
+    made.mkdir()
+    try:
+        write_evaluation(made, evaluation, place.name)
+        write_file(made / MEANS, to_strict_json(evaluation.summary.to_dict()))
+        made_from.save(made, STAMP)
+        for name in (STAMP, MEANS, SAMPLES):  # if this is killed now, none must stand beside numbers of others
+            (place / name).unlink(missing_ok=True)
+        for name in (FILE, SAMPLES, MEANS, STAMP):
+            if (made / name).exists():
+                os.replace(made / name, place / name)
+        sync(place)
+    except OSError as error:
+        error.filename = str(place)  # the user knows of no other
+        raise
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
 
 
 def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) -> tuple[str, ...]:

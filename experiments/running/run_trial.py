@@ -301,7 +301,7 @@ def run_trial(
         },
     }
     if is_writer():
-        write_evaluation(directory, evaluation)
+        write_evaluation(directory, evaluation, directory.name)
         record_end(directory)
         write_result(directory, result)
         parts.remove()
@@ -323,9 +323,10 @@ def last_loss(losses: Sequence[float]) -> dict[str, Any]:
     return dataclasses.asdict(mean_and_sem(losses[-max(round(LAST * len(losses)), 1) :]))
 
 
-def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
-    """Writes windows.parquet and, where there are samples, samples.npz into `directory`, in place of others."""
-    evaluation.windows.save(directory / FILE, directory.name)
+def write_evaluation(directory: Path, evaluation: Evaluation, trial: str) -> None:
+    """Writes windows.parquet, of `trial`, and, where there are samples, samples.npz into `directory`, in place of
+    others."""
+    evaluation.windows.save(directory / FILE, trial)
     if evaluation.samples:
         write_samples(directory / SAMPLES, evaluation.samples)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.cli.evaluate import table_of, trained_on_other_tokens
+from experiments.cli.evaluate import MEANS, table_of, trained_on_other_tokens, write_results
 from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
 from experiments.running.result_file import SAMPLES
@@ -23,6 +24,7 @@ from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
 from tests.data_pipelines.windows.test_evalset import small_store
 from tests.experiments.test_names import with_field
+from tests.full_disk import full_disk
 
 TRAINED = SimpleNamespace(model=ModelConfig(), train=TrainConfig(), provenance={"loader": {}}, weights="last", step=3)
 
@@ -61,8 +63,55 @@ def test_clips_of_an_evaluation_do_not_stay_beside_one_without(tmp_path):
     (tmp_path / SAMPLES).write_bytes(b"of before")
     one = np.zeros(1, np.int64)
     windows = WindowTable(np.array(["arm"]), one, one, one + 4, {"action_error": np.ones(1)})
-    write_evaluation(tmp_path, Evaluation(windows, summarise(windows, 1), {}))
+    write_evaluation(tmp_path, Evaluation(windows, summarise(windows, 1), {}), "run")
     assert [path.name for path in tmp_path.iterdir()] == [FILE]
+
+
+def evaluation_of(value: float, pixels: int = 0) -> Evaluation:
+    one = np.zeros(1, np.int64)
+    windows = WindowTable(np.array(["arm"]), one, one, one + 4, {"psnr": np.full(1, value)})
+    clip = np.random.default_rng(0).integers(0, 256, pixels, np.uint8)
+    return Evaluation(windows, summarise(windows, 1), {"arm": {"true": clip}} if pixels else {})
+
+
+def files_of(place: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in place.iterdir()}
+
+
+def test_results_stay_until_all_of_those_that_replace_them_are_on_the_disk(tmp_path):
+    """Clips need the most room: the table is written when the disk is full."""
+    write_results(tmp_path, evaluation_of(9), made_from())
+    before = files_of(tmp_path)
+    assert set(before) == {FILE, MEANS, STAMP}
+    later = evaluation_of(8, pixels=9000)
+    with full_disk(8000), pytest.raises(OSError, match=f"{tmp_path}'$"):
+        write_results(tmp_path, later, made_from(step=9))
+    assert files_of(tmp_path) == before
+    write_results(tmp_path, later, made_from(step=9))
+    assert set(files_of(tmp_path)) == {FILE, MEANS, STAMP, SAMPLES}
+    assert not [name for name in before if files_of(tmp_path)[name] == before[name]]
+
+
+@pytest.mark.parametrize("moves", range(3))
+def test_means_stand_beside_no_numbers_of_others_where_a_process_is_killed(moves, tmp_path, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def killed(source, target, replace=os.replace):
+        if Path(target).parent == tmp_path:
+            if len(moved) == moves:
+                raise Killed
+            moved.append(target)
+        replace(source, target)
+
+    write_results(tmp_path, evaluation_of(9, pixels=9), made_from())
+    moved = []
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(os, "replace", killed)
+        write_results(tmp_path, evaluation_of(8), made_from())
+    assert sorted(files_of(tmp_path)) == [*[MEANS] * (moves > 1), FILE], "the stamp comes last"
+    write_results(tmp_path, evaluation_of(8), made_from())
+    assert set(files_of(tmp_path)) == {FILE, MEANS, STAMP}
 
 
 @pytest.mark.parametrize(
