@@ -29,19 +29,26 @@ SHOW_MS, HOLD_MS = 200, 1200
 
 SCRIPT = """
 const KEPT = `hma labels ${document.body.dataset.page}`;
-let labels = {};
-try { labels = JSON.parse(localStorage.getItem(KEPT)) ?? {}; } catch {}  // a browser may keep nothing
-let at = 0;
+let labels = {}, unkept = {};  // a browser may keep nothing
+let at = 0, unsaved = false;
+function merge() {  // another window of this page may have added some
+  let stored = {};
+  try { stored = JSON.parse(localStorage.getItem(KEPT)) ?? {}; } catch {}
+  labels = {...labels, ...stored, ...unkept};
+}
 const clips = [...document.querySelectorAll('img')];
 function show() {
   clips.forEach((clip, i) => { clip.hidden = i !== at; });
   const done = Object.keys(labels).length;
   document.getElementById('where').textContent = `${at + 1} of ${clips.length}, ${done} labelled: ` +
-    ({true: 'success', false: 'failure'}[labels[clips[at].dataset.clip]] ?? 'not labelled');
+    ({true: 'success', false: 'failure'}[labels[clips[at].dataset.clip]] ?? 'not labelled') +
+    (unsaved ? '. This browser does not keep labels: save labels.json before you leave or reload this page' : '');
 }
 function label(value) {
-  labels[clips[at].dataset.clip] = value;
-  try { localStorage.setItem(KEPT, JSON.stringify(labels)); } catch {}
+  unkept[clips[at].dataset.clip] = value;
+  merge();
+  try { localStorage.setItem(KEPT, JSON.stringify(labels)); unkept = {}; } catch {}
+  unsaved = Object.keys(unkept).length > 0;
   move(1);
 }
 function move(by) { at = Math.min(Math.max(at + by, 0), clips.length - 1); show(); }
@@ -56,11 +63,16 @@ document.getElementById('failure').onclick = () => label(false);
 document.getElementById('back').onclick = () => move(-1);
 document.getElementById('on').onclick = () => move(1);
 document.getElementById('save').onclick = () => {
+  merge();
   const link = document.createElement('a');
   link.href = URL.createObjectURL(new Blob([JSON.stringify({page: document.body.dataset.page, labels}, null, 1)]));
   link.download = 'labels.json';
   link.click();
+  unsaved = false;
+  show();
 };
+addEventListener('beforeunload', (event) => { if (unsaved) event.preventDefault(); });
+merge();
 show();
 """
 
