@@ -133,8 +133,9 @@ def fit(
     so that there never are two. `make_batches(start)` gives host batches from step `start` on.
     With several processes (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin
     with this start. When any of them is asked to stop, or a save by the minute is due, all do so after the same step.
-    Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy, and ConfigError for batches that end before
-    the steps do, or that are given instead of a function that makes them.
+    Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy, ConfigError for batches that end before
+    the steps do, or that are given instead of a function that makes them, and an OSError of `progress`, such as that of
+    a pipe that nobody reads, once the state is saved.
     """
     require(
         callable(make_batches),
@@ -227,6 +228,7 @@ class _BetweenSteps:
         self._log, self._checkpoints, self._lock, self._stop = log, checkpoints, lock, stop
         self._agreement = AgreedMaximum()
         self._pending: tuple[int, dict[str, jax.Array]] | None = None  # a step whose metrics are not written yet
+        self._unread: OSError | None = None  # nobody reads the progress: a stop request
         self._began = self._saved = self._seconds_aside = 0.0  # see `start_clock`
 
     def start_clock(self, start: int) -> None:
@@ -269,7 +271,7 @@ class _BetweenSteps:
         self._agreement.submit(self._request)
         if stopping and not last:
             self._checkpoints.finish(step, state)
-            raise Interrupted(
+            raise self._unread or Interrupted(
                 f"stopped at step {step} of {self._steps}; the same command resumes from {self._run_dir}",
                 self._stop.exit,
             )
@@ -283,11 +285,16 @@ class _BetweenSteps:
         # With as many digits as single precision has: half the bytes of a log, and nothing is lost.
         values = {name: float(str(np.float32(value))) for name, value in jax.device_get(metrics).items()}
         require_finite(step, values, self._log.run_dir, self._records)
-        self._log.write(step, {name: value for name, value in values.items() if not name.startswith(FINITE)})
         self._pending = None
+        try:
+            self._log.write(step, {name: value for name, value in values.items() if not name.startswith(FINITE)})
+        except SaveError:
+            raise
+        except OSError as error:  # of the progress, which the log reports last
+            self._unread = error
 
     def _request(self) -> int:
-        if self._stop.is_set():
+        if self._stop.is_set() or self._unread:
             return STOP
         late = self._checkpoints.to_repeat or _is_late(self._options.clock() - self._saved, self._options)
         return SAVE if late else 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import json
 import math
@@ -324,6 +325,19 @@ def test_a_signal_saves_before_it_stops_training_and_one_of_another_kind_changes
         if number == signal.SIGHUP:  # of a shell that is slow to end
             signal.raise_signal(number)
     assert list_steps(tmp_path / "checkpoints")
+
+
+def test_what_is_trained_is_saved_where_nobody_reads_the_progress_any_more(tmp_path: Path):
+    """`hma train | tee log` lost up to ten minutes where tee was killed."""
+
+    def closed(step: int, steps: int, metrics: dict) -> None:
+        if step == 3:
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    with pytest.raises(BrokenPipeError):
+        fit_toy(tmp_path, steps=1000, progress=closed)
+    assert list_steps(tmp_path / "checkpoints") == [4]
+    assert fit_toy(tmp_path, steps=6).resumed_from == 4
 
 
 def test_under_nohup_training_ignores_sighup(tmp_path: Path):
