@@ -192,6 +192,28 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
     browsing(test, visitors=1)
 
 
+def test_a_server_that_stands_still_is_lost_before_the_browser_says_so(browsing, monkeypatch):
+    """The one that is connected, and the next one, to which no connection is made."""
+    edit_page(monkeypatch, "PATIENCE = 10e3", "PATIENCE = 1e3")
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate("""{
+            state.socket.onmessage = null; state.socket.close = () => {};
+            window.said = []; new MutationObserver(() => said.push($("status").textContent)).observe($("status"), {childList: true});
+            const real = WebSocket;
+            WebSocket = class { static OPEN = 1; readyState = 0; constructor() { WebSocket = real; } close() {} };
+            void 0;
+        }""")
+        await page.wait_for_function("said.length > 2 && said.at(-1) === 'connected'")
+        lost = [f"connection lost; trying again in {seconds} s" for seconds in (0.5, 1)]
+        assert (await page.evaluate("said"))[:2] == lost
+        await frames(page, 2)
+        assert not page.faults
+
+    browsing(test)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_robot_that_is_chosen_while_the_connection_is_lost_begins_once_there_is_one(browsing, known: bool):
     """Also one that is chosen before the page knows that the connection is lost."""
