@@ -8,7 +8,9 @@ pytest.importorskip("aiohttp", reason="needs the extra `play`")
 pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
 
 from experiments.applications.play import recording  # noqa: E402
+from experiments.applications.play.server import SESSIONS  # noqa: E402
 from tests.experiments.applications.browser import edit_page, frames, opened  # noqa: E402
+from tests.experiments.applications.serving import Player, until  # noqa: E402
 from tests.experiments.applications.test_play_server import FakeTruth  # noqa: E402
 
 
@@ -124,3 +126,32 @@ def test_a_recording_that_ends_with_its_episode_says_so(browsing):
         assert not page.faults
 
     browsing(test, truth=FakeTruth)
+
+
+def test_an_episode_that_was_lost_with_the_connection_is_not_begun_anew_without_a_word(browsing):
+    """Somebody else needed the place, as after a new start of the server; the recording cannot be downloaded either."""
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        visitors = client.server.app[SESSIONS].visitors
+        for recorded in (False, True):
+            if recorded:
+                await page.click("#record")
+                await page.wait_for_function("state.recording")
+                await frames(page, 2)
+            await page.evaluate("state.socket.onclose = null; state.socket.close()")
+            await until(lambda: all(visitor.socket is None for visitor in visitors.values()))
+            other = Player(client)
+            await other.enter(begin=False)
+            await other.socket.close()
+            await until(lambda: all(visitor.socket is None for visitor in visitors.values()))
+            await page.evaluate("connect()")
+            await page.wait_for_function("state.socket.readyState === 1 && state.tries === 0 && !state.pending.length")
+            lost = "the episode and its recording were lost" if recorded else "the episode was lost"
+            assert f"paused: {lost} with the connection, and a new one began" in await page.inner_text("#said")
+            assert await page.inner_text("#record") == "Record" and not await page.is_visible("#saved")
+            await page.click("#run")
+            await frames(page, 2)
+            assert await page.inner_text("#said") == "" and not page.faults
+
+    browsing(test, visitors=1)
