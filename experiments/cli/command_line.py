@@ -23,6 +23,9 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 from tyro.extras import SubcommandApp
 
+from experiments.terminal.progress import OUTPUT
+from hma_jax.runtime.files import naming
+
 VALUES = {int: "N", float: "NUMBER", str: "NAME", Path: "PATH"}
 """What a help calls a value, where the option itself does not say it."""
 
@@ -148,7 +151,8 @@ def _wrapped() -> Iterator[None]:
             yield
     finally:
         if text := caught.getvalue():
-            stream.write(wrapped(text, shutil.get_terminal_size().columns))
+            with naming(OUTPUT):
+                stream.write(wrapped(text, shutil.get_terminal_size().columns))
 
 
 def _values() -> ConstructorRegistry:

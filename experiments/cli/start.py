@@ -1,6 +1,7 @@
 """Where the program starts: before anything large is imported, it settles how the process holds memory."""
 
 import faulthandler
+import os
 import sys
 
 from experiments.terminal.program import is_program
@@ -9,6 +10,9 @@ from hma_jax.runtime.host_memory import collect_rarely, restart_keeping_pages
 
 
 def start() -> None:
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed, as by `>&-`: what is written goes nowhere
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     faulthandler.enable()  # what each thread did, when a library ends the process by a signal
     if is_program():
         restart_keeping_pages()

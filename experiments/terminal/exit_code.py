@@ -11,9 +11,10 @@ from contextlib import nullcontext, suppress
 from data_pipelines.errors import DataError, EpisodeError
 from experiments.run_study import TrialsFailed
 from experiments.running.children import plain_messages, silence_background
-from experiments.terminal.progress import errors
+from experiments.terminal.progress import OUTPUT, errors
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
+from hma_jax.runtime.files import naming
 from hma_jax.runtime.user_code import raising_as_called
 
 OUT_OF_MEMORY = (
@@ -50,15 +51,15 @@ def exit_code_of(
                 with raising_as_called():
                     work()
             except SystemExit:  # of --help
-                sys.stdout.flush()
+                _flush()
                 raise
-            sys.stdout.flush()  # not later, where nothing catches what is wrong with it
+            _flush()  # not later, where nothing catches what is wrong with it
             _end_together()
         return Exit.DONE
     except BrokenPipeError as error:
         if not _unread():
             return _failed(error, debug, skipping)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left in buffers goes there
+        _discard_output()
         _end_together(error, Exit.UNREAD)
         return Exit.UNREAD
     except KeyboardInterrupt as request:
@@ -69,6 +70,8 @@ def exit_code_of(
         _end_together(request, code)
         return code
     except Exception as error:  # the boundary of the program
+        if isinstance(error, OSError) and error.filename == str(OUTPUT):
+            _discard_output()
         return _failed(error, debug, skipping)
 
 
@@ -97,6 +100,16 @@ def _failed(error: Exception, debug: bool, skipping: str) -> int:
     _say(f"error: {_words(error, skipping)}")
     _end_together(error, code)
     return code
+
+
+def _flush() -> None:
+    with naming(OUTPUT):
+        sys.stdout.flush()
+
+
+def _discard_output() -> None:
+    """What is left in its buffers goes nowhere; Python would try to write it when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _unread() -> bool:

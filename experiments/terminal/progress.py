@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -20,9 +21,17 @@ from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.runner import Job, Monitor
 from hma_jax.runtime.exits import raise_pending_stop
+from hma_jax.runtime.files import naming
+
+OUTPUT = Path("standard output")
+"""What an error names in place of a file."""
 
 
 class _Output(Console):
+    def print(self, *objects: Any, **how: Any) -> None:
+        with naming(OUTPUT):
+            super().print(*objects, **how)
+
     def on_broken_pipe(self) -> None:
         """Raises what rich has caught again, for the boundary of the program; rich itself would exit."""
         raise

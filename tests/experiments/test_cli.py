@@ -48,6 +48,12 @@ def test_help_needs_no_jax():
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
+def test_a_program_whose_output_is_closed_works_on():
+    """As supervisors start some."""
+    command = f"exec {shlex.quote(sys.executable)} -m experiments.cli data list >&- 2>&-"
+    assert subprocess.run(command, shell=True, timeout=120).returncode == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [

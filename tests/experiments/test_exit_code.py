@@ -17,6 +17,15 @@ from hma_jax.runtime.user_code import called_from_program
 from hma_jax.training.checkpoints import SaveError
 
 
+@pytest.fixture
+def emptied():
+    """What the console could not write waits for the next line, which is another test's."""
+    yield
+    with console.capture():
+        pass
+
+
+@pytest.mark.usefixtures("emptied")
 @pytest.mark.parametrize("say", [print, console.print])
 def test_an_output_that_nobody_reads_ends_the_program_as_sigpipe_would(say, capfd, monkeypatch):
     ours, theirs = os.pipe()
@@ -25,6 +34,15 @@ def test_an_output_that_nobody_reads_ends_the_program_as_sigpipe_would(say, capf
         patch.setattr("sys.stdout", pipe)
         assert exit_code_of(lambda: say("a line")) == Exit.UNREAD == 141
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("emptied")
+@pytest.mark.parametrize("say", [print, console.print])
+def test_a_full_disk_under_the_output_is_said_of_the_output(say, capsys, monkeypatch):
+    with open("/dev/full", "w") as full, monkeypatch.context() as patch:
+        patch.setattr("sys.stdout", full)
+        assert exit_code_of(lambda: say("a line")) == Exit.FAILED
+    assert capsys.readouterr().err.startswith("error: standard output: No space left on device")
 
 
 def test_another_pipe_that_breaks_is_an_error(capsys):
