@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hma_jax.config import ConfigError
+
 IO_ERRNOS = frozenset(
     getattr(errno, name)
     for name in (
@@ -24,8 +26,16 @@ CACHE_VARIABLE = "HMA_CACHE_DIR"
 
 
 def cache_directory() -> Path:
-    """What is kept for later processes of this user: `$HMA_CACHE_DIR`, by default `~/.cache/hma-jax`."""
-    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "hma-jax")
+    """What is kept for later processes of this user: `$HMA_CACHE_DIR`, by default `~/.cache/hma-jax`. Raises
+    ConfigError for a user without a home directory, as in some containers."""
+    if chosen := os.environ.get(CACHE_VARIABLE):
+        return Path(chosen)
+    try:
+        return Path.home() / ".cache" / "hma-jax"
+    except RuntimeError:
+        raise ConfigError(
+            f"this user has no home directory to keep files in; set {CACHE_VARIABLE} to a directory where you may write"
+        ) from None
 
 
 def sync(path: Path) -> None:
