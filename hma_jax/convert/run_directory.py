@@ -12,7 +12,7 @@ from hma_jax.config import require
 from hma_jax.convert.atomic import atomic_directory
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.files import write_file
-from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.checkpoints import Checkpoints, SaveError
 from hma_jax.training.run_lock import CHECKPOINTS
 from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState, state_shapes
@@ -31,14 +31,21 @@ def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None)
     """Writes a checkpoint of step 0 with a fresh optimiser state, and `texts`, files by name, into the run directory.
     Where the weights were trained, `converted` in its provenance says at which step they were and which ones.
 
-    Raises ConfigError if `directory` exists, and as `require_run`.
+    Raises ConfigError if `directory` exists, and as `require_run`; SaveError if it cannot be written.
     """
     require_run(run)
     with atomic_directory(directory) as temporary:
         converted = {"converted": {"step": run.step, "weights": run.weights}} if run.step else {}
         meta = describe_run(run.model, run.train, run.table, run.provenance | converted)
-        with Checkpoints(temporary / CHECKPOINTS, meta) as checkpoints:
-            checkpoints.save(0, fresh_state(run))
+        try:
+            with Checkpoints(temporary / CHECKPOINTS, meta) as checkpoints:
+                checkpoints.save(0, fresh_state(run))
+        except SaveError as error:  # it speaks of training, and of a directory that goes now
+            raise SaveError(
+                f"cannot write {directory}: {error.reason}. Make sure that there is space and permission to write, then "
+                "convert again",
+                error.passing,
+            ) from error
         for name, text in (texts or {}).items():
             write_file(temporary / name, text)
 

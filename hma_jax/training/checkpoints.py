@@ -71,11 +71,11 @@ log = logging.getLogger(__name__)
 
 class SaveError(OSError):
     """Something of a run could not be written. Its last finished checkpoint is kept. `passing`: a disk or network
-    failed, which may answer again."""
+    failed, which may answer again; `reason`: what the system says of a checkpoint."""
 
-    def __init__(self, message: str, passing: bool = False):
+    def __init__(self, message: str, passing: bool = False, reason: str = ""):
         super().__init__(message)
-        self.passing = passing
+        self.passing, self.reason = passing, reason
 
 
 class Checkpoints:
@@ -260,6 +260,7 @@ class Checkpoints:
             f"the checkpoint of step {step} could not be written to {self.directory}: {reason}. {self._space()}Make "
             f"sure that there is space and permission to write, then run the same command again: {again}",
             passing=error_code(error) in IO_ERRNOS,
+            reason=reason,
         )
         if failure.passing and (agreed or jax.process_count() == 1):
             return failure
