@@ -14,14 +14,15 @@ def start() -> None:
         if getattr(sys, name) is None:  # closed, as by `>&-`: what is written goes nowhere
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     faulthandler.enable()  # what each thread did, when a library ends the process by a signal
-    if is_program():
+    own_process = is_program()
+    if own_process:
         restart_keeping_pages()
     collect_rarely()
     try:
         with sigterm_as_interrupt():
             from experiments.cli.main import main
 
-            code = main()
+            code = main(None if own_process else sys.argv[1:])
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
     sys.exit(code)

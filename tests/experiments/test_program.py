@@ -13,22 +13,23 @@ from experiments.terminal.program import is_program
 NOTEBOOK = """
 import runpy, sys
 print("first cell", flush=True)
+hook = sys.unraisablehook
 sys.argv = ["notebook", "--help"]
 try:
     runpy.run_module({module!r}, run_name="__main__", alter_sys=True)
 except SystemExit as end:
-    print("\\nnext cell", end.code, sys.argv)
+    print("\\nnext cell", end.code, sys.argv, sys.unraisablehook is hook)
 """
 
 
 @pytest.mark.parametrize("module", ["experiments.cli", "experiments.sweeps.width"])
 def test_a_process_that_runs_a_module_goes_on_after_it(module):
-    """A notebook was replaced by the program, or by itself, and all its variables were lost."""
+    """A notebook was replaced by the program, or by itself, and all its variables were lost. Its errors stay heard."""
     environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
     command = [sys.executable, "-c", NOTEBOOK.format(module=module)]
     lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines.count("first cell") == 1 and lines[1].startswith("usage: hma")
-    assert lines[-1] == "next cell 0 ['notebook', '--help']"
+    assert lines[-1] == "next cell 0 ['notebook', '--help'] True"
 
 
 @pytest.mark.parametrize(
