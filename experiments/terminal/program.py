@@ -27,12 +27,14 @@ def is_program() -> bool:
     """Whether Python was started for this program alone: by its script, or with `-m`. Otherwise, as under `runpy` or
     `%run` of a notebook, starting another one in this process would lose all that it holds."""
     started = " ".join(sys.orig_argv[1 : len(sys.orig_argv) - len(sys.argv) + 1])  # without the program's arguments
-    return re.search(rf"(^|[ /]){PROGRAM}$|(^| )-m ?experiments\.[\w.]+$", started) is not None
+    return re.search(rf"(^|[ /]){PROGRAM}$|(^| )-\w*m ?experiments\.[\w.]+$", started) is not None
 
 
 def command_line() -> str:
-    """The command as typed, whichever way the program was started."""
+    """The command as typed, whichever way the program was started; of another program that uses this one, its own."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     module = spec.name if spec else ""
-    own = module.startswith("experiments.") and not module.startswith("experiments.cli")
-    return shlex.join([*(["python", "-m", module] if own else [PROGRAM]), *sys.argv[1:]])
+    own = module.startswith("experiments.")
+    if own and not module.startswith("experiments.cli"):
+        return shlex.join(["python", "-m", module, *sys.argv[1:]])
+    return shlex.join([PROGRAM, *sys.argv[1:]] if own or is_program() else sys.orig_argv)

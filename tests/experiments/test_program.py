@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
-from experiments.terminal.program import is_program
+from experiments.terminal.program import command_line, is_program
 
 NOTEBOOK = """
 import runpy, sys
@@ -37,6 +38,7 @@ def test_a_process_that_runs_a_module_goes_on_after_it(module):
     [
         ("python -m experiments.cli", "study --out a", True),
         ("python -u -X dev -mexperiments.sweeps.width", "", True),
+        ("python -um experiments.sweeps.width", "", True),
         ("python /venv/bin/hma", "--help", True),
         ("python hma", "", True),
         ("python -m ipykernel_launcher -f kernel.json", None, False),
@@ -52,3 +54,24 @@ def test_a_process_is_the_programs_own_if_python_was_started_for_it(started, arg
     monkeypatch.setattr(sys, "orig_argv", [*started.split(), *asked])
     monkeypatch.setattr(sys, "argv", ["file", *asked] if arguments is not None else ["file", "--preset", "smoke"])
     assert is_program() == program
+
+
+@pytest.mark.parametrize(
+    ("started", "module", "command"),
+    [
+        ("python /venv/bin/hma judge runs/a", "", "hma judge runs/a"),
+        ("python -m experiments.cli judge runs/a", "experiments.cli.__main__", "hma judge runs/a"),
+        ("python -m experiments.applications.detector a", "experiments.applications.detector", None),
+        ("python -m ipykernel_launcher -f kernel.json", "", None),
+        ("python -m their.study runs/a", "their.study", None),
+        ("python study.py runs/a", "", None),
+    ],
+)
+def test_a_command_is_that_of_the_process(started, module, command, monkeypatch):
+    """Results that a notebook or script had asked for were said to be of `hma -f kernel.json`."""
+    words = started.split()
+    main = SimpleNamespace(__spec__=SimpleNamespace(name=module) if module else None)
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    monkeypatch.setattr(sys, "orig_argv", words)
+    monkeypatch.setattr(sys, "argv", ["file", *words[3 if words[1] == "-m" else 2 :]])
+    assert command_line() == (command or started)
