@@ -205,6 +205,8 @@ def fit(
             jax.block_until_ready(state)
             seconds = between.seconds()
             checkpoints.finish(steps, state)
+            if between.unread:
+                raise between.unread
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 
 
@@ -228,7 +230,7 @@ class _BetweenSteps:
         self._log, self._checkpoints, self._lock, self._stop = log, checkpoints, lock, stop
         self._agreement = AgreedMaximum()
         self._pending: tuple[int, dict[str, jax.Array]] | None = None  # a step whose metrics are not written yet
-        self._unread: OSError | None = None  # nobody reads the progress: a stop request
+        self.unread: OSError | None = None  # nobody reads the progress: a stop request
         self._began = self._saved = self._seconds_aside = 0.0  # see `start_clock`
 
     def start_clock(self, start: int) -> None:
@@ -271,7 +273,7 @@ class _BetweenSteps:
         self._agreement.submit(self._request)
         if stopping and not last:
             self._checkpoints.finish(step, state)
-            raise self._unread or Interrupted(
+            raise self.unread or Interrupted(
                 f"stopped at step {step} of {self._steps}; the same command resumes from {self._run_dir}",
                 self._stop.exit,
             )
@@ -291,10 +293,10 @@ class _BetweenSteps:
         except SaveError:
             raise
         except OSError as error:  # of the progress, which the log reports last
-            self._unread = error
+            self.unread = error
 
     def _request(self) -> int:
-        if self._stop.is_set() or self._unread:
+        if self._stop.is_set() or self.unread:
             return STOP
         late = self._checkpoints.to_repeat or _is_late(self._options.clock() - self._saved, self._options)
         return SAVE if late else 0

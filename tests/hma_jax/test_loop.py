@@ -337,7 +337,9 @@ def test_what_is_trained_is_saved_where_nobody_reads_the_progress_any_more(tmp_p
     with pytest.raises(BrokenPipeError):
         fit_toy(tmp_path, steps=1000, progress=closed)
     assert list_steps(tmp_path / "checkpoints") == [4]
-    assert fit_toy(tmp_path, steps=6).resumed_from == 4
+    with pytest.raises(BrokenPipeError):
+        fit_toy(tmp_path, steps=6, progress=lambda step, steps, _: closed(step - 3, steps, _))
+    assert fit_toy(tmp_path, steps=6).resumed_from == 6, "a run that is finished, of which that was the last step"
 
 
 def test_under_nohup_training_ignores_sighup(tmp_path: Path):
