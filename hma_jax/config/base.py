@@ -135,11 +135,13 @@ def _as_made(hint: Any, value: Any, where: str) -> Any:
 def _member(options: list[Any], value: Any, where: str) -> Any:
     """The member of a union that `value` is meant for: the tuple if it is a list, its class, or among configs the one
     with the same `kind`; else the first."""
+    if len(options) == 1:  # which may be one that `isinstance` refuses, as Any
+        return options[0]
     for option in options:
         kinds = (list, tuple) if typing.get_origin(option) is tuple else option
         if isinstance(kinds, (type, tuple)) and isinstance(value, kinds):
             return option
-    if len(options) == 1 or not isinstance(value, dict) or "kind" not in value:
+    if not isinstance(value, dict) or "kind" not in value:
         return options[0]
     kinds = {option.kind: option for option in options if hasattr(option, "kind")}
     require(value["kind"] in kinds, f"{where}: unknown kind {value['kind']!r}; known: {', '.join(kinds)}")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig, require
-from hma_jax.config.json import from_dict, to_dict
+from hma_jax.config.json import completed, from_dict, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
@@ -68,9 +68,10 @@ def find_starts(directory: Path) -> tuple[Start, ...]:
 
 
 def find_decode(directory: Path) -> DecodeConfig:
-    """From decode.json; what it leaves out is as in DEFAULT_DECODE. Raises ConfigError for a file that is damaged."""
+    """From decode.json; what it leaves out is as in DEFAULT_DECODE or, where the field came later than the file may be
+    (`hma_jax.config.base.later`), as before. Raises ConfigError for a file that is damaged."""
     path = directory / DECODE
-    stated = _read(path) if path.exists() else {}
+    stated = completed(_read(path), DEFAULT_DECODE) if path.exists() else {}
     return from_dict(DecodeConfig, _completed(to_dict(DEFAULT_DECODE), stated), str(path))
 
 

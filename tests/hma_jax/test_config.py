@@ -56,8 +56,9 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         one: Literal["a", "b"] | None = None
         several: tuple[Literal[1, 2], ...] = ()
         whatever: str | None = None
+        anything: typing.Any | None = None
 
-    for accepted in (Some(), Some("a", (1, 2, 1), "c")):
+    for accepted in (Some(), Some("a", (1, 2, 1), "c", object())):
         check_fields(accepted)
     with pytest.raises(ConfigError, match="Some.one: 'c' is not allowed; choose one of a, b, None"):
         check_fields(Some("c"))

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +23,9 @@ from experiments.cli.main import main
 from experiments.running.workspace import Workspace
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.config.base import later
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.simulator import folder
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, save_decode, save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
@@ -114,6 +116,19 @@ def test_a_decoding_that_is_written_by_hand_says_only_what_differs(tmp_path):
         (tmp_path / "decode.json").write_text(text)
         with pytest.raises(ConfigError, match=rf"decode.json: {message}"):
             find_decode(tmp_path)
+
+
+@dataclass(frozen=True)
+class Cooled(DecodeConfig):
+    cooling: float = later(0.5, before=1.0)
+
+
+def test_a_setting_of_decoding_that_came_later_is_as_before_in_a_file_without_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder, "DecodeConfig", Cooled)
+    monkeypatch.setattr(folder, "DEFAULT_DECODE", Cooled(sampler=DEFAULT_DECODE.sampler))
+    assert find_decode(tmp_path).cooling == 0.5
+    save_decode(DecodeConfig(8), tmp_path / "decode.json")
+    assert find_decode(tmp_path) == Cooled(8, cooling=1.0)
 
 
 def test_robots_and_starts_that_are_given_are_not_taken_from_the_study(run):
