@@ -68,13 +68,14 @@ def find_format(location: str | Location) -> str:
         except UnreachableError:
             raise
         except DataError as error:
-            if _holds_tokens(place):
+            meant = _meant(place)
+            if not meant and _holds_tokens(place):
                 raise NoDatasetError(
                     f"{place}: a token store, not recordings. Give the directory of the recordings: tokens that were made "
                     "of them are used where --out is the directory of their study. To train on tokens that were imported: "
                     'docs/own_data.md, "Training on tokens of the release".'
                 ) from error
-            raise type(error)(f"{error}{_meant(place)}") from error
+            raise type(error)(f"{error}{meant}") from error
     require(
         found == "rlds" or not is_remote(place),
         f"{place}: {found} can be read only from a disk. Copy the dataset to a disk.",

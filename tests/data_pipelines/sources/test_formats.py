@@ -642,6 +642,11 @@ def test_a_token_store_is_no_dataset_and_told_as_such(tmp_path):
     for place in (own, own.parent):
         with pytest.raises(NoDatasetError, match=rf"^{place}: a token store, not recordings\. .* docs/own_data\.md"):
             open_source(place)
+    arm = write_lerobot(tmp_path / "toy-arm", "v2.1")
+    (tmp_path / "page").mkdir()
+    (tmp_path / "page" / MANIFEST).write_text("{}")  # of some other program
+    with pytest.raises(NoDatasetError, match=rf" Datasets in it: {arm}$"):
+        open_source(tmp_path)
 
 
 def test_corrupt_records_are_episode_errors():
