@@ -218,8 +218,9 @@ def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore)
     """Prints a note where a model may have been trained on episodes that are held out in `store` (data leakage)."""
     if elsewhere := trained_on_other_tokens(trained, names, store):
         say(
-            f"note: {few(elsewhere)}: the model was trained on other tokens than those of this study, so it may have "
-            "been trained on episodes that are held out here; in the --out that it was trained in, held-out episodes "
+            f"note: {few(elsewhere)}: the model, or the one that it was initialised from, was trained on other tokens than "
+            "those of this study, so it may have been trained on episodes that are held out here; not if only "
+            "store.max_train, or what an entry `joins`, differs. In the --out that it was trained in, held-out episodes "
             "are new to it"
         )
 
