@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import sys
 from dataclasses import fields, replace
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from data_pipelines.suite.generate import generate_suite
 from experiments.analysis.bootstrap import bootstrap_intervals
@@ -358,6 +360,23 @@ def summary_of(name: str, model: Path) -> list[conditions.Summary]:
 @pytest.mark.parametrize("name", ["synthetic", "synthetic_given"])
 def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
     assert conditions.markdown(summary_of(name, FIRST)) in (ROOT / "docs" / "generating.md").read_text()
+
+
+def test_what_following_actions_is_worth_is_as_the_page_says():
+    """Success of policies on data of a model with actions and of one without, paired by seed, with Student's t."""
+    with open(RESULTS / "synthetic_given" / "trials.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    seeds = sorted({row["seed"] for row in rows})
+
+    def rates(name: str) -> np.ndarray:
+        own = [row for row in rows if row["condition"] == name]
+        return np.array([np.mean([row["success"] == "1" for row in own if row["seed"] == seed]) for seed in seeds])
+
+    gain = rates(CONDITIONS[MOST].name) - rates(CONDITIONS[PASSIVE].name)
+    half = stats.t.ppf(0.975, len(seeds) - 1) * gain.std(ddof=1) / len(seeds) ** 0.5
+    page = (ROOT / "docs" / "generating.md").read_text()
+    assert len(seeds) == 12
+    assert f"worth {gain.mean():.2f} ({gain.mean() - half:.2f} to {gain.mean() + half:.2f}) of success" in page
 
 
 def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():
