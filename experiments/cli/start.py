@@ -1,18 +1,15 @@
 """Where the program starts: before anything large is imported, it settles how the process holds memory."""
 
 import faulthandler
-import os
 import sys
 
-from experiments.terminal.program import is_program
+from experiments.terminal.program import is_program, open_closed_output
 from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt
 from hma_jax.runtime.host_memory import collect_rarely, restart_keeping_pages
 
 
 def start() -> None:
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed, as by `>&-`: what is written goes nowhere
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    open_closed_output()
     faulthandler.enable()  # what each thread did, when a library ends the process by a signal
     own_process = is_program()
     if own_process:

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from experiments.running.slots import Slot
+from experiments.terminal.program import open_closed_output
 from hma_jax.config import ConfigError
 from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely, keep_freed_memory
@@ -58,6 +59,7 @@ def child_environment(compile_cache: Path, slot: Slot = Slot(), accelerator: str
 def enter_child(parent: int = 0) -> None:
     """Called first in a child: takes its cores, arranges to die with its `parent` (0: which the environment names) and
     to end in order when asked to."""
+    open_closed_output()  # a child does not have what its parent opened
     faulthandler.enable()  # a library that ends the process by a signal is named by what its threads did
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked

@@ -11,6 +11,7 @@ from contextlib import nullcontext, suppress
 from data_pipelines.errors import DataError, EpisodeError
 from experiments.run_study import TrialsFailed
 from experiments.running.children import plain_messages, silence_background
+from experiments.terminal.program import open_closed_output
 from experiments.terminal.progress import OUTPUT, errors
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
@@ -41,6 +42,7 @@ def exit_code_of(
     none may be a path that is not UTF-8, by default those of the process; `resumes`: after a stop the same command goes
     on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves out records
     that cannot be read."""
+    open_closed_output()
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
         silence_background()

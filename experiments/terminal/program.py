@@ -30,6 +30,13 @@ def is_program() -> bool:
     return re.search(rf"(^|[ /]){PROGRAM}$|(^| )-\w*m ?experiments\.[\w.]+$", started) is not None
 
 
+def open_closed_output() -> None:
+    """What is written to standard output or standard error goes nowhere where these are closed, as by `>&-`."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+
+
 def command_line() -> str:
     """The command as typed, whichever way the program was started; of another program that uses this one, its own."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)

@@ -37,7 +37,7 @@ class _Output(Console):
         raise
 
 
-console = _Output(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 110)
+console = _Output(highlight=False, emoji=False, width=None if sys.stdout and sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False, emoji=False)
 
 FOLDED = 16

@@ -48,9 +48,18 @@ def test_help_needs_no_jax():
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
-def test_a_program_whose_output_is_closed_works_on():
-    """As supervisors start some."""
-    command = f"exec {shlex.quote(sys.executable)} -m experiments.cli data list >&- 2>&-"
+BEGINS = "import os, sys; from experiments.terminal.exit_code import exit_code_of; "
+PRINTS = BEGINS + "sys.exit(exit_code_of(lambda: print(1)))"
+ASKS = (
+    BEGINS + "from experiments.running.subprocess_call import call_in_subprocess; "
+    "sys.exit(exit_code_of(lambda: call_in_subprocess('asks', os.getpid)))"
+)
+
+
+@pytest.mark.parametrize("arguments", [("-m", "experiments.cli", "data", "list"), ("-c", PRINTS), ("-c", ASKS)])
+def test_a_program_whose_output_is_closed_works_on(arguments):
+    """As supervisors start some: hma, a program of its own, one that starts another process."""
+    command = f"exec {shlex.join([sys.executable, *arguments])} >&- 2>&-"
     assert subprocess.run(command, shell=True, timeout=120).returncode == 0
 
 
