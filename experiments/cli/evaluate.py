@@ -131,9 +131,9 @@ def write_results(place: Path, evaluation: Evaluation, made_from: MadeFrom) -> N
     from experiments.running.run_trial import write_evaluation
 
     made = place / ".evaluation.tmp"
-    shutil.rmtree(made, ignore_errors=True)  # a killed process left it
-    made.mkdir()
     try:
+        shutil.rmtree(made, ignore_errors=True)  # a killed process left it
+        made.mkdir()
         write_evaluation(made, evaluation, place.name)
         write_file(made / MEANS, to_strict_json(evaluation.summary.to_dict()))
         made_from.save(made, STAMP)

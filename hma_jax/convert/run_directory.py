@@ -43,7 +43,7 @@ def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None)
         except SaveError as error:  # it speaks of training, and of a directory that goes now
             raise SaveError(
                 f"cannot write {directory}: {error.reason}. Make sure that there is space and permission to write, then "
-                "convert again",
+                "try again",
                 error.passing,
             ) from error
         for name, text in (texts or {}).items():

@@ -90,6 +90,8 @@ def test_results_stay_until_all_of_those_that_replace_them_are_on_the_disk(tmp_p
     write_results(tmp_path, later, made_from(step=9))
     assert set(files_of(tmp_path)) == {FILE, MEANS, STAMP, SAMPLES}
     assert not [name for name in before if files_of(tmp_path)[name] == before[name]]
+    with pytest.raises(OSError, match=f"{tmp_path / 'gone'}'$"):
+        write_results(tmp_path / "gone", later, made_from())
 
 
 @pytest.mark.parametrize("moves", range(3))
