@@ -273,7 +273,9 @@ class _BetweenSteps:
         self._agreement.submit(self._request)
         if stopping and not last:
             self._checkpoints.finish(step, state)
-            raise self.unread or Interrupted(
+            if self.unread and not self._stop.is_set():  # Ctrl-C ends the reader of a pipe, too
+                raise self.unread
+            raise Interrupted(
                 f"stopped at step {step} of {self._steps}; the same command resumes from {self._run_dir}",
                 self._stop.exit,
             )

@@ -342,6 +342,19 @@ def test_what_is_trained_is_saved_where_nobody_reads_the_progress_any_more(tmp_p
     assert fit_toy(tmp_path, steps=6).resumed_from == 6, "a run that is finished, of which that was the last step"
 
 
+def test_a_signal_that_ends_the_reader_of_the_progress_too_is_what_stopped_the_training(tmp_path: Path):
+    """Ctrl-C of `hma train | tee log`, and a terminal that is closed."""
+
+    def closed(step: int, steps: int, metrics: dict) -> None:
+        if step == 3:
+            signal.raise_signal(signal.SIGHUP)
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    with pytest.raises(Interrupted) as stopped:
+        fit_toy(tmp_path, steps=1000, progress=closed)
+    assert stopped.value.exit == Exit.STOPPED and list_steps(tmp_path / "checkpoints") == [4]
+
+
 def test_under_nohup_training_ignores_sighup(tmp_path: Path):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
