@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,7 +63,8 @@ def test_every_start_leaves_commit_machine_and_command_beside_the_settings(tmp_p
     first, second = map(json.loads, (tmp_path / "provenance.jsonl").read_text().splitlines())
     assert first["command"] == "python -m experiments.applications.plan_actions 'runs/a model' --out out"
     assert first["commit"] == git_commit() and first["processor"] and first["settings"] == "settings.json"
-    assert second["began"] >= first["began"]
+    assert second == first | {"began": second["began"]}
+    time.strptime(first["began"], "%Y-%m-%dT%H:%M:%SZ")  # raises for another form
 
 
 def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(tmp_path):
