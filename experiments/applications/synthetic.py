@@ -244,7 +244,7 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
     )
     scripted, recorded = (
         {name: value for name in names if (value := getattr(args, name)) is not None}
-        for names in (("task", "frames", "starts"), ("split", "held_out", "registry"))
+        for names in (("task", "frames", "hold", "starts"), ("split", "held_out", "registry"))
     )
     if args.actions is None:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in recorded)
@@ -287,6 +287,7 @@ def main() -> None:
     parser.add_argument("--robot", help=f"of the model; DATASET's, or {Settings.robot}")
     parser.add_argument("--task", help=f"hover, reach, or own: what its recordings do ({Settings.task})")
     parser.add_argument("--frames", type=int, help=f"of an episode ({Settings.frames})")
+    parser.add_argument("--hold", type=int, help=f"frames in a row at the goal, for success ({Settings.hold})")
     parser.add_argument("--starts", type=int, help=f"in the true simulator ({Settings.starts})")
     parser.add_argument("--seeds", type=int, default=len(Training.seeds), help="how many")
     parser.add_argument("--steps", type=int, default=Training.steps, help="of training, of every policy")

@@ -238,7 +238,7 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
         (["--given", "0"], "--given must be at least 1, got 0: a generated trajectory begins with"),
         (["--seeds", "0"], "no seed"),
         (["--held-out", "train"], "evaluated on their training data, split train"),
-        (["--starts", "3"], "--starts: only for tasks of the suite, not with recordings"),
+        (["--hold", "4", "--starts", "3"], "--hold, --starts: only for tasks of the suite, not with recordings"),
         (["--robot", "gripper_wood"], "2 action values, but gripper_wood needs 4"),
     ):
         monkeypatch.setattr(sys, "argv", [*asked, *more])
