@@ -21,7 +21,7 @@ from data_pipelines.registry.mixtures import get_mixture
 from experiments.data_size import are_counted, sizes_by_tokens, use_sizes
 from experiments.presets import get_preset
 from experiments.running.run_options import UNSET
-from experiments.running.workspace import Workspace, find_record
+from experiments.running.workspace import Workspace, find_record, use_own_entries
 from experiments.study import Study, most_trajectories, on_tokenizer, on_user_data, without_equal_caps
 from experiments.terminal.program import PROGRAM
 from experiments.terminal.progress import say, short
@@ -227,8 +227,11 @@ def _without_equal_caps(study: Study, arguments: StudyArguments, workspace: Work
     return before if planned == same else planned
 
 
-def use_entries(registry: Path | None) -> None:
-    """Adds the entries of a TOML file to the registry, for the rest of this process."""
+def use_entries(registry: Path | None, run: Path | None = None) -> None:
+    """Adds the user's own entries to the registry, for the rest of this process: those that the study of `run` was
+    planned with, if it has any, and those of a TOML file, which take the place of others of the same name."""
+    if run is not None:
+        use_own_entries(Workspace.of_run(run))
     if registry is not None:
         from data_pipelines.registry.toml_file import load_entries
 

@@ -252,7 +252,7 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
         settings = Settings(**vars(training), robot=args.robot or Settings.robot, **scripted)
         return ScriptedSource(settings, simulator.robot(settings.robot), simulator.tokenizer.image_size)
     require(not scripted, f"--{', --'.join(scripted)}: only for tasks of the suite, not with recordings (--actions)")
-    use_entries(args.registry)
+    use_entries(args.registry, args.run)
     robot = simulator.robot(args.robot) if args.robot else None
     place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(args.run).store
     trained_on, driven = open_trajectories(args.actions, args.split or "train", *place)

@@ -65,7 +65,7 @@ def generate(
         allow_clipping: Replay actions even if most values of one of them lie outside the robot's range.
         skip_damaged: Leave out damaged episodes and count them, instead of stopping.
         tokenizer: Directory of the tokenizer that the model was trained with, if it is not beside RUN.
-        registry: TOML file with your own registry entries.
+        registry: TOML file with your own registry entries, besides those of the study of RUN.
     """
     from data_pipelines.convert.write import convert
     from data_pipelines.sources.convertible import require_module
@@ -89,7 +89,7 @@ def generate(
     require(clips >= 0, f"--clips must not be negative, got {clips}")
     if clips:
         require_module("av", f"--clips {clips}")
-    use_entries(registry)
+    use_entries(registry, run)
     decode = change_decode(find_decode(run), temperature, unmask_steps=unmask_steps)
     simulator = load_simulator(
         run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,

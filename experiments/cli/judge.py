@@ -67,7 +67,7 @@ def judge(
         split: Split of --recordings. Default: train.
         reward: With --recordings that have a reward in every step: the goal is reached in steps with at least this
             reward. The head is then trained frame by frame, which needs far fewer recordings.
-        registry: TOML file with your own registry entries.
+        registry: TOML file with your own registry entries, besides those of the study of RUN.
         real: CSV file with results of the policies on the real robot, with --recordings: columns policy, successes,
             episodes.
         starts: Number of starts of every policy, each the beginning of a held-out episode; with --recordings at most as
@@ -128,7 +128,7 @@ def judge(
     if recordings is None:
         judged = judge_run(run, out, config, policies)
     else:
-        use_entries(registry)
+        use_entries(registry, run)
         judged = judge_recorded(run, out, config, recordings, policies, split, tuple(counts or ()))
     ladder = judged.config.ladder
     trained = {"--demonstrations": judged.config.demonstrations, "--steps": ladder.steps}

@@ -196,9 +196,15 @@ def load_record(workspace: Workspace) -> Record:
         bool(record.axes),
         f"{workspace.record}: axes is empty; restore the axes that the study had, or run `{record.command}`",
     )
+    use_own_entries(workspace)
+    use_sizes(sizes_by_tokens(workspace.data_summary) if record.data else {})
+    return record
+
+
+def use_own_entries(workspace: Workspace) -> None:
+    """Adds the entries of the user's own that the study was planned with to the registry, for the rest of this
+    process."""
     if workspace.registry.exists():
         from data_pipelines.registry.toml_file import load_entries
 
         register(load_entries(workspace.registry))
-    use_sizes(sizes_by_tokens(workspace.data_summary) if record.data else {})
-    return record

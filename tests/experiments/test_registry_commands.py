@@ -427,3 +427,16 @@ def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monk
     assert {p.x for p in sweep.points} == {8, 23, 35}  # of 9 and 30 trajectories 2 are held out each
     run(replace(arguments, registry=None), replace(study, datasets=("pusher_sand", "rover_road")), "width", "study")
     assert load_record(workspace).axes == ("width",) and not workspace.registry.exists(), "of the study before"
+
+
+def test_a_run_of_a_study_needs_the_study_s_own_entries_no_second_time(tmp_path):
+    """`hma generate RUN --actions DIR` and others knew only the entries of their own --registry."""
+    workspace, given = Workspace(tmp_path / "study"), tmp_path / "given.toml"
+    workspace.root.mkdir()
+    for path, hz in ((workspace.registry, 5.0), (given, 7.0)):
+        path.write_text(to_toml(replace(make_spec("mine", (4,)), hz=hz)))
+    use_entries(None, workspace.root / "a run")
+    assert get_spec("mine").hz == 5
+    use_entries(given, workspace.root / "a run")
+    assert get_spec("mine").hz == 7, "what is given counts"
+    use_entries(None, tmp_path / "elsewhere" / "a run")  # of no study
