@@ -119,8 +119,9 @@ def as_scalar(hint: type, value: Any, where: str) -> Any:
     kinds = (int, float) if hint is float else hint
     fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
     require(fits, f"{where}: expected {hint.__name__}, got {given!r}")
-    whole = hint is float and isinstance(value, int)
-    require(not whole or abs(value) <= sys.float_info.max, f"{where}: the number is too large for a float")
+    if isinstance(value, int):
+        most = sys.float_info.max if hint is float else sys.maxsize
+        require(abs(value) <= most, f"{where}: the number is too large for {hint.__name__}")
     return value
 
 

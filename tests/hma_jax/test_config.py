@@ -201,10 +201,13 @@ def test_no_number_of_a_configuration_is_infinite_or_none_at_all():
                 cls(**{name: value})
 
 
-def test_whole_numbers_that_no_float_holds_are_refused():
+def test_whole_numbers_that_no_float_or_array_holds_are_refused():
     assert from_dict(OptimizerConfig, {"learning_rate": 1}).learning_rate == 1.0
-    with pytest.raises(ConfigError, match="OptimizerConfig.learning_rate: the number is too large for a float"):
+    with pytest.raises(ConfigError, match="OptimizerConfig.learning_rate: the number is too large for float"):
         from_dict(OptimizerConfig, {"learning_rate": 10**400})
+    for steps in (1e300, -(10**30)):
+        with pytest.raises(ConfigError, match="TrainConfig.steps: the number is too large for int"):
+            from_dict(TrainConfig, {"steps": steps})
 
 
 def test_lists_are_as_good_as_tuples():
