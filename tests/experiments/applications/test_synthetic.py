@@ -30,6 +30,7 @@ from experiments.applications.generating.conditions import (
 )
 from experiments.applications.generating.demonstration_sources import (
     RecordedSource,
+    ScriptedSource,
     Settings,
     Training,
     shuffled_actions,
@@ -46,7 +47,7 @@ from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.config.json import from_dict
-from hma_jax.simulator.folder import DECODE, change_decode, save_decode
+from hma_jax.simulator.folder import DECODE, ROBOTS, change_decode, load_robots, save_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_model
 from tests.experiments.applications.runs import TABLE, make_run
@@ -378,6 +379,15 @@ def test_what_following_actions_is_worth_is_as_the_page_says(name):
     page = " ".join((ROOT / "docs" / "generating.md").read_text().split())
     assert len(seeds) == 12
     assert f"worth {gain.mean():.2f} ({gain.mean() - half:.2f} to {gain.mean() + half:.2f}) of success" in page
+
+
+def test_how_soon_the_task_of_the_recorded_frames_is_done_is_as_the_page_says():
+    settings = from_settings(Settings, RESULTS / "synthetic_pusher" / "settings.json")
+    (robot,) = (one for one in load_robots(FIRST / ROBOTS) if one.name == settings.robot)
+    reached = ScriptedSource(settings, robot, 32).record().reached
+    third, fourth = 100 * reached[:, settings.given - 1 : settings.given + 1].mean(0)
+    page = " ".join((ROOT / "docs" / "generating.md").read_text().split())
+    assert f"{third:.0f} % of the tools are on the mark in the third frame, {fourth:.0f} % in the fourth" in page
 
 
 def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():

@@ -20,7 +20,7 @@ SPEC = make_spec(hz=4)
 KEYS = (SPEC.image_key, SPEC.action_keys)
 
 
-GROWTH = 350  # MB. In eight runs frames under way took 51 to 247; where records were read whole, it was 513 to 719
+GROWTH = 200  # MB: read_ahead.PREFETCH_BYTES, and half as much again for copies
 
 
 class Bytes:
