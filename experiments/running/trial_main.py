@@ -7,6 +7,7 @@ A launcher starts this, on whichever machine; run it by hand to debug a trial.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
@@ -166,4 +167,6 @@ class _ProgressFile:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]).absolute()))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("directory", type=Path, metavar="DIRECTORY")
+    sys.exit(main(parser.parse_args().directory.absolute()))

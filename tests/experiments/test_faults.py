@@ -6,6 +6,8 @@ import hashlib
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +33,8 @@ from hma_jax.training.runs import load_model, load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, LENGTHS, SMOKE, idle_training  # noqa: F401
 from tests.full_disk import full_disk
+
+ROOT = Path(__file__).parents[2]
 
 STEPS = ("--set", "tokenizer_train.steps=4", "--set", "train.steps=4")
 
@@ -144,6 +148,15 @@ def test_a_trial_on_a_full_disk_is_lost_not_failed_so_that_the_same_command_goes
     state = outcome(tmp_path, AttemptEnd(Exit.LOST))
     assert state.event == "lost"
     assert ("provenance.json" if room else "is the disk full?") in state.message
+
+
+def test_the_process_of_a_trial_takes_no_option_for_a_directory(tmp_path):
+    """--help was made, and held the start of an attempt."""
+    asked = [sys.executable, "-m", "experiments.running.trial_main", "--help"]
+    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=60, **where)
+    assert done.returncode == 0 and "trial_main.py [-h] DIRECTORY" in done.stdout
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_trial_whose_data_cannot_be_read_now_is_lost_not_failed(tmp_path, monkeypatch):
