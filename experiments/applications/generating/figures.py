@@ -26,7 +26,7 @@ def draw_conditions(
     of those that are not trained on generated trajectories."""
     most, label = {"success": (1, "success in the true simulator"), "error": (None, "action error, held out")}[what]
     with plt.rc_context(STYLE):
-        figure, panel = plt.subplots(figsize=(7.2, 3.4), layout="constrained")
+        figure, panel = plt.subplots(figsize=(1.1 * max(len(found), 6.5), 3.4), layout="constrained")
         places, mean = np.arange(len(found)), np.array([r.mean for r in found.values()])
         low, high = (np.clip([getattr(r, end) for r in found.values()], 0, most) for end in ("low", "high"))
         colours = [
@@ -43,7 +43,7 @@ def draw_conditions(
 
 
 def wrapped(name: str) -> str:
-    for words in (" generated", " without"):
+    for words in (" generated", " without", " first"):
         name = name.replace(words, "\n" + words[1:])
     return name.replace(", ", ",\n")
 

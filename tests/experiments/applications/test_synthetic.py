@@ -23,6 +23,7 @@ from experiments.applications.generating.conditions import (
     CONDITIONS,
     CONTROL,
     FEW,
+    GIVEN,
     MOST,
     PASSIVE,
     Condition,
@@ -39,7 +40,7 @@ from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.plan_actions import decided
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig
-from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.demonstrations import Demonstrations, save_demonstrations
 from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.tasks import find_task
 from experiments.applications.settings_file import hash_of
@@ -68,19 +69,57 @@ DATA = {kind: demonstrations(i) for i, kind in enumerate(("recorded", "generated
 
 
 def test_conditions_are_nested_and_no_recording_is_also_generated():
-    chosen = [choose(c, DATA, 3, 1) for c in CONDITIONS]
+    chosen = [choose(c, DATA, 3, 1) for c in CONDITIONS if c.kind in DATA]
+    assert len(chosen) == GIVEN == len(CONDITIONS) - 1
     which = [d.actions[:, 0, 0].astype(int).tolist() for d in chosen]
     kinds = [np.bincount(d.images[:, 0, 0, 0, 0], minlength=4).tolist() for d in chosen]
     assert kinds[:4] == [[10, 0, 0, 0], [10, 10, 0, 0], [10, 50, 0, 0], [10, 90, 0, 0]]
     assert kinds[4:] == [[10, 0, 90, 0], [100, 0, 0, 0], [10, 0, 0, 90]]
     assert all(len(set(w)) == len(w) for w in which)
-    for d, c in zip(chosen, CONDITIONS, strict=True):  # of a generated trajectory two frames, none of them recorded
+    for d, c in zip(
+        chosen, CONDITIONS[:GIVEN], strict=True
+    ):  # of a generated trajectory two frames, none of them recorded
         assert d.lengths.tolist() == [3] * c.recorded + [2] * c.generated
         assert (d.images[c.recorded :, :2] > 0).all()
     for fewer, more in zip(which[:3], which[1:4], strict=True):
         assert more[: len(fewer)] == fewer
     assert which[MOST] == which[CONTROL] == which[PASSIVE] and sorted(which[ALL]) == sorted(which[MOST])
     assert set(which[FEW]) != set(choose(CONDITIONS[FEW], DATA, 4, 1).actions[:, 0, 0].astype(int).tolist())
+
+
+def test_the_third_control_has_the_recorded_frames_that_generated_trajectories_begin_with_and_no_others(tmp_path):
+    count = 100
+    rng, lengths = np.random.default_rng(0), np.where(np.arange(count) == 4, 1, 3)
+    recorded = replace(demonstrations(0), images=rng.integers(0, 256, (count, 3, 1, 1, 3), np.uint8), lengths=lengths)
+    for kind in ("recorded", "generated", "shuffled", "held_out"):
+        save_demonstrations(recorded, tmp_path / f"{kind}.npz")
+    settings = Settings(given=2, with_given=True)
+    data = make_data(SimpleNamespace(settings=settings), None, tmp_path)
+    made = choose(CONDITIONS[GIVEN], data, 3, 0)
+    which = made.actions[:, 0, 0].astype(int)
+    assert sorted(which) == list(range(count))
+    assert made.lengths[:10].tolist() == lengths[which[:10]].tolist()
+    assert made.lengths[10:].tolist() == np.minimum(lengths[which[10:]], 2).tolist()
+    episode, frame = made.steps()
+    np.testing.assert_array_equal(made.images[episode, frame], recorded.images[which[episode], frame])
+    assert which[:10].tolist() == choose(CONDITIONS[MOST], data, 3, 0).actions[:10, 0, 0].astype(int).tolist()
+    without = make_data(SimpleNamespace(settings=replace(settings, with_given=False)), None, tmp_path)
+    assert set(data) - set(without) == {conditions.GIVEN_KIND}
+
+
+def test_every_control_s_share_is_that_of_its_own_trials_whichever_were_tried():
+    rng, seeds = np.random.default_rng(0), (0, 1, 2)
+    rates = dict(zip(range(len(CONDITIONS)), (0.2, 0.3, 0.5, 0.7, 0.25, 0.8, 0.4, 0.6), strict=True))
+    every = {(i, s): {"success": rng.random(400) < rate} for i, rate in rates.items() for s in seeds}
+    found = {one.name: one for one in conditions.summarise(every, seeds)}
+    for left_out in ({PASSIVE}, {GIVEN}, {PASSIVE, GIVEN}):
+        some = {at: trial for at, trial in every.items() if at[0] not in left_out}
+        summaries = conditions.summarise(some, seeds)
+        assert len(summaries) == len(found) - 2 * len(left_out)
+        assert all(found[one.name] == one for one in summaries)
+    for i, name in conditions.SHARES.items():
+        share = found[f"share of the gap: {name}"].measured["success"].mean
+        assert share == pytest.approx((rates[i] - rates[FEW]) / (rates[ALL] - rates[FEW]), abs=0.08)
 
 
 def test_the_share_of_the_gap_is_that_of_the_means():
