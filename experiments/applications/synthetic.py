@@ -41,6 +41,7 @@ from experiments.applications.generating.conditions import (
     CONDITIONS,
     CONTROLS,
     FEW,
+    GENERATED_KINDS,
     GIVEN_KIND,
     KINDS,
     PASSIVE_KIND,
@@ -62,6 +63,7 @@ from experiments.applications.generating.demonstration_sources import (
     shuffled_actions,
 )
 from experiments.applications.generating.figures import draw_conditions, draw_strips
+from experiments.applications.generating.reconstruction import ThroughTokenizer, reconstruct_recorded
 from experiments.applications.generating.source import replay
 from experiments.applications.generating.survey import survey
 from experiments.applications.generating.trajectories import describe_reconstruction, open_trajectories, require_layout
@@ -85,6 +87,7 @@ from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
+from hma_jax.tokenizers.base import Tokenizer
 
 OUT = Path("runs/synthetic")
 
@@ -168,22 +171,29 @@ def without_first(demos: Demonstrations, frames: int) -> Demonstrations:
 
 
 def run_trial(
-    source: DemonstrationSource, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update: Report
+    source: DemonstrationSource,
+    condition: Condition,
+    data: Mapping[str, Demonstrations],
+    seed: int,
+    update: Report,
+    through: Tokenizer | None = None,
 ) -> dict[str, list[float]]:
     """Trains one policy and judges it: the source's measures for every start, and `error` for every held-out
-    trajectory."""
+    trajectory. In the simulator it sees frames as the tokenizer `through` reconstructs them, if there is one."""
     settings = source.settings
     demos = choose(condition, data, seed, 0 if settings.with_given else settings.given)
     fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
     policy = clone(demos, BcConfig(frames=1, fit=fit), seed, update)
-    judged = source.judge(policy)
+    judged = source.judge(ThroughTokenizer(policy, through) if through else policy)
     errors = action_errors(policy, data[JUDGED_ON], scale_of(data["recorded"]))
     return {**judged, "error": np.round(errors, 5).tolist()}
 
 
-def run_trials(source: DemonstrationSource, data: Mapping[str, Demonstrations], kept: Path) -> Trials:
-    """Every condition that there is data of, with every seed. Each trial is kept in the directory `kept`, and made
-    once."""
+def run_trials(
+    source: DemonstrationSource, data: Mapping[str, Demonstrations], kept: Path, through: Tokenizer | None = None
+) -> Trials:
+    """Every condition that there is data of, with every seed, as `run_trial`. Each trial is kept in the directory
+    `kept`, and made once."""
     seeds, conditions = source.settings.seeds, [i for i, c in enumerate(CONDITIONS) if c.kind in data]
     first = sorted(conditions, key=lambda i: i not in (FEW, ALL, *SHARES))  # what counts most
     jobs, eta = [(i, s) for i in first for s in seeds], Eta()
@@ -193,7 +203,7 @@ def run_trials(source: DemonstrationSource, data: Mapping[str, Demonstrations], 
         def run_new(n: int, i: int, seed: int) -> dict[str, list[float]]:
             note = f"{CONDITIONS[i].name}, seed {seed}{eta(n, len(jobs))}"
             report = lambda done, total, loss: update(n, len(jobs), f"{note}: step {done}, {loss}")
-            return run_trial(source, CONDITIONS[i], data, seed, report)
+            return run_trial(source, CONDITIONS[i], data, seed, report, through)
 
         for n, (i, seed) in enumerate(jobs):
             trials[i, seed] = make_once(kept / f"{i}-{seed}.json", run_new, n, i, seed)
@@ -232,7 +242,7 @@ def write_results(seeds: tuple[int, ...], trials: Trials, quality: dict, out: Pa
 def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tuple[float, float, float]]:
     """PSNR in dB against the recording, of the frames after the given ones: mean, low and high over trajectories."""
     quality, recorded = {}, data["recorded"]
-    for kind in (kind for kind in ("generated", "shuffled", PASSIVE_KIND) if kind in data):
+    for kind in (kind for kind in GENERATED_KINDS if kind in data):
         each = psnr(data[kind].images, recorded.images)
         means = np.array([row[given:length].mean() for row, length in zip(each, recorded.lengths, strict=True)])
         names, numbers = np.full(len(means), kind), np.arange(len(means))
@@ -246,7 +256,12 @@ def make_source(args: argparse.Namespace, simulator: Simulator) -> Demonstration
     source."""
     seeds = tuple(range(args.seeds))
     training = Training(
-        seeds=seeds, steps=args.steps, given=args.given, with_given=args.with_given, temperature=args.temperature
+        seeds=seeds,
+        steps=args.steps,
+        given=args.given,
+        with_given=args.with_given,
+        through_tokenizer=args.through_tokenizer,
+        temperature=args.temperature,
     )
     scripted, recorded = (
         {name: value for name in names if (value := getattr(args, name)) is not None}
@@ -300,6 +315,12 @@ def main() -> None:
     parser.add_argument("--given", type=int, default=Training.given, help="recorded frames that others begin with")
     parser.add_argument("--with-given", action="store_true", help="train on these, too")
     parser.add_argument(
+        "--through-tokenizer",
+        action="store_true",
+        help="policies see all frames as the world model's tokenizer reconstructs them, in training and in the true "
+        "simulator: recorded and generated ones then look alike",
+    )
+    parser.add_argument(
         "--temperature",
         type=float,
         default=Training.temperature,
@@ -326,7 +347,9 @@ def main() -> None:
     if passive:
         pin_settings(out, without, passive, file=SECOND)
     data = make_data(source, simulator, out, passive)
-    trials = run_trials(source, data, out / "trials")
+    through = simulator.tokenizer if settings.through_tokenizer else None
+    seen = reconstruct_recorded(data, through, settings.given) if through else data
+    trials = run_trials(source, seen, out / "trials", through)
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
     write_settings(out, run, simulator, settings)
     shortest = data["recorded"].lengths[:2].min()

@@ -245,7 +245,7 @@ def reconstruction_psnr(
     values, datasets, episodes = [], [], []
     for number in itertools.count():
         images = next(frames)
-        values.append(np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)))
+        values.append(np.asarray(psnr(tokenizer.reconstruct(images), images)))
         for column, own in zip((datasets, episodes), frames.episodes(number), strict=True):
             column.append(own)
         done = sum(map(len, values))

@@ -58,7 +58,7 @@ def main() -> None:
     tokenizer, rows = load_tokenizer(args.run / "tokenizer"), []
     for directory in sorted((args.run / "suite").iterdir()):
         pairs = frame_pairs(get_spec(directory.name), directory, tokenizer.image_size)
-        decoded = np.asarray(tokenizer.decode(tokenizer.encode(pairs[:, 1])))
+        decoded = tokenizer.reconstruct(pairs[:, 1])
         rows.append([directory.name, *quality(decoded, pairs)])
     rows.append(["mean", *np.mean([row[1:] for row in rows], 0)])
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -168,6 +168,10 @@ class Tokenizer(abc.ABC):
         tokens = self._checked(np.asarray(tokens))
         return in_pieces(lambda piece: self._decode(self._device_params, piece), tokens, self.at_once)
 
+    def reconstruct(self, images: np.ndarray) -> np.ndarray:
+        """uint8 [B, H, W, 3], encoded and decoded. Raises ConfigError as `encode` and `decode` do."""
+        return np.asarray(self.decode(self.encode(images)))
+
     def require_tokens(self, tokens: np.ndarray, what: str, advice: str) -> None:
         """Raises ConfigError, which begins with `what` made them and ends with `advice`, for values that are no tokens.
         Compiled programs do not look: what they make is checked where it comes to the host."""

@@ -16,6 +16,7 @@ from experiments.applications.policies.demonstrations import Demonstrations, rec
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, find_task
 from hma_jax.config import require
+from hma_jax.config.base import later
 from hma_jax.simulator.robots import Robot
 
 
@@ -31,6 +32,7 @@ class Training:
     learning_rate: float = 2e-3
     given: int = 1  # recorded frames that a generated trajectory begins with
     with_given: bool = False  # policies are trained on these, too
+    through_tokenizer: bool = later(False)  # policies see all frames as the world model's tokenizer reconstructs them
     temperature: float = 0.0  # of sampling, whatever a run's decode.json says; 0: greedy decoding
 
     def __post_init__(self) -> None:

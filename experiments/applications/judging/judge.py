@@ -203,11 +203,7 @@ def _place(out: Path, name: str, world: str) -> Path:
 
 
 def _find_head(directory: Path, truth: GroundTruth, simulator: Simulator, user_success: UserSuccess | None) -> Head:
-    tokenizer = simulator.tokenizer
-
-    def reconstruct(images: np.ndarray) -> np.ndarray:
-        return np.asarray(tokenizer.decode(tokenizer.encode(images)))
-
+    reconstruct = simulator.tokenizer.reconstruct
     if user_success is not None:
         kept = directory / MEASURED
         if not kept.exists():

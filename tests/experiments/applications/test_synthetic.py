@@ -36,6 +36,7 @@ from experiments.applications.generating.demonstration_sources import (
     Training,
     shuffled_actions,
 )
+from experiments.applications.generating.reconstruction import ThroughTokenizer, reconstruct_recorded
 from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.plan_actions import decided
 from experiments.applications.policies.acting import scale_of
@@ -105,6 +106,69 @@ def test_the_third_control_has_the_recorded_frames_that_generated_trajectories_b
     assert which[:10].tolist() == choose(CONDITIONS[MOST], data, 3, 0).actions[:10, 0, 0].astype(int).tolist()
     without = make_data(SimpleNamespace(settings=replace(settings, with_given=False)), None, tmp_path)
     assert set(data) - set(without) == {conditions.GIVEN_KIND}
+
+
+class Coarse:
+    """A tokenizer whose reconstruction keeps the upper half of a grey level."""
+
+    def reconstruct(self, images: np.ndarray) -> np.ndarray:
+        assert images.ndim == 4 and images.dtype == np.uint8
+        return images // 16 * 16
+
+
+def test_policies_that_see_through_the_tokenizer_see_no_frame_otherwise_and_none_is_reconstructed_twice():
+    rng, ones = np.random.default_rng(0), np.ones(2, int)
+
+    def made(first: np.ndarray | None = None) -> Demonstrations:
+        images = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8)
+        if first is not None:
+            images[:, :2] = first[:, :2]
+        return Demonstrations(images, np.zeros((2, 4, 1), np.float32), 4 * ones, np.ones((2, 4), bool), ones > 0, ones)
+
+    recorded = made()
+    data = {"recorded": recorded, "held_out": made(), "given": replace(recorded, lengths=2 * ones)}
+    data |= {kind: made(recorded.images) for kind in ("generated", "shuffled", "blind")}
+    seen = reconstruct_recorded(data, Coarse(), 2)
+    for kind, demos in seen.items():
+        frames = 2 if kind in ("generated", "shuffled", "blind") else 4
+        np.testing.assert_array_equal(demos.images[:, :frames], data[kind].images[:, :frames] // 16 * 16)
+        np.testing.assert_array_equal(demos.images[:, frames:], data[kind].images[:, frames:])
+        np.testing.assert_array_equal(demos.lengths, data[kind].lengths)
+
+    told = []
+    policy = SimpleNamespace(reset=lambda *a, **k: told.append((a, k)), act=lambda images: images)
+    through = ThroughTokenizer(policy, Coarse())
+    through.reset([1], seeds=[7])
+    assert told == [(([1],), {"seeds": [7]})]
+    np.testing.assert_array_equal(through.act(recorded.images[:, 0]), recorded.images[:, 0] // 16 * 16)
+
+
+def test_a_policy_that_sees_through_the_tokenizer_does_so_in_the_true_simulator(monkeypatch):
+    monkeypatch.setattr(synthetic, "clone", lambda *_: "policy")
+    monkeypatch.setattr(synthetic, "action_errors", lambda policy, *_: np.array([float(policy == "policy")]))
+    source, coarse = SimpleNamespace(settings=Settings(), judge=lambda policy: {"success": [policy]}), Coarse()
+    data = DATA | {"held_out": DATA["recorded"]}
+    for through, acting in ((None, "policy"), (coarse, ThroughTokenizer("policy", coarse))):
+        found = run_trial(source, CONDITIONS[MOST], data, 0, lambda *_: None, through)
+        assert found == {"success": [acting], "error": [1]}
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_policies_are_trained_and_judged_through_the_tokenizer_if_that_was_asked_for(asked, tmp_path, monkeypatch):
+    """Both in the true simulator: trained on what the tokenizer reconstructs, and acting on it."""
+    run, kinds = make_run(tmp_path / "study"), ("recorded", "generated", "shuffled", "held_out")
+    monkeypatch.setattr(synthetic, "require_multiples", lambda *_: None)
+    monkeypatch.setattr(synthetic, "make_source", lambda *_: SimpleNamespace(settings=settings))
+    monkeypatch.setattr(synthetic, "make_data", lambda *_: {kind: demonstrations(i) for i, kind in enumerate(kinds)})
+    monkeypatch.setattr(synthetic, "reconstruct_recorded", lambda data, *how: ("reconstructed", data, how))
+    monkeypatch.setattr(synthetic, "run_trials", lambda *given: got.append(given) or 1 / 0)
+    settings, got = Settings(seeds=(0,), through_tokenizer=asked), []
+    monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(tmp_path / "out")])
+    with pytest.raises(ZeroDivisionError):
+        synthetic.main()
+    ((_, seen, _, through),) = got
+    assert (through is not None) == asked == (seen[0] == "reconstructed" if asked else False)
+    assert not asked or seen[2] == (through, 1)
 
 
 def test_every_control_s_share_is_that_of_its_own_trials_whichever_were_tried():
