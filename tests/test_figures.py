@@ -140,7 +140,7 @@ def test_how_many_episodes_are_held_out_is_as_the_page_on_own_data_says():
         assert (kept.count(enough - 1), kept.count(enough)) == (MIN_EPISODES - 1, MIN_EPISODES), name
         assert kept.count(7) == 1
     assert (
-        "Of fewer than 70 episodes (`paper`, which holds out 1 % instead of 5 %: of fewer than 350) at most 3" in page
+        "Of fewer than 70 episodes (fewer than 350 with `paper`, which holds out 1 % instead of 5 %) at most 3" in page
     )
     assert f"of fewer than 8 a single one: too few for `hma check`, which needs {MIN_EPISODES}." in page
 
