@@ -1,4 +1,5 @@
-"""Arguments of several commands besides `StudyArguments`; they hold for one command and are not passed to the next."""
+"""Arguments that several commands share, besides `StudyArguments`. They hold for one command and are not passed to the
+next."""
 
 from __future__ import annotations
 
@@ -46,8 +47,8 @@ class ReplaceArguments:
     """Results made with other settings or data are replaced only on request."""
 
     replace: Annotated[Step | None, arg(metavar="STEP"), UNSET] = None
-    """Make this step and those that depend on it again, in place of results made with other settings or data.
-    The steps in order: suite, tokenizer, tokens, windows, study."""
+    """Redo this step and those that depend on it, and replace results made with other settings or data. The steps in
+    order: suite, tokenizer, tokens, windows, study."""
 
 
 @dataclass(frozen=True)
@@ -60,12 +61,12 @@ class ModelArguments:
     """Train on N trajectories of each robot, chosen by hash: the same ones as in a sweep over trajectories."""
 
     def directory(self, study: StudyArguments) -> Path:
-        """`run`, or else that of a model of the study. Raises ConfigError for a URL."""
+        """`run`, or by default the study's directory for a single model. Raises ConfigError for a URL."""
         require_local("--run", self.run)
         return self.run or study.anywhere().out / "model"
 
 
-# As commands take them: `--help` shows those of each under its name.
+# The types that commands take: `--help` shows the options of each under its name.
 StudyOptions = Annotated[OmitArgPrefixes[StudyArguments], arg(name="study")]
 ModelOptions = Annotated[OmitArgPrefixes[ModelArguments], arg(name="model")]
 SavingOptions = Annotated[OmitArgPrefixes[RunOptions], arg(name="saving")]

@@ -1,6 +1,6 @@
-"""How command lines are read and helps are printed, for all commands alike; tyro does the rest.
+"""How command lines are read and help texts are printed, alike for all commands; tyro does the rest.
 
-A command is read by itself: an error names its options and its help only, not those of all commands.
+Each command is parsed on its own, so an error names only that command's options and help, not those of all commands.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from experiments.terminal.progress import OUTPUT
 from hma_jax.runtime.files import naming
 
 VALUES = {int: "N", float: "NUMBER", str: "NAME", Path: "PATH"}
-"""What a help calls a value, where the option itself does not say it."""
+"""How help texts name a value that its option does not name."""
 
 BORDER = "│╭╰"
 
@@ -37,14 +37,15 @@ REPEATED = ("--set", "--launcher-set")
 """Options that take one 'path=value' each time."""
 
 STYLE = re.compile("\x1b\\[[0-9;]*m")
-"""What a terminal takes for colours."""
+"""What a terminal reads as colours."""
 
 
 class Commands(SubcommandApp):
     """Commands by name, some of them groups of others."""
 
     def run(self, prog: str, arguments: Sequence[str], description: str | None = None) -> None:
-        """Runs the command that the arguments name. Exits with a message where they are wrong, and after a help."""
+        """Runs the command that the arguments name. Exits with a message if they are wrong, and after printing a help
+        text."""
         shown = _wrapped() if {"-h", "--help"} & set(arguments) else nullcontext()
         with _values(), shown:
             try:
@@ -76,8 +77,8 @@ class Commands(SubcommandApp):
 
 
 def repeat_option(arguments: Sequence[str]) -> str:
-    """What to write where an option of `REPEATED` was given once for several settings, or with a space for the '=';
-    '' where neither is so."""
+    """What to write instead if an option of `REPEATED` was given once for several settings, or with a space in place of
+    '='; '' if neither is the case."""
     for n, option in enumerate(arguments):
         if option not in REPEATED:
             continue
@@ -93,8 +94,8 @@ def repeat_option(arguments: Sequence[str]) -> str:
 
 
 def joined(doc: str) -> str:
-    """A docstring with every paragraph and every argument on one line, which a help breaks where it must. 'Default: X.'
-    at the end of an argument becomes '(default: X)', as tyro writes it."""
+    """A docstring with every paragraph and every argument on one line, which the help text breaks where needed.
+    'Default: X.' at the end of an argument becomes '(default: X)', as tyro writes it."""
     lines: list[str] = []
     arguments = False
     for line in inspect.cleandoc(doc).splitlines():
@@ -113,7 +114,7 @@ def _join_lines(function: Callable[..., Any]) -> None:
 
 
 def wrapped(text: str, width: int) -> str:
-    """A help with the lines outside its boxes broken, which tyro prints as they are."""
+    """A help text in which the lines outside its boxes are broken too: tyro prints those as they are."""
     lines = []
     for styled in text.splitlines():
         line = STYLE.sub("", styled)
@@ -128,7 +129,7 @@ def wrapped(text: str, width: int) -> str:
 
 
 class _Caught(io.StringIO):
-    """Collects what is printed, with the properties of the stream that it is meant for."""
+    """Collects what is printed, and has the properties of the stream for which it was meant."""
 
     def __init__(self, stream: TextIO):
         super().__init__()
@@ -156,7 +157,7 @@ def _wrapped() -> Iterator[None]:
 
 
 def _values() -> ConstructorRegistry:
-    """Rules by which a help calls values as `VALUES` says, also those of an option that may be left out."""
+    """Rules that make help texts name values as in `VALUES`, also for options that may be left out."""
     registry = ConstructorRegistry()
 
     @registry.primitive_rule

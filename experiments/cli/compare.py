@@ -1,4 +1,4 @@
-"""`hma compare`: two models on the windows that both saw, window by window."""
+"""`hma compare`: two models compared window by window, on the windows that both were evaluated on."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
 
 
 def _caption(rows: list[Difference], a: Side, b: Side) -> str:
-    """What the errors count, whose training differs, and which seeds, robots and metrics were not compared."""
+    """What the errors include, whose training differs, and which seeds, robots and metrics were not compared."""
     from experiments.analysis.compare import other_sequences
 
     seeds = max((row.seeds for row in rows), default=1)
@@ -99,10 +99,10 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
                 caption += f" {escape(other.name)} {unsaid} {common}."
         robots, other_robots = (next(iter(one.seeds.values())).datasets for one in (side, other))
         if left_out := [name for name in robots if name not in other_robots]:
-            caption += f" Only {escape(side.name)} was judged on {few(left_out)}: nothing here is of them."
+            caption += f" Only {escape(side.name)} was judged on {few(left_out)}: no value here includes them."
     if len(a.seeds) == len(b.seeds) == 1 and a.says_seed and b.says_seed and a.seeds.keys() != b.seeds.keys():
         of_a, of_b = (f"{escape(side.name)} is of seed {next(iter(side.seeds))}" for side in (a, b))
-        caption += f" {of_a}, {of_b}: differences are also those of seeds, which no error counts."
+        caption += f" {of_a}, {of_b}: differences include those between seeds, which no error accounts for."
     known = [side for side in (a, b) if side.step]
     if len({side.step for side in known}) > 1 or any(side.step < side.steps for side in known):
         made = [f"{escape(one.name)} {one.step:,}" + (f" of {one.steps:,}" if one.steps else "") for one in known]
@@ -130,7 +130,7 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
 
 
 def _heading(metric: str, ids: bool) -> str:
-    """A metric with its unit, if it has one. Where tokens are latents, and not `ids`, action-nats are of the loss."""
+    """A metric with its unit, if it has one. If tokens are latents, not `ids`, action-nats are in units of the loss."""
     from experiments.analysis.intervals import NATS
 
     unit = ("nats" if ids else "loss") if metric in NATS else METRICS[metric].unit

@@ -38,13 +38,14 @@ NAMES_IN_RATES = """\
 """
 
 THINNED = ("epic_kitchen",)
-"""Datasets of which `hma data convert` keeps fewer frames than the release, whose strides so count other frames."""
+"""Datasets of which `hma data convert` keeps fewer frames than the release did. The release's strides therefore count
+other frames."""
 
 SWAPPED = ("ego4d",)
 """Datasets whose images the release trained on with red and blue swapped (reference section 5.5)."""
 
 PLAIN = DecodeConfig(sampler=SamplerConfig(temperature=0.0))
-"""How exported programs fill frames where decode.json does not say it: as models are judged, without noise."""
+"""How exported programs fill frames where decode.json leaves it open: as in evaluation, without noise."""
 
 
 def _unless(usual: float | str) -> object:
@@ -176,8 +177,8 @@ def to_stablehlo(
         out: Directory to write: model.stablehlo, model.safetensors and model.json.
         batch: Clips at a time.
         prompt: Number of given frames.
-        frames: Total number of frames; those after the prompt are generated. Past the model's window it slides as
-            RUN/decode.json's `slide` says, by default exact.
+        frames: Total number of frames; those after the prompt are generated. Past the model's window, the window slides
+            as `slide` in RUN/decode.json says, by default exact.
         unmask_steps: Unmasking steps per generated frame.
         temperature: 0 takes the most likely tokens or latents, 1 samples from the model's distribution.
         sampler_steps: Steps of the diffusion sampler; no effect on discrete models.
@@ -201,8 +202,8 @@ def to_stablehlo(
 
 
 def _decode(run: Path, temperature: float | None, unmask_steps: int | None, latents: dict[str, Any]) -> DecodeConfig:
-    """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, changed where an argument, or a
-    value of `latents` for the sampler, is not None."""
+    """How a run fills frames: as in its decode.json, or else `PLAIN`. Arguments that are not None, and values of
+    `latents` (for the sampler) that are not None, replace those settings."""
     from hma_jax.simulator.folder import DECODE, change_decode, find_decode
 
     found = find_decode(run) if (run / DECODE).exists() else PLAIN
@@ -211,8 +212,8 @@ def _decode(run: Path, temperature: float | None, unmask_steps: int | None, late
 
 
 def _rates(run: Run) -> tuple[str, list[str]]:
-    """(registry entries of the run's robots, at the rates that give their strides; notes on robots that have none, or
-    need more than a rate)."""
+    """(registry entries of the run's robots, at the rates that give their strides; notes on robots without an entry,
+    and on those that need more than a rate)."""
     from data_pipelines.registry.toml_file import to_toml
 
     entries, unknown, other, thinned = [], [], [], []
@@ -247,7 +248,7 @@ def _rates(run: Run) -> tuple[str, list[str]]:
 
 
 def _study_of(run: Run, rates: Path) -> str:
-    """The arguments, some of them to be filled in, of a study that judges a converted run."""
+    """The arguments of a study that evaluates a converted run; the user has to fill in some of them."""
     study = get_preset("cpu-continuous" if run.model.diffusion else "paper")
     words = f"--preset {study.name} --registry {_quoted(rates)} --tokenizer TOKENIZER --data DIR --out OUT"
     frames, prompt = run.model.frames, study.eval.prompt_frames

@@ -29,9 +29,9 @@ def coord_check(
     """Check that a model's activations keep their size as it widens: the coordinate check of muP.
 
     Models of several widths learn the same few random windows. The table says with which power of the width each
-    activation grows, and its change in training (both as root mean squares): with muP these powers are near 0; if
-    they are not, a learning rate does not carry over from one width to another. Needs no data. Writes
-    coord_check.csv and coord_check.png into --out. docs/models.md shows a result.
+    activation, and its change in training, grows (both as root mean squares): with muP these powers are near 0; if they
+    are not, a learning rate does not carry over from one width to another. Needs no data. Writes coord_check.csv and
+    coord_check.png into --out. docs/models.md shows a result.
 
     Args:
         arguments: The study whose model and optimiser are checked.

@@ -1,4 +1,4 @@
-"""`hma evaluate`: a trained model on the frozen windows of a study, if it was made for them."""
+"""`hma evaluate`: evaluates a trained model on the frozen windows of a study, if the model was made for them."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def evaluate(
 
 
 def evaluate_model(setup: StudySetup, run: Path, weights: Weights, to: Path | None, replace: bool) -> None:
-    """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may
-    be replaced."""
+    """Writes results into `to`, or else into `run`. Raises ConfigError if other results exist there, unless they may be
+    replaced."""
     from hma_jax.runtime.processes import is_writer
     from hma_jax.training.runs import load_run
 
@@ -74,8 +74,8 @@ def evaluate_model(setup: StudySetup, run: Path, weights: Weights, to: Path | No
         to is None or not (to / JOB).is_file(),
         f"--to {to} is the directory of a trial, whose results must not be changed; choose another --to",
     )
-    trained = load_run(run, weights)  # into memory of the host: it may be too large for one device
-    # Before the work: its results can be written, and by no other process.
+    trained = load_run(run, weights)  # into host memory: it may be too large for one device
+    # Before the work, make sure that its results can be written, and that no other process writes there.
     with locked_run(to or run, EVALUATION) if is_writer() else nullcontext():
         _evaluate(setup, run, trained, to or run, replace)
 
@@ -95,7 +95,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     made_from = describe_evaluation(trained, names, prepared, protocol)
     if not replace:
         require_same_evaluation(place, made_from, trained)
-    # Besides what the stamp names: which windows are in a batch depends on its size, and a run that was trained again
+    # More than the stamp holds: the batch size decides which windows share a batch, and a run that was trained again
     # may have other weights at the same step.
     weights = read_list(run / CHECKPOINTS / str(trained.step))
     depends = lambda: [made_from.identity(), weights, protocol.batch, to_dict(execution), closure_hash(trial_closure())]
@@ -118,7 +118,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     summary = evaluation.summary
     which = ", averaged weights" if trained.weights == "ema" else ""
     of = "" if trained.finished else f" of {trained.train.steps:,}"
-    when = f", step {trained.step:,}{of}" if trained.step else ""  # a run that was converted has made no step here
+    when = f", step {trained.step:,}{of}" if trained.step else ""  # a converted run has made no step here
     console.print(table_of(summary, f"{short(run)}{when}{which}"))
     write_results(place, evaluation, made_from)
     parts.remove()
@@ -126,8 +126,8 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
 
 
 def write_results(place: Path, evaluation: Evaluation, made_from: MadeFrom) -> None:
-    """Writes the files of an evaluation into `place`, where others stay until all of them are on the disk. Raises
-    OSError, which keeps the others."""
+    """Writes the files of an evaluation into `place`. Earlier files there stay until all new ones are on the disk;
+    OSError is raised, and they are kept, if that fails."""
     from experiments.running.run_trial import write_evaluation
 
     made = place / ".evaluation.tmp"
@@ -137,22 +137,22 @@ def write_results(place: Path, evaluation: Evaluation, made_from: MadeFrom) -> N
         write_evaluation(made, evaluation, place.name)
         write_file(made / MEANS, to_strict_json(evaluation.summary.to_dict()))
         made_from.save(made, STAMP)
-        for name in (STAMP, MEANS, SAMPLES):  # if this is killed now, none must stand beside numbers of others
+        for name in (STAMP, MEANS, SAMPLES):  # if killed here, no file may be left beside files of another evaluation
             (place / name).unlink(missing_ok=True)
         for name in (FILE, SAMPLES, MEANS, STAMP):
             if (made / name).exists():
                 os.replace(made / name, place / name)
         sync(place)
     except OSError as error:
-        error.filename = str(place)  # the user knows of no other
+        error.filename = str(place)  # the only path that the user knows
         raise
     finally:
         shutil.rmtree(made, ignore_errors=True)
 
 
 def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) -> tuple[str, ...]:
-    """The datasets on whose windows a model is evaluated. Prints notes on those that are left out, and on what a reader
-    of the results should know of the others."""
+    """The datasets on whose windows a model is evaluated. Prints notes on datasets that are left out, and what a reader
+    of the results should know about the others."""
     frozen, empty = set(prepared.manifest.names), prepared.manifest.empty
     known, untrained = trained.table.names, _not_trained_on(trained, prepared)
     if not trained.train.masking.predicts_frames:
@@ -170,7 +170,7 @@ def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) ->
     besides = [name for name in names if setup.data and name not in setup.study.dataset_names()]
     if besides:
         say(
-            f"note: all windows that are frozen in {short(setup.workspace.root)} are evaluated, also those of "
+            f"note: all windows frozen in {short(setup.workspace.root)} are evaluated, also those of "
             f"{few(besides)}, which --data does not name"
         )
     _note_other_data(setup, prepared)
@@ -179,7 +179,7 @@ def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) ->
 
 
 def table_of(summary: Summary, title: str) -> TidyTable:
-    """The metrics that are shown of every dataset, and of all."""
+    """The displayed metrics, per dataset and over all."""
     metrics = [name for name, metric in METRICS.items() if metric.evaluated and name in summary.overall]
     table = tidy_table(title, "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
@@ -191,18 +191,18 @@ def table_of(summary: Summary, title: str) -> TidyTable:
 
 
 def _note_other_data(setup: StudySetup, prepared: PreparedData) -> None:
-    """Prints a note where the windows were frozen on other recordings than those that --data and --registry give."""
+    """Prints a note if the windows were frozen on recordings other than those that --data and --registry give."""
     from experiments.preparing.store import data_differences
 
     if lines := data_differences(setup.study, setup.workspace, setup.data, prepared.tokenizer):
         say(
-            f"note: the windows that are frozen in {short(setup.workspace.root)} are evaluated, whose tokens were made "
+            f"note: the windows frozen in {short(setup.workspace.root)} are evaluated, whose tokens were made "
             f"from other data than --data and the registry give (there -> given): {'; '.join(lines)}"
         )
 
 
 def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:
-    """Datasets among those a model was to be trained on that had no training window."""
+    """Datasets that a model was to be trained on, but that had no training window."""
     from data_pipelines.loading.selection import LoaderConfig, select_windows
 
     loader = trained.provenance.get("loader")
@@ -215,7 +215,7 @@ def _not_trained_on(trained: Run, prepared: PreparedData) -> list[str]:
 
 
 def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore) -> None:
-    """Prints a note where a model may have been trained on episodes that are held out in `store` (data leakage)."""
+    """Prints a note if a model may have been trained on episodes that are held out in `store` (data leakage)."""
     if elsewhere := trained_on_other_tokens(trained, names, store):
         say(
             f"note: {few(elsewhere)}: the model, or the one that it was initialised from, was trained on other tokens than "
@@ -226,9 +226,9 @@ def note_possible_leakage(trained: Run, names: Sequence[str], store: TokenStore)
 
 
 def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStore) -> list[str]:
-    """The robots of `names` that the model, or the model that it was initialised from, was trained on with other
-    tokens than those of `store`, as far as can be told. Another choice of held-out episodes makes another store. A
-    run keeps one hash of all its datasets: if one of these differs or is missing here, all are listed."""
+    """The robots of `names` for which the model, or the model that it was initialised from, was trained on tokens other
+    than those of `store`, as far as can be told. Another choice of held-out episodes makes another store. A run keeps
+    one hash for all its datasets: if one dataset differs or is missing here, all are listed."""
     found: list[str] = []
     provenance = trained.provenance
     while "loader" in provenance:
@@ -240,14 +240,14 @@ def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStor
 
 
 def require_prepared(setup: StudySetup) -> None:
-    """Raises ConfigError, with the command that makes it, unless everything is there that evaluation reads."""
+    """Raises ConfigError, with the command that makes it, if something that evaluation reads is missing."""
     workspace = setup.workspace
     missing = [str(p) for p in (workspace.store, workspace.tokenizer, workspace.manifest) if not p.exists()]
     require(not missing, f"{', '.join(missing)}: not made yet; run `{setup.command('tokenize')}`")
 
 
 def _require_known_data(setup: StudySetup, trained: Run) -> None:
-    """Raises ConfigError where tokens are still to be made, of datasets of which the model knows none."""
+    """Raises ConfigError if the tokens do not exist yet and the model knows none of the study's datasets."""
     known, given = trained.table.names, setup.study.dataset_names()
     require(
         not setup.data or setup.workspace.manifest.exists() or bool(set(known) & set(given)),
@@ -256,7 +256,7 @@ def _require_known_data(setup: StudySetup, trained: Run) -> None:
 
 
 def check_fits(trained: Run, prepared: PreparedData) -> None:
-    """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
+    """Raises ConfigError if a model was trained for tokens, windows or datasets other than these."""
     frames, manifest = trained.model.frames, prepared.manifest
     tokens = windows = data = "; evaluate it with the --out it was trained in"
     if _converted(trained):  # it was trained in none
@@ -276,7 +276,7 @@ def check_fits(trained: Run, prepared: PreparedData) -> None:
 
 
 def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
-    """Raises ConfigError, with `advice`, where the model was not trained on the tokenizer's tokens."""
+    """Raises ConfigError, with `advice`, if the model was not trained on the tokenizer's tokens."""
     if why := tokenizer_mismatch(trained, tokenizer):
         raise ConfigError(why + advice)
     if _converted(trained):
@@ -287,8 +287,8 @@ def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
 
 
 def tokenizer_mismatch(trained: Run, tokenizer: Tokenizer) -> str:
-    """Why a model was not trained on the tokens of this tokenizer; '' if it was. A model that was converted does not
-    know its own: then the form of its tokens decides."""
+    """Why a model was not trained on the tokens of this tokenizer; '' if it was. A converted model does not record its
+    tokenizer: then the form of its tokens decides."""
     from hma_jax.tokenizers.base import token_mismatch
 
     if not _converted(trained):

@@ -1,4 +1,4 @@
-"""`hma fit`: scaling fits of a study, and a prediction from them, written down before it is put to the test."""
+"""`hma fit`: scaling fits of a study, and predictions from them that are written down before they are tested."""
 
 from __future__ import annotations
 
@@ -141,9 +141,9 @@ def _predict(root: Path, target: str, out: Path | None, settings: tuple[str, ...
 
 
 def _held_out(sweep: Sweep, provenance: Provenance, target: str, x: float, how: str) -> tuple[Curve, list[Position]]:
-    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` they are added, for the
-    message where there are none. Raises ConfigError for that, for an axis along which no power law is expected, and
-    where it is not clear which of several curves is meant."""
+    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`. `how`: how to add such trials,
+    for the error message. Raises ConfigError if there are none, if no power law is expected along the axis, and if it
+    is not clear which of several curves is meant."""
     from experiments.analysis.scaling import curves_of
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import POINT

@@ -56,7 +56,7 @@ def generate(
         name: Name of the new dataset. Default: ROBOT_generated.
         given: Number of recorded frames that each episode begins with.
         seed: Random seed; another one gives other samples of the same episodes.
-        batch: Episodes generated at the same time. By rounding, it has an effect on the frames.
+        batch: Episodes generated at the same time. It affects the frames, through rounding.
         clips: Number of episodes that are also written as MP4, the recording on the left. With 0, PyAV is not needed.
         unmask_steps: Unmasking steps per frame. Default: as in RUN/decode.json.
         temperature: Temperature at which tokens or latents are sampled. Default: as in RUN/decode.json.

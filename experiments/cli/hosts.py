@@ -1,4 +1,4 @@
-"""What commands ask that several processes, on one host or on many, do together."""
+"""Options of commands that several processes, on one host or on many, run together."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Hosts:
     process: Annotated[int | None, arg(metavar="I"), UNSET] = None
     """Number of this process, from 0. Or set HMA_PROCESS."""
     distributed: Annotated[FlagCreatePairsOff[bool], UNSET] = False
-    """Detect what is not given, from Slurm (srun), Kubernetes, a TPU pod or MPI."""
+    """Detect the values that are not given, from Slurm (srun), Kubernetes, a TPU pod or MPI."""
     start_timeout: Annotated[float, arg(name="start-timeout", metavar="SECONDS")] = 300.0
     """How long to wait until all processes have started."""
     lost_after: Annotated[float, arg(name="lost-after", metavar="SECONDS")] = 90.0
-    """If a process gives no sign of life for so long, the others end with exit code 75."""
+    """If a process gives no sign of life for this long, the others end with exit code 75."""
 
     def _settings(self, detect: bool) -> Processes:
         from hma_jax.runtime.processes import Processes
@@ -40,12 +40,12 @@ class Hosts:
         ).or_from(os.environ)
 
     def count(self) -> int:
-        """How many processes are asked for, whether or not they are told how to meet; 1 also where --distributed is to
-        find it out."""
+        """How many processes are asked for, whether or not the arguments say how they connect; 1 also if --distributed
+        has still to detect it."""
         return self._settings(detect=True).processes or 1
 
     def join(self) -> None:
-        """Joins the other processes, if there are any; from then on only process 0 writes to the screen."""
+        """Connects to the other processes, if there are any; from then on only process 0 writes to the screen."""
         from hma_jax.runtime.processes import start
 
         settings = self._settings(self.distributed)

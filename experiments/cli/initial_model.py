@@ -1,5 +1,5 @@
-"""The trained model that a training run begins with: the study that follows from its architecture, tokenizer and
-robots, and what the run remembers of it."""
+"""The trained model from which a training run starts: the study that follows from its architecture, tokenizer and
+robots, and what the run records of it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 
 def setup_of(source: Path, trained: Run, arguments: StudyArguments) -> StudySetup:
-    """The study that goes on from the model `trained`, which is in the directory `source`. Writes nothing.
+    """The study that continues from the model `trained`, which is in the directory `source`. Writes nothing.
 
-    Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
+    Raises ConfigError, before any work, for a model, tokens or actions other than those that it was made for.
     """
     arguments = arguments.anywhere()
     arguments = dataclasses.replace(arguments, tokenizer=_find_tokenizer(source, trained, arguments))
@@ -43,12 +43,12 @@ def setup_of(source: Path, trained: Run, arguments: StudyArguments) -> StudySetu
 
 
 def known_datasets(trained: Run, setup: StudySetup) -> list[str]:
-    """The datasets of a study whose robots a model knows."""
+    """The datasets in a study whose robots the model knows."""
     return [name for name in setup.study.dataset_names() if name in trained.table.names]
 
 
 def new_datasets(trained: Run, setup: StudySetup) -> list[str]:
-    """The datasets of a study whose robots a model does not know."""
+    """The datasets in a study whose robots the model does not know."""
     return [name for name in setup.study.dataset_names() if name not in trained.table.names]
 
 
@@ -63,7 +63,7 @@ def require_known(source: Path, trained: Run, setup: StudySetup) -> None:
 
 
 def require_other_directory(source: Path, run: Path) -> None:
-    """Raises ConfigError if the new run would lie where the model lies that it begins with."""
+    """Raises ConfigError if the new run would have the directory of the model that it begins with."""
     require(
         run.resolve() != source.resolve(),
         f"{short(source)} holds the model that the new run begins with; give the new run a directory of its own with "
@@ -73,7 +73,7 @@ def require_other_directory(source: Path, run: Path) -> None:
 
 def _find_tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Path:
     """The directory of the tokenizer whose tokens a model takes: the one that is asked for, or one in the study's
-    directory or beside the run. Raises ConfigError where it is none of them."""
+    directory or beside the run. Raises ConfigError if none of these is the model's tokenizer."""
     from hma_jax.simulator.folder import TOKENIZER
     from hma_jax.tokenizers.io import load_tokenizer
 
@@ -92,23 +92,23 @@ def _find_tokenizer(source: Path, trained: Run, arguments: StudyArguments) -> Pa
 
 
 def newest_description(run: Path) -> tuple[int, dict[str, Any]]:
-    """(step, description) of the newest checkpoint of a run that says what it is; (0, {}) without any."""
+    """(step, description) of the newest checkpoint of a run that has a description; (0, {}) without any."""
     from hma_jax.training.reading import CheckpointError, list_steps, read_description
 
     checkpoints = run.absolute() / CHECKPOINTS
     for newest in reversed(list_steps(checkpoints)):
-        with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
+        with suppress(CheckpointError):  # damage is reported, or skipped, by the code that restores the checkpoint
             return newest, read_description(checkpoints / str(newest))
     return 0, {}
 
 
 def origin_of(run: Path, initial: Run | None) -> dict[str, Any] | None:
-    """The origin of a run: step and provenance of the model `initial` that it begins with. Of a run that exists, those
-    that it began with, which may be an earlier step of that model; None without an initial model. Raises ConfigError
-    for a run that began with another one."""
+    """The origin of a run: step and provenance of the model `initial` that it begins with. For an existing run: those
+    that it began with, which may be of an earlier step of that model. None without an initial model. Raises ConfigError
+    for a run that began with another model."""
     _, described = newest_description(run)
     origin = None if initial is None else {"step": initial.step, "provenance": initial.provenance}
-    if "table" not in described:  # it has not begun, or is none, of which the restoring speaks
+    if "table" not in described:  # not begun yet, or no model: then restoring reports it
         return origin
     taken, place = described["provenance"].get("origin"), "give the new run a directory of its own with --run NEW"
     if taken is None or origin is None:
@@ -133,8 +133,8 @@ def origin_of(run: Path, initial: Run | None) -> dict[str, Any] | None:
 
 
 def load_initial(source: Path, run: Path) -> Run:
-    """The trained model in `source`. Where that was removed and `run` began with it, what the run recorded of it, which
-    with its own checkpoint is enough to go on."""
+    """The trained model in `source`. If that was removed and `run` began with it: what the run recorded of it, which
+    together with the run's own checkpoint is enough to continue."""
     from hma_jax.training.runs import load_run
 
     origin = None if source.exists() else newest_description(run)[1].get("provenance", {}).get("origin")

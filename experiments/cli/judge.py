@@ -1,4 +1,4 @@
-"""`hma judge`: does success in the learned simulator tell success in the true one?"""
+"""`hma judge`: does success in the learned simulator predict success in the true one?"""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def judge(
             require_robot(robot, load_run(run, "auto").table.names)
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
-        expert = dict.fromkeys(KINDS, 0) | expert  # recordings have no expert to clone
+        expert = dict.fromkeys(KINDS, 0) | expert  # with recordings there is no expert to clone
         split = split or "train"
         judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold, reward)
     config = JudgeConfig(
@@ -160,7 +160,8 @@ def _show_agreement_with_labels(labels: Path, out: Path) -> None:
 def _require_options_of(
     recordings: str | None, task: str, of_expert: dict[str, int], of_recordings: dict[str, Any]
 ) -> None:
-    """Raises ConfigError for options of recordings without these, and for options of an expert with recordings."""
+    """Raises ConfigError for options that need --recordings if it is not given, and for options that need an expert if
+    it is."""
     if recordings is None:
         for flag, value in of_recordings.items():
             require(
@@ -177,7 +178,8 @@ def _require_options_of(
 
 
 def _write_results(judged: Judgement, counts: Mapping[str, Count] | None, out: Path, again: str) -> None:
-    """Tables, figure and pages of a judgement; `counts` of the real robot; `again`: the command that repeats it."""
+    """Writes tables, figure and pages of a judgement. `counts`: of the real robot; `again`: the command that repeats
+    it."""
     from experiments.applications.judging.blind import write_blind
     from experiments.applications.judging.outcomes import write_outcomes
     from experiments.applications.judging.page import write_page

@@ -26,7 +26,7 @@ from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.program import PROGRAM
 
 BEGIN_ANEW = tuple("compare report status fit convert bench plan coord-check play check branch".split())
-"""Commands that keep nothing of what they had begun when they are stopped."""
+"""Commands that keep no unfinished work when they are stopped."""
 
 app = Commands()
 app.command(name="study")(study.study)

@@ -1,4 +1,4 @@
-"""The table of a mixture: how much there is of each dataset, and how often a training run draws it."""
+"""The table of a mixture: the amount of data in each dataset, and how often a training run draws from it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def show_mixture(store: TokenStore, trial: Trial) -> None:
 
 
 def show_drawn(drawn: Mapping[str, Drawn], trial: Trial) -> None:
-    """The same of what was counted."""
+    """The same table, from counts that were already made."""
     if sum(one.share > 0 for one in drawn.values()) < 2:
         return
     draws = trial.train.steps * trial.train.batch

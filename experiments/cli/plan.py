@@ -100,7 +100,7 @@ def plan(
         "verdict",
     )  # fmt: skip
     for name, made in rows:
-        # The peak holds parameters, moments, the average and whatever lives at once of what is computed.
+        # The peak holds parameters, moments, the average, and whatever intermediate values live at the same time.
         sizes = (made.stored, made.moments, *[made.stored] * averaged, made.temporary, made.peak)
         shown = [size_of(x) if made.peak else "" for x in sizes]
         shape = " x ".join(map(str, made.mesh.values()))
@@ -118,7 +118,7 @@ def plan(
 
 
 def read_memory(size: str | None) -> float | None:
-    """Bytes of '80GiB' or '80GB'. Raises ConfigError for what is no size."""
+    """Number of bytes in '80GiB' or '80GB'. Raises ConfigError for anything that is not a size."""
     if size is None:
         return None
     match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(GiB|GB)", size)
@@ -129,7 +129,7 @@ def read_memory(size: str | None) -> float | None:
 def _choose_model(
     arguments: PlanArguments, shape: Shape
 ) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
-    """The model in words, then what its training step is made of: of a study's reference trial, or of a fixed model."""
+    """The model in words, then the parts of its training step: for a study's reference trial, or for a fixed model."""
     if arguments.preset is None:
         from experiments.bench.models import make_shape
 
@@ -180,7 +180,8 @@ def _print_sent(name: str, made: Plan, accumulate: int) -> None:
 
 
 def how_often(loops: int, accumulate: int) -> str:
-    """How often what is in so many loops of a step with so many micro-batches occurs. Loops in a layer are not told."""
+    """How often a collective runs that is inside this many nested loops of a step with this many micro-batches. Loops
+    within a layer cannot be distinguished."""
     inner = ["each layer", *["each micro-batch"] * (accumulate > 1)]
     return " of ".join(inner[-loops:]) if loops else "once"
 

@@ -1,4 +1,4 @@
-"""`hma play`: a page on which a trained model is driven."""
+"""`hma play`: a page on which you drive a trained model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hma_jax.simulator.robots import Robot
 
 EVERYWHERE = ("0.0.0.0", "::")
-"""Addresses that stand for all of this computer's, none of which a browser can be sent to."""
+"""Addresses that stand for all addresses of this computer; a browser cannot be sent to them."""
 
 
 def play(
@@ -47,8 +47,8 @@ def play(
         host: Address to listen on. 127.0.0.1: for this computer only; 0.0.0.0: for everybody who can reach it.
         port: Port to listen on; 0 takes a free one.
         public_name: A name, without port, by which browsers reach this server through a proxy, a tunnel or a network;
-            repeat the option for further ones. At names but these, localhost and --host it refuses to answer; at IP
-            addresses it always does.
+            repeat the option for further ones. It refuses requests for any name except these, localhost and --host; it
+            always answers requests for IP addresses.
         visitors: How many people can drive at the same time, in one batch.
         window: How to continue when the episode is longer than the model's window: exact computes the window again for
             every frame; streaming is faster, but may stop following commands (docs/endurance_small.md). Default: as
@@ -104,7 +104,7 @@ def play(
     raise_pending_stop()
 
     def truth(robot: Robot) -> TrueSimulator | None:
-        # What draws a physics simulator belongs to one thread; turns are taken in several.
+        # The renderer of a physics simulator belongs to one thread, but turns are taken in several.
         return true_simulator(simulator, [robot]) if in_suite(robot) else None
 
     app, ended = make_app(simulator, truth, max_acting=1, public_names=(host, *public_name)), threading.Event()
@@ -112,7 +112,7 @@ def play(
     def reached(together: int) -> None:
         app[SESSIONS].max_acting = together
 
-    # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.
+    # It is joined at the end, after at most one more program: the interpreter cannot exit while a thread compiles.
     compiling = threading.Thread(
         target=warm_up_more, args=(simulator, 1), kwargs={"ended": ended.is_set, "reached": reached}
     )
@@ -121,7 +121,7 @@ def play(
         shown = "localhost" if host in ("127.0.0.1", *EVERYWHERE) else host
         others = ", from other computers at this one's address" if host in EVERYWHERE else ""
         say(f"drive it at http://{_place(shown, actual)}{others} (end with Ctrl-C)")
-        if visitors > 1:  # in the background: until programs for several visitors are compiled, these take turns
+        if visitors > 1:  # in the background: until programs for several visitors are compiled, they take turns
             compiling.start()
 
     try:
@@ -137,7 +137,7 @@ def play(
 
 @contextmanager
 def _listening_at(host: str, port: int) -> Iterator[None]:
-    """Says where it was when the system does not let the block listen."""
+    """If the system does not let the block listen, raises an error that names host and port."""
     try:
         yield
     except OSError as error:
@@ -147,5 +147,5 @@ def _listening_at(host: str, port: int) -> Iterator[None]:
 
 
 def _place(host: str, port: int) -> str:
-    """As in a URL, where an IPv6 address stands in brackets."""
+    """Host and port as in a URL, where an IPv6 address is in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,4 +1,4 @@
-"""Where the program starts: before anything large is imported, it settles how the process holds memory."""
+"""Where the program starts: before anything large is imported, it sets how the process manages memory."""
 
 import faulthandler
 import sys
@@ -10,7 +10,7 @@ from hma_jax.runtime.host_memory import collect_rarely, restart_keeping_pages
 
 def start() -> None:
     open_closed_output()
-    faulthandler.enable()  # what each thread did, when a library ends the process by a signal
+    faulthandler.enable()  # shows what each thread did if a library ends the process by a signal
     own_process = is_program()
     if own_process:
         restart_keeping_pages()

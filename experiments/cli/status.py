@@ -1,4 +1,4 @@
-"""`hma status`: how far the trials of a study are."""
+"""`hma status`: the progress of a study's trials."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def status(
     study: Annotated[Positional[Path], arg(metavar="STUDY")],
     everything: Annotated[FlagCreatePairsOff[bool], arg(name="all"), UNSET] = False,
 ) -> None:
-    """Show how far the trials of a study are: which run, where, and how those ended that have no result.
+    """Show the progress of a study's trials: which ones run, where, and how those without a result ended.
 
     Reads only, so the study may be running, on this machine or on others.
 

@@ -1,4 +1,4 @@
-"""`hma study`, `hma sweep` and `hma report`: all of a study, one axis of it, its page again."""
+"""`hma study`, `hma sweep` and `hma report`: a whole study, one axis of it, or its page anew."""
 
 from __future__ import annotations
 
@@ -107,7 +107,8 @@ def _dry_run(
     launcher_options: LauncherOptions,
     replace: Step | None,
 ) -> None:
-    """Prints the table of trials, notes on them, and why the command itself would be refused for what is there."""
+    """Prints the table of trials, notes on them, and why the command itself would be refused because of existing
+    results."""
     from experiments.dry_run.done import find_done
     from experiments.dry_run.notes import refusal_as_note, say_notes
     from experiments.dry_run.plan_table import Devices, plan_table

@@ -1,4 +1,4 @@
-"""`hma tokenize`: everything up to training, by one process or by many."""
+"""`hma tokenize`: prepares everything up to training, in one process or in many."""
 
 from __future__ import annotations
 
@@ -43,8 +43,9 @@ def tokenize(
     Args:
         arguments: Study, data, output directory and settings. Several processes share the directory.
         replacement: Results made with other settings or data are replaced only on request.
-        batch: Frames encoded at a time, at least: rounded up to what fills all devices. Does not change any token.
-        threads: Threads that decode frames, to train a tokenizer as well.
+        batch: Smallest number of frames encoded at a time: it is rounded up to fill all devices. Does not change any
+            token.
+        threads: Threads that decode frames, also to train a tokenizer.
     """
     prepare_together(make_setup(arguments), batch, threads, replacement.replace)
 
@@ -80,7 +81,8 @@ def prepare_together(setup: StudySetup, batch: int | None, threads: int | None, 
 
 
 def _take_part(setup: StudySetup, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
-    """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
+    """Joins in the tokenising, but makes no tokenizer and replaces nothing: the process that holds the directory relies
+    on what is there."""
     from experiments.preparing.asked import require_same_asked
     from experiments.preparing.given_tokenizer import require_same_tokenizer
     from experiments.preparing.sources import find_sources, find_suite
@@ -108,7 +110,7 @@ def _take_part(setup: StudySetup, busy: Busy, batch: int | None, threads: int | 
 
 
 def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
-    """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
+    """Makes sure that a complete store's windows are frozen, by the process that holds the directory or by this one."""
     from experiments.preparing.given_tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
@@ -130,7 +132,7 @@ def _freeze(setup: StudySetup, sources: Sequence[Source]) -> None:
 
 
 def show_store(workspace: Workspace, rate: float | None) -> None:
-    """What the token store holds, per dataset, and the stride of a study at `rate` Hz (None: native)."""
+    """Prints what the token store holds for each dataset, and its stride in a study at `rate` Hz (None: native)."""
     from data_pipelines.tokens.manifest import FILE
     from data_pipelines.tokens.store import TokenStore
 

@@ -1,4 +1,4 @@
-"""`hma tokenizer`: the image tokenizer is trained here, made of published weights or of your own code, or none."""
+"""`hma tokenizer`: trains an image tokenizer, or makes one from published weights, your own code or pixel patches."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 tokenizer_app = Commands()
 
-HELP = "Train an image tokenizer, import published weights, or make one of your own code or of pixel patches."
+HELP = "Train an image tokenizer, import published weights, or make one from your own code or from pixel patches."
 
 
 @tokenizer_app.command(name="train")
@@ -92,7 +92,7 @@ def pixels(
 def python(
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")], out: Annotated[Path, arg(metavar="DIR")]
 ) -> None:
-    """Make a tokenizer of your own Python code: a folder with tokenizer.py, beside it its weights.
+    """Make a tokenizer from your own Python code: a folder with tokenizer.py and, beside it, its weights.
 
     All files of the folder are copied. Every command that uses the tokenizer runs this code. Others who get the
     tokenizer, or a run or study that holds it, have to say that they trust it: `hma tokenizer trust`.
@@ -113,7 +113,7 @@ def python(
 
 @tokenizer_app.command(name="trust")
 def trust(directory: Annotated[Positional[Path], arg(metavar="DIR")]) -> None:
-    """Let a tokenizer of somebody else's Python code run here, in this and all later commands.
+    """Let a tokenizer made from somebody else's Python code run here, in this and all later commands.
 
     One that `hma tokenizer python` made here needs this only for other users, or on machines with another home
     directory (HMA_CACHE_DIR). Read the code first: DIR/files.

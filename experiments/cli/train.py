@@ -1,4 +1,4 @@
-"""`hma train` and `hma adapt`: single models of a study's data."""
+"""`hma train` and `hma adapt`: single models, trained on a study's data."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 SWEPT = ("seeds", "ablation_seeds", "axes", "widths", "trajectory_counts", "transfer", "designs", "judged")
-"""Settings of a study that a single model does not have; of `seeds` it has the first."""
+"""Settings of a study that a single model does not use; of `seeds` it uses the first."""
 
 
 def train(
@@ -130,7 +130,7 @@ def adapt(
     trained, gone = load_initial(source, run), not source.exists()
     setup = setup_of(source, trained, arguments)
     study = setup.study
-    # Of a source that is gone `run` itself is read, which has the new robots already.
+    # If the source is gone, `run` itself is read, which already has the new robots.
     new = list(trained.train.only) or study.dataset_names() if gone else new_datasets(trained, setup)
     require(
         bool(new),
@@ -167,8 +167,8 @@ def train_model(
     replace: Step | None,
     initial: Run | None,
 ) -> None:
-    """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
-    the run `initial` on where one is given, which knows its robots."""
+    """Trains the study's reference trial on its own, on `trajectories` of each robot (None: all). If the run `initial`
+    is given, training starts from its weights; it must know the robots."""
     origin = _check(setup, run, trajectories, options, initial)
     _require_devices(setup)
     if initial is None:
@@ -187,7 +187,7 @@ def _check(
     setup: StudySetup, run: Path, trajectories: int | None, options: RunOptions, initial: Run | None
 ) -> dict[str, Any] | None:
     """The origin of the run (`origin_of`). Raises ConfigError, before any work, for invalid options and for a run that
-    was not trained here, or began with another model."""
+    was not trained here or began with another model."""
     from experiments.dry_run.trainable import require_only
     from hma_jax.training.optimizer import check_schedule
 
@@ -203,8 +203,8 @@ def _check(
 
 
 def _require_free(setup: StudySetup, run: Path) -> None:
-    """Raises ConfigError for a run that would lie among what a study made: as its own directory, of which no
-    application would find tokenizer and tokens beside the run, or in the place of a part of it."""
+    """Raises ConfigError if `run` is the directory of a study or of one of its parts. In a study's own directory, no
+    application would find tokenizer and tokens beside the run."""
     study = setup.workspace
     parts = (study.suite, study.tokenizer, study.store, study.trials, study.predictions, study.figures)
     there = run.resolve()
@@ -217,8 +217,8 @@ def _require_free(setup: StudySetup, run: Path) -> None:
 
 
 def _require_no_trial(setup: StudySetup, run: Path) -> None:
-    """Raises ConfigError for the run of a trial: its result vouches for the log as it is, and its study for the
-    steps."""
+    """Raises ConfigError for the run of a trial: the trial's result seals its log, and its study fixes the
+    number of steps."""
     require(
         run.name != RUN or not (run.absolute().parent / JOB).is_file(),
         f"{short(run)} is the run of a trial, and its study would refuse what was trained on; to train its model further: "
@@ -227,10 +227,10 @@ def _require_no_trial(setup: StudySetup, run: Path) -> None:
 
 
 def _require_trained_here(setup: StudySetup, run: Path) -> None:
-    """Raises ConfigError for a run that was converted: it was trained on no data that training could go on with."""
+    """Raises ConfigError for a converted run: it has no data here with which training could continue."""
     step, described = newest_description(run)
-    # What has no table is no model, of which the restoring speaks too. Training saves nothing before its first step:
-    # weights of step 0 are another run's, under its description perhaps (`hma convert from-safetensors`).
+    # Without a table it is no model, which restoring reports. Training saves nothing before its first step, so
+    # weights of step 0 come from another run, perhaps with that run's description (`hma convert from-safetensors`).
     require(
         "table" not in described or (step > 0 and "loader" in described["provenance"]),
         f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
@@ -239,7 +239,7 @@ def _require_trained_here(setup: StudySetup, run: Path) -> None:
 
 
 def _require_devices(setup: StudySetup) -> None:
-    """Raises ConfigError, before any work, for a mesh that does not fit the devices here, the batch or the model."""
+    """Raises ConfigError, before any work, if the mesh does not fit the devices here, the batch or the model."""
     from hma_jax.runtime.mesh import check_mesh, make_mesh
 
     study, execution = setup.study, setup.study.execution
@@ -258,8 +258,8 @@ def _prepare(setup: StudySetup, replace: Step | None) -> None:
 
 
 def _require_no_tokenizer_training(setup: StudySetup, replace: Step | None) -> None:
-    """Raises ConfigError, in all of several processes, where process 0 would train a tokenizer while it prepares alone:
-    training waits for all of them."""
+    """With several processes, raises ConfigError in all of them if process 0 would train a tokenizer while it prepares
+    alone: training waits for all processes."""
     import jax
 
     again = may_replace("tokenizer", replace)
@@ -273,7 +273,7 @@ def _require_no_tokenizer_training(setup: StudySetup, replace: Step | None) -> N
 
 
 def _say_swept(setup: StudySetup) -> None:
-    """Names the settings that were given and only sweeps have."""
+    """Names the settings that were given although only sweeps use them."""
     first, *more = setup.study.seeds
     names = {path: "seeds beyond the first" if path == "seeds" and more else path for path in setup.arguments.chosen()}
     without = [name for path, name in names.items() if name != "seeds" and path.split(".")[0] in SWEPT]
@@ -295,14 +295,14 @@ def _say_average(setup: StudySetup) -> None:
 
 
 def _single_trial(setup: StudySetup, trajectories: int | None) -> Trial:
-    """The reference trial, but that the largest number of trajectories in a sweep does not bound it."""
+    """The reference trial, but with `trajectories` of each robot (None: all) in place of a sweep's largest number."""
     study = setup.study
     return dataclasses.replace(reference_trial(study, study.seeds[0]), max_trajectories=trajectories)
 
 
 def _print_cost(setup: StudySetup, trial: Trial, run: Path, processes: int) -> None:
-    """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so
-    many `processes` as this one."""
+    """Prints the dry run of a study with this trial only, for the steps that `run` does not have yet, on the devices of
+    `processes` processes like this one."""
     from experiments.dry_run.done import UNKNOWN, find_prepared
     from experiments.dry_run.plan_table import Devices, plan_table
     from experiments.dry_run.trainable import check_trials
@@ -336,7 +336,7 @@ def _train(setup: StudySetup, trial: Trial, run: Path, options: RunOptions, **st
             run,
             execution=setup.study.execution,
             options=options,
-            # From before its decay a run can be extended.
+            # A run can be extended from before its decay.
             keep=(common_steps(optimizer, steps, 2 * steps),) if optimizer.schedule == "wsd" else (),
             progress=lambda phase, done, total: update(done, total, phase),
             **start,
@@ -350,7 +350,8 @@ def _train(setup: StudySetup, trial: Trial, run: Path, options: RunOptions, **st
 
 
 def _held_out(run: Path) -> str:
-    """The latest held-out loss of a run, and its lowest, after which the run may have overfitted; '' without any."""
+    """The latest held-out loss of a run, in words, and its lowest, after which it may have overfitted; '' without
+    any."""
     file = run / "validation.jsonl"
     seen = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     if not seen:
@@ -361,8 +362,8 @@ def _held_out(run: Path) -> str:
 
 
 def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:
-    """The directory of the profile that a run from step `start` to `steps` recorded, if it did: says of which steps it
-    is, and how it is seen."""
+    """The directory of the profile that a run from step `start` to `steps` recorded, if it did. Prints which steps it
+    covers and how to view it."""
     from hma_jax.training.step_trace import PROFILE, traced_steps
 
     first, last = traced_steps(asked, start, steps)
@@ -380,7 +381,7 @@ def _say_profiled(run: Path, asked: int, start: int, steps: int) -> list[Path]:
 
 
 def say_data(trial: Trial, prepared: PreparedData) -> None:
-    """What a model is trained on. Raises DataError if it is nothing."""
+    """Prints what a model is trained on. Raises DataError if it is nothing."""
     from data_pipelines.loading.selection import select_windows
     from experiments.cli.mixture import show_drawn
 

@@ -569,9 +569,7 @@ def test_evaluation_says_where_its_windows_are_of_other_recordings_than_data_nam
         assert main(["evaluate", str(out / "model"), *SMOKE, "--out", str(out), option, *map(str, data), *to]) == 2
         return capsys.readouterr().out
 
-    note = (
-        f"note: the windows that are frozen in {out} are evaluated, whose tokens were made from other data than --data"
-    )
+    note = f"note: the windows frozen in {out} are evaluated, whose tokens were made from other data than --data"
     assert note not in said(arm, base)
     found = said(longer, base)
     assert note in found and "source: " in found and f"({ARM.name})" in found

@@ -1,4 +1,4 @@
-"""What several commands of `hma bench` ask."""
+"""Arguments that several commands of `hma bench` share."""
 
 from __future__ import annotations
 

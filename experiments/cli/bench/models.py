@@ -1,4 +1,5 @@
-"""`hma bench generate|rollout|train|products|eval`: a model with drawn weights, the fast way and the naive one."""
+"""`hma bench generate|rollout|train|products|eval`: a model with random weights, computed the fast way and the naive
+way."""
 
 from __future__ import annotations
 
@@ -136,7 +137,7 @@ def _over_batches(bench: Bench, what: str, measure: Callable[[int], list[Stage]]
 
 
 def _ratios(bench: Bench, stages: Sequence[Stage], above: str, below: str) -> dict[str, float]:
-    """How much longer one stage takes than another, at each batch."""
+    """How many times as long one stage takes as another, at each batch size."""
     median = {(s.name, s.batch): s.timing.median for s in stages}
     return {f"{above} / {below}, batch {rows}": median[above, rows] / median[below, rows] for rows in bench.batch}
 

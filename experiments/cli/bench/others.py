@@ -56,7 +56,7 @@ def quality(
     if frames < trained.model.frames:
         raise ConfigError(f"--frames must be at least the model's window of {trained.model.frames}, got {frames}")
     names = [d.dataset for d in prepared.manifest.datasets if d.dataset in trained.table.names]
-    # Whole windows: what is timed are frames, all of them.
+    # Windows of the rollout's whole length: every frame is timed.
     frozen = freeze_manifest(
         prepared.store, names, frames, windows, prepared.manifest.seed, rate=prepared.manifest.rate
     )
@@ -155,7 +155,8 @@ def load(
     threads: tuple[int, ...] = (1, 2),
     out: Annotated[Path, arg(metavar="DIR")] = Path("runs/bench"),
 ) -> None:
-    """Time the loading of training windows from a token store and of frames from RLDS directories, and their memory.
+    """Time the loading of training windows from a token store and of frames from RLDS directories, and measure its
+    memory.
 
     Args:
         store: Directory of a token store. Default: a temporary one of forty datasets with random tokens.

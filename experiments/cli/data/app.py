@@ -1,4 +1,4 @@
-"""`hma data`: its commands by name, and the one that writes the study's own suite."""
+"""`hma data`: its commands by name, and the command that writes the study's own suite."""
 
 from __future__ import annotations
 

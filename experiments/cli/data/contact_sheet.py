@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import ExampleEpisode
 
 TILE = 112
-"""Pixels of a frame's height."""
+"""Height of a frame in pixels."""
 
 GAP = 4
 MARGIN = 12
@@ -53,7 +53,7 @@ def draw_sheet(title: str, examples: Sequence[ExampleEpisode], blank: Collection
 def _tile(frame: np.ndarray) -> Image.Image:
     image = Image.fromarray(frame)
     width = max(round(image.width * TILE / image.height), 1)
-    # Small pictures keep their pixels; large ones are averaged.
+    # Small images keep their pixels; large ones are averaged.
     way = Image.Resampling.NEAREST if image.height <= TILE else Image.Resampling.BOX
     return image.resize((width, TILE), way)
 

@@ -149,7 +149,7 @@ def _convert(
                 skip_damaged=destination.skip_damaged,
                 progress=update,
             )
-        except UnitError as error:  # whose own advice is for those who tokenise, too
+        except UnitError as error:  # the error's own advice is also for users who tokenise
             rest = without_advice(str(error))
             advice = "Download the file again, or add" if rest != str(error) else "Add"
             raise DataError(f"{rest} {advice} --skip-damaged to leave it out.") from error
@@ -167,7 +167,7 @@ def _convert(
 
 
 def entry(spec: DatasetSpec) -> str:
-    """The registry entry as it is written there."""
+    """The registry entry, as Python code for data_pipelines/registry/own.py."""
     keys, dims = (f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims))
     return (
         f'DatasetSpec("{spec.name}", image_key="{spec.image_key}", action_keys={keys}, '

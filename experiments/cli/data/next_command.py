@@ -1,4 +1,4 @@
-"""What to run after looking at data: the command that reads it as it was counted, or why there is none yet."""
+"""What to run after looking at data: the command that reads the data as counted here, or why there is none yet."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 ENTRIES = "my_robots.toml"
-"""Where entries are written if there is no file of them yet: a command takes one."""
+"""Where entries are written if there is no file of entries yet: a command takes only one such file."""
 
 
 def say_next(
     datasets: Sequence[Facts], frames: int, registry: Path | None, longest: int, rate: float | None = None
 ) -> None:
-    """Prints the command that tokenises `datasets`, by the preset that is the default and by the one for a GPU or TPU,
-    or what to do before. The other arguments are those of `tokenize_command`."""
+    """Prints the command that tokenises `datasets`, with the default preset and with the preset for a GPU or TPU, or
+    what to do first. The other arguments are those of `tokenize_command`."""
     if first := single_episode(datasets):
         print_next(first)
         return
@@ -46,8 +46,8 @@ def tokenize_command(
 ) -> str:
     """The command that tokenises datasets for windows of `frames`, without the episodes that cannot be read.
 
-    `longest`: frames of the longest episode at that rate; the prompt leaves one of them to judge. `rate`: of
-    frames in Hz, if it is not the preset's.
+    `longest`: frames of the longest episode at that rate; the prompt is short enough to leave one of them to evaluate.
+    `rate`: frames per second, if it is not the preset's.
     """
     preset = get_preset(preset_name)
     changes: dict[str, object] = {}
@@ -73,8 +73,8 @@ def tokenize_command(
 
 
 def _unusable(facts: Facts) -> int:
-    """Sampled episodes that tokenising refuses: those that cannot be read, and those whose actions, as the entry takes
-    them, are not all finite."""
+    """Sampled episodes that tokenising refuses: those that cannot be read, and those whose actions (as read by the
+    entry) are not all finite."""
     from data_pipelines.inspection.issues import chosen_actions
 
     fields = chosen_actions(facts, find_reader(facts.name))
@@ -83,8 +83,8 @@ def _unusable(facts: Facts) -> int:
 
 
 def _another_out(default: Path, names: Sequence[str]) -> Path | None:
-    """Where to tokenise datasets if the `default` directory has tokens of others, which a command there would be
-    refused for; None if it has none."""
+    """Where to tokenise datasets if the `default` directory has tokens of other datasets, for which a command there
+    would be refused; None if it has none."""
     from data_pipelines.tokens.manifest import FILE
 
     asked = {name if (known := find_reader(name)) is None else known.name for name in names}
@@ -93,23 +93,24 @@ def _another_out(default: Path, names: Sequence[str]) -> Path | None:
 
 
 def print_next(words: str, name: str = "") -> None:
-    """Prints the command that comes next, for the dataset `name` of several; advice that is none as a note."""
+    """Prints the next command, for the dataset `name` if there are several; advice that is not a command is printed as
+    a note."""
     label = "next" if words.startswith(f"{PROGRAM} ") else "note"
     say(f"{label}{name and f' for {name}'}: {words}")
 
 
 def single_episode(directories: Sequence[Facts]) -> str | None:
-    """What to do where the datasets hold a single episode together, of which none can be held out; else None."""
+    """What to do if all datasets together have a single episode, so that none can be held out; else None."""
     if sum(facts.episodes for facts in directories) != 1 or len(directories[0].splits) > 1:
         return None
     return (
-        "add another dataset (hma tokenize --data DIR OTHER), or record more: of a single episode none can be held out, "
+        "add another dataset (hma tokenize --data DIR OTHER), or record more: a single episode cannot be held out, "
         "so no model can be evaluated on it"
     )
 
 
 def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
-    """What to run instead for a dataset of which no episode has two frames at `stride`, and why."""
+    """What to run instead for a dataset in which no episode has two frames at `stride`, and why."""
     longest, known = facts.lengths.longest, (("--registry", registry) if registry else ())
     if longest < 2:
         return "leave it out: no episode has more than one step, so there is no motion to learn"
@@ -121,8 +122,8 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
 
 
 def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | None:
-    """What to run first where a known dataset was looked at with another native rate than its entry's, which is the
-    one that a study takes; None where they agree."""
+    """What to run first if a known dataset was read with a native rate other than its entry's, which a study uses; None
+    if the two agree."""
     from data_pipelines.sources.source import same_rate
 
     known = find_reader(facts.name)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 SHEET = "contact_sheet.png"
 
 WIDE = 10_000
-"""Columns at which every table has room."""
+"""Terminal columns that every table fits into."""
 
 
 def data_list(
@@ -79,7 +79,7 @@ def _fits(spec: DatasetSpec, title: str, words: Sequence[str]) -> bool:
 
 
 def _print_list(title: str, specs: Sequence[DatasetSpec]) -> None:
-    """What `_table_of` shows, where its names have no room: they are names of directories, and never broken."""
+    """What `_table_of` shows, for names too long for it: as names of directories they are never broken."""
     console.print(f"[italic]{escape(title)}[/]")
     for spec in specs:
         cells = _cells(spec)
@@ -129,8 +129,8 @@ def data_inspect(
     Args:
         directory: The dataset: an RLDS directory (<name> or <name>/<version>, a path or URL), the root of a
             LeRobot dataset, or a robomimic .hdf5 file.
-        hz: Native frames per second, if the files do not contain it (those of LeRobot and robomimic do, and what
-            was converted, generated or played here).
+        hz: Native frames per second, if the files do not contain it (files of LeRobot and robomimic contain it, and so
+            does everything that was converted, generated or played here).
         split: The split to read.
         out: Directory for contact_sheet.png. Default: runs/inspect/NAME.
         episodes: Number of episodes to read, drawn at random; fewer if they have more than 2 GB in all.
@@ -148,7 +148,7 @@ def data_inspect(
     stride_of(hz or 1, FRAME_RATE)  # raises before the dataset is read
     require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
     require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
-    own = {spec.name: spec for spec in all_specs()}  # the project's, before the user's take their places
+    own = {spec.name: spec for spec in all_specs()}  # the project's entry, before the user's may replace it
     use_entries(registry)
     sheets = Path("runs") / "inspect"
     make_directory(out or sheets)
@@ -188,8 +188,8 @@ def data_inspect(
 
 
 def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetSpec | None, frames: int) -> WindowFacts:
-    """Prints at which stride frames are taken at a native `rate`, and how many windows there are. `hz`: the rate given
-    by the user; `taken`: the registry entry by which the dataset will be read."""
+    """Prints the stride of frames at a native `rate`, and the number of windows. `hz`: the rate given by the user;
+    `taken`: the registry entry by which the dataset will be read."""
     from data_pipelines.inspection.suggest import window_facts
     from data_pipelines.sources.source import same_rate
 
@@ -305,7 +305,7 @@ def _in_words(spec: DatasetSpec) -> str:
 
 
 def _write_entry(path: Path, suggestion: Suggestion) -> None:
-    """Adds the entry to a TOML file, in place of one of the same name, whose differences it prints."""
+    """Adds the entry to a TOML file. Replaces an entry of the same name, and prints how the two differ."""
     from data_pipelines.registry.toml_file import load_entries, put_entry
 
     spec = suggestion.spec()
@@ -322,7 +322,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
 
 def _say_displaced(own: DatasetSpec | None, spec: DatasetSpec, path: Path) -> None:
-    """Prints how the entry `spec`, which is in the file at `path` now, differs from the project's `own`."""
+    """Prints how the entry `spec`, which is now in the file at `path`, differs from the project's `own`."""
     if own is not None and (lines := diff(own.facts(), spec.facts())):
         say(
             f"note: this takes the place of the project's entry of {own.name}, in commands with --registry {path} (there "
@@ -331,8 +331,8 @@ def _say_displaced(own: DatasetSpec | None, spec: DatasetSpec, path: Path) -> No
 
 
 def _say_other_rate(facts: Facts, hz: float | None) -> None:
-    """Prints that the user's rate takes the place of that of the files. Either may be right: files may be wrong, and a
-    model is trained at the rate that somebody gave its robot."""
+    """Prints that the user's rate replaces that of the files. Either may be right: files may be wrong, and a model is
+    trained at the rate that the user gave for its robot."""
     from data_pipelines.sources.source import same_rate
 
     if hz is not None and facts.hz is not None and not same_rate(hz, facts.hz):
@@ -343,8 +343,8 @@ def _say_other_rate(facts: Facts, hz: float | None) -> None:
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, first: str | None) -> None:
-    """The command that reads the dataset as it was counted here, or what to try where nothing can be read. `first`:
-    what comes before either."""
+    """Prints the command that reads the dataset as counted here, or what to try if nothing can be read. `first`: what
+    must be run before that."""
     if windows is None:
         return
     if windows.total and not first:

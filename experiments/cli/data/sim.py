@@ -21,12 +21,12 @@ SimPreset = Literal["smoke", "full"]
 
 @dataclass(frozen=True)
 class Amount:
-    """How much is simulated. No names: all of the table."""
+    """How much is simulated. `names` is None: all robots of the table."""
 
     names: tuple[str, ...] | None
     episodes: int
     size: int
-    study: str  # the preset of a study for which that is enough
+    study: str  # preset of a study for which this amount is enough
 
 
 PRESETS = {
@@ -46,7 +46,7 @@ SHEET = "overview.png"
 SHEET_EPISODES = 4
 
 REPORT = 10
-"""Episodes from one line of a log to the next."""
+"""Number of episodes between two lines of a log."""
 
 
 def data_sim(
@@ -96,16 +96,18 @@ def data_sim(
         for path in paths:
             draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
         draw_sheet(paths, out / SHEET)
-    everything = sorted(paths) == sorted(out.glob(f"*/{paths[0].name}"))  # then a pattern says it shorter
+    everything = sorted(paths) == sorted(out.glob(f"*/{paths[0].name}"))  # then a pattern is shorter
     data = f"{command_words(out)}/*/{paths[0].name}" if everything else command_words(*paths)
     study = command("study", "--preset", chosen.study, "--out", "runs/sim")
     wrote(*paths, out / SHEET, then=f"{study} --data {data}")
 
 
 def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
-    """The robots to simulate: all whose dataset is not there, made by other versions of the packages, which is said.
+    """The robots to simulate: all whose dataset does not exist yet. Prints which existing datasets were made by other
+    versions of the packages.
 
-    Raises ConfigError, before anything is made, where one is there that was made with other settings, or by others.
+    Raises ConfigError, before anything is made, if a dataset exists that was made with other settings or by another
+    program.
     """
     from data_pipelines.simulators.generate import made_by_other_versions
 

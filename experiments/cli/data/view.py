@@ -1,4 +1,4 @@
-"""`hma data view`: datasets read in part, one page written, the command that comes next."""
+"""`hma data view`: reads a part of each dataset, writes one page, and prints the next command."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from experiments.report.data_page import DatasetView
 
 OTHER_SPLITS = 2
-"""Splits beside the one shown that are searched for the same episodes."""
+"""Number of splits, besides the one shown, that are searched for the same episodes."""
 
 
 def view(
@@ -116,7 +116,8 @@ def _view_one(
 
 
 def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
-    """Fingerprints of another split; none, with a note, if it cannot be read: the page is about the one asked for."""
+    """Fingerprints of another split. If it cannot be read, prints a note and returns none: the page is about the split
+    that was asked for."""
     from data_pipelines.inspection.inspect import inspect_dataset
 
     try:
@@ -136,7 +137,7 @@ def _say_issues(viewed: DatasetView, episodes: int) -> None:
         title = f"[{colours[issue.severity]}]{issue.title}[/]"
         console.print(f"[bold]{name}[/]: {title}: {escape(issue.text)}", soft_wrap=True)
     f = viewed.facts
-    if f.stopped or episodes < f.episodes:  # of others all that can be read were
+    if f.stopped or episodes < f.episodes:  # otherwise every readable episode was read
         say(
             f"note: {f.name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); duplicate recordings are "
             "searched only among these"
@@ -144,7 +145,7 @@ def _say_issues(viewed: DatasetView, episodes: int) -> None:
 
 
 def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None) -> None:
-    """The commands that read what can be read, one per rate of frames, or those that lead there."""
+    """Prints the commands that read what can be read, one per frame rate, or the commands that are needed first."""
     from data_pipelines.inspection.issues import MISFIT
     from data_pipelines.inspection.suggest import window_facts
 
@@ -160,7 +161,7 @@ def _say_next(viewed: Sequence[DatasetView], frames: int, registry: Path | None)
             words = command("data inspect", f.directory, *native, "--entry", file)
             after = f"{words}  # it is not in the registry; this writes its entry"
         elif any(r.title == MISFIT for r in v.issues):
-            after = f"{command('data inspect', f.directory)}  # it says what the registry's entry should be"
+            after = f"{command('data inspect', f.directory)}  # it shows what the registry entry should be"
         elif first := other_rate(f, v.hz, registry):
             after = first
         elif not window_facts(f, v.stride, frames).total:

@@ -110,7 +110,7 @@ def test_of_other_seeds_two_models_are_compared_and_it_is_said_and_two_studies_a
     a, b = trials
     assert main(["compare", str(a), str(b), *to]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert f"{a.name} is of seed 0, {b.name} is of seed 1: differences are also those of seeds" in said
+    assert f"{a.name} is of seed 0, {b.name} is of seed 1: differences include those between seeds" in said
     assert main(["compare", str(a), str(a), *to]) == 0 and "also those of seeds" not in capsys.readouterr().out
 
 
@@ -129,7 +129,7 @@ def test_robots_that_one_was_not_judged_on_are_left_out_and_it_is_said(table, tm
         assert main(["compare", str(one), str(other), "--to", str(tmp_path / "c.csv")]) == 0
         assert {scope for scope, _ in rows_of(tmp_path / "c.csv")} == {OVERALL, "r0", "r2"}
         said = " ".join(capsys.readouterr().out.split())
-        assert said.count("Only") == 1 and f"Only {a.name} was judged on r1: nothing here is of them." in said
+        assert said.count("Only") == 1 and f"Only {a.name} was judged on r1: no value here includes them." in said
 
 
 def test_metrics_that_are_left_out_are_named(table, tmp_path, capsys):
