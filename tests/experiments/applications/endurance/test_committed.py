@@ -59,9 +59,8 @@ def test_ten_minutes_are_as_the_page_says():
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
     keeping = [robot for robot in following if mine[robot, 10]["follows"] >= mine[robot, 1]["follows"] / 2]
     assert len(following) == 6
-    said += (
-        f"Six robots have more than 0.5 in the first minute; {len(keeping)} of them keep at least half of their value."
-    )
+    assert len(keeping) == 6
+    said += "Six robots have more than 0.5 in the first minute, and all six keep at least half of their value."
     assert said in page
     places = {robot: round(100 * row["tool_close"]) for (robot, minute), row in mine.items() if minute == 10}
     grippers, arms, pusher_in_place = (
@@ -82,7 +81,7 @@ def test_ten_minutes_are_as_the_page_says():
     variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
     colours = mean("histogram", 1), mean("histogram", 10)
     assert f"The variance of frames is {variance:.2f} of the true one." in page
-    said = "Of the colour histogram {:.2f} differs in the first minute, {:.2f} in the last."
+    said = "The share of the colour histogram that differs is {:.2f} in the first minute, {:.2f} in the last."
     assert said.format(*colours) in page
     lasting = {robot: round(100 * row["object_found"]) for (robot, minute), row in mine.items() if minute == 10}
     assert lasting["pusher_sand"] == lasting["omni_chalk"] == 100
@@ -114,7 +113,10 @@ def test_robots_that_lose_their_heading_steer_to_the_end_as_the_page_says():
     )
     assert said.format(*ends, worst, truly) in page
     last = [f"{100 * row['object_found']:.0f}" for row in rows if (row["robot"], row["part"]) == ("rover_road", 10)]
-    said = "rover_road's is found in {} % of the last. From the second starts it is the third minute, and {} %."
+    said = (
+        "rover_road's is found in {} % of the last. From the second starts omni_chalk loses its object in the third minute, "
+        "and rover_road's is found in {} % of the last."
+    )
     assert said.format(*last) in page
     lost = [
         [r["part"] for r in rows if r["robot"] == "omni_chalk" and r["start"] == s and r["object_found"] < 0.1]
@@ -250,7 +252,7 @@ def test_robots_of_the_model_that_two_cores_train_stay_and_objects_do_not():
     said = f"tools are found in {100 * tools:.0f} % of the frames of the last minute, "
     said += '"follows" is {:.2f} in the first and {:.2f} in the last. '.format(*follows)
     objects = (100 * over_robots(of, "object_found")[0] for of in (first, last))
-    assert said + "Objects are found in {:.0f} and {:.0f} %.".format(*objects) in page
+    assert said + "Objects are found in {:.0f} and {:.0f} % of the frames".format(*objects) in page
 
 
 def test_half_of_what_was_hidden_comes_back():
@@ -265,7 +267,7 @@ def test_half_of_what_was_hidden_comes_back():
     said = f"shows it in {found[0]} ± {found[1]} % of the cases, and in place in {close[0]} ± {close[1]} %; controls: "
     assert said + f"{stay[0]} ± {stay[1]} and {stay_close[0]} ± {stay_close[1]} %." in page
     short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
-    assert f"it is {sum(short):.0f} of {len(short)}, after four or more {sum(long):.0f} of {len(long)}" in page
+    assert f"shows {sum(short):.0f} of {len(short)} objects, after four or more {sum(long):.0f} of {len(long)}" in page
     gone = [row["gone"] for row in hidden]
     assert f"an object is out of view for {min(gone):.0f} to {max(gone):.0f} frames" in page
     moved, stayed, control_moved, control_stayed = (
@@ -276,8 +278,8 @@ def test_half_of_what_was_hidden_comes_back():
     )
     said = (
         f"of the {{}} objects that end more than {CLOSE_PX:.0f} pixels from where they were last seen, the model shows {{}}, "
-        "and {} in place; of the {} others {}, and {} in place. Controls: of {} that moved as far {} and {}, of {} others "
-        "{} and {}."
+        "and {} of these in place; of the other {} it shows {}, and {} of these in place. Controls: of the {} that moved as "
+        "far, {} are shown and {} in place; of the other {}, {} and {}."
     )
     assert said.format(*moved, *stayed, *control_moved, *control_stayed) in page
 
