@@ -140,13 +140,12 @@ def test_a_displaced_past_keeps_objects_for_a_minute_where_tokens_are_drawn():
     control, before = partial(gains, "displaced", beside="resumed"), partial(gains, "displaced", beside="weighed")
     (more, half), (less, off) = control("object_found"), control("psnr")
     assert more > half and less < -off
-    assert (
-        'compared with "weighed", too, they are found in {:.2f} ± {:.2f} more'.format(*before("object_found")) in page
-    )
+    said = 'compared with "weighed", too, the share of frames in which they are found is higher by {:.2f} ± {:.2f}.'
+    assert said.format(*before("object_found")) in page
     places = *control("object_close"), *before("object_close")
     said = 'Objects in place: {:+.2f} ± {:.2f} (compared with "resumed") and {:+.2f} ± {:.2f} ("weighed").'
     assert said.format(*places) in page
-    assert '{:+.1f} ± {:.1f} dB compared with "weighed"'.format(*before("psnr")) in page
+    assert 'compared with "weighed" it changes by {:+.1f} ± {:.1f} dB;'.format(*before("psnr")) in page
     assert '"follows" does not change ({:.2f} ± {:.2f} compared with "resumed")'.format(*control("follows")) in page
     back = [
         over_robots([r for r in read_rows(RESULTS / f"{name}_hidden.csv") if r["kind"] == "hidden"], "found")[0]
@@ -214,7 +213,7 @@ def test_ten_minutes_are_as_the_page_says():
     colours = mean("histogram", 1), mean("histogram", 10)
     assert "({:.2f} of the histogram differs in the first minute, {:.2f} in the last)".format(*colours) in page
     before = percent("tool_found", 10, first), percent("object_found", 10, first)
-    said = "of the last minute ({}), objects in {} % ({});"
+    said = "of the last minute (first model: {} %), objects in {} % ({} %);"
     assert said.format(before[0], objects[2], before[1]) in page
     arm = [each["arm_sand", 10]["follows"] for each in (mine, first)]
     assert f'("follows" {arm[0]:.2f}, first model {arm[1]:.2f})' in page
@@ -241,4 +240,4 @@ def test_what_was_hidden_for_long_does_not_come_back():
         found, close = ([round(100 * x) for x in over_robots(mine, name)[:2]] for name in ("found", "close"))
         assert f"{found[0]} ± {found[1]} " in page and f"{close[0]} ± {close[1]} %" in page
     short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
-    assert f"it is {sum(short):.0f} of {len(short)}, after four or more {sum(long):.0f} of {len(long)}" in page
+    assert f"shows {sum(short):.0f} of {len(short)} objects, after four or more {sum(long):.0f} of {len(long)}" in page
