@@ -239,7 +239,7 @@ def test_plans_from_further_starts_are_as_their_page_says():
     assert "came to {:.2f}, {:.2f} and {:.2f}".format(*rates[:3]) in page
     best = policies[rates.argmax()]
     alone = (best > plans).sum(), (plans > best).sum()
-    assert "succeeds alone from {} of them, MPPI from {}.".format(*alone) in page
+    assert "From {} of the starts only the best of the sixteen succeeds, from {} only MPPI;".format(*alone) in page
     thirty = planned_from_thirty("MPPI in the model")
     counts = [[tried.sum(), len(tried) - tried.sum()] for tried in (thirty, plans)]
     chance = scipy.stats.fisher_exact(counts)[1]
