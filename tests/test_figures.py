@@ -69,7 +69,7 @@ def test_the_figure_beside_the_study_s_table_has_the_perplexity_that_the_page_sa
         for r in read_csv(STUDY / "results.csv")
         if (r.sweep, r.x, r.role, r.scope, r.metric) == ("width", 48, "point", OVERALL, "cross_entropy")
     )
-    said = f"The figure draws exp of the mean nats (the reference: {np.exp(nats):.0f}), the table"
+    said = f"The figure draws exp of the mean nats (the reference: {np.exp(nats):.0f}); the table"
     assert said in " ".join(RESULTS.read_text().split())
 
 
