@@ -28,8 +28,8 @@ class Past(NamedTuple):
 def attention_scale(config: ModelConfig) -> float:
     """The factor on q.k.
 
-    Under muP attention_scale / head width: 8 / I as released, so that logits stay of order one
-    as heads widen; otherwise 1 / sqrt(I).
+    Under muP it is attention_scale / I (8 / I as released), so that logits stay of order one as heads widen. Otherwise
+    it is 1 / sqrt(I).
     """
     if config.mup.enabled and "attention" not in config.mup.without:
         return config.mup.attention_scale / config.head_width
@@ -37,7 +37,7 @@ def attention_scale(config: ModelConfig) -> float:
 
 
 class Attention(nnx.Module):
-    """q, k, v and output projections; the caller says over which axis and what is visible."""
+    """q, k, v and output projections; the caller chooses the axis of attention and what is visible."""
 
     def __init__(self, config: ModelConfig, execution: ExecutionConfig):
         width, heads, head = config.width, config.heads, config.head_width
@@ -74,7 +74,7 @@ class Attention(nnx.Module):
         return self.project_out(find_backend(self.backend).within(self.project(x_BTPD), self.scale))
 
     def over_time(self, x_BTPD: jax.Array, visible: jax.Array, past: Past | None) -> tuple[jax.Array, Past]:
-        """Every token sees its own position in the frames that `visible`, bool [T, T_past + T], allows.
+        """Every token sees the token at its own position in each frame that `visible`, bool [T, T_past + T], allows.
 
         Returns the output and the new frames' keys and values.
         """

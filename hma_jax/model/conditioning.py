@@ -1,7 +1,7 @@
 """How actions act inside every block, between spatial and temporal attention.
 
-Reference section 1.6. A hidden action acts on no path: where `shown` is False nothing is added.
-DIFFERS: the release masks action tokens only and goes on modulating by what it masked.
+Reference section 1.6. A hidden action has no effect on any path: where `shown_BT` is False, nothing is added. DIFFERS:
+the release masks only the action tokens, and still modulates by the masked actions.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class BlockConditioning(nnx.Module):
     """What an action adds to the tokens of a block."""
 
     def __init__(self, config: ModelConfig, embodiments: int):
-        """Without parameters."""
+        """The base class declares no parameters."""
 
     def __call__(
         self, x_BTPD: jax.Array, action: ActionFeature, robot_row_B: jax.Array, visible: jax.Array, past: Any
     ) -> tuple[jax.Array, Any]:
-        """(what is added to `x_BTPD`, what of these frames is cached), `past` being what was cached of earlier ones;
-        `visible` [T, T_past + T] as for temporal attention."""
+        """Returns (what is added to `x_BTPD`, what is cached for these frames). `past` is what was cached for earlier
+        frames; `visible` [T, T_past + T] is as for temporal attention."""
         raise NotImplementedError
 
     @staticmethod
@@ -71,7 +71,7 @@ class Modulation(BlockConditioning):
 
     @staticmethod
     def multiplications(config: ModelConfig, seen: float) -> tuple[float, float]:
-        return config.width**2, 3 * config.width**2  # shift and scale are made once per frame
+        return config.width**2, 3 * config.width**2  # shift and scale are computed once per frame
 
 
 class Addition(BlockConditioning):
@@ -91,13 +91,13 @@ class Addition(BlockConditioning):
 class CrossAttention(BlockConditioning):
     """Every token attends to the actions of its own and earlier frames, with normalised q and k.
 
-    DIFFERS: the release's heads attend to each other at one position and its results are
-    scrambled over time (reference section 9.1), so a checkpoint of it converts but does not
-    compute what it was trained to. The output is 0 for a frame that is shown no action.
+    DIFFERS: in the release, heads attend to each other at one position and the results are scrambled over time
+    (reference section 9.1). A checkpoint of the release can therefore be converted, but does not compute here what it
+    was trained to compute. The output is 0 for a frame that is shown no action.
 
     Keys carry no time, so a frame's own action is distinguished from earlier ones by a bonus on its logit: at
-    initialisation its weight equals that of all the others together. Even so, models follow actions less than in the
-    other ways (cpu-full's findings).
+    initialisation its weight equals that of all the others together. Even so, models follow actions less than with the
+    other kinds of conditioning (the findings of cpu-full).
     """
 
     def __init__(self, config: ModelConfig, embodiments: int):
@@ -152,8 +152,8 @@ class CrossAttention(BlockConditioning):
 
 
 def _own_bonus(allowed_BTs: jax.Array) -> jax.Array:
-    """bool [B, T, T_past + T], the actions that a frame may attend to -> what is added to their logits: for its own
-    action the logarithm of the number of others, for others 0."""
+    """bool [B, T, T_past + T], the actions that a frame may attend to -> what is added to their logits: the logarithm
+    of the number of other actions for its own action, 0 for the others."""
     count, keys = allowed_BTs.shape[1:]
     itself = jnp.eye(count, keys, k=keys - count, dtype=bool)
     others = jnp.sum(allowed_BTs & ~itself, axis=-1, keepdims=True)
@@ -169,7 +169,7 @@ IN_BLOCKS: dict[str, type[BlockConditioning]] = {
     "add": Addition,
     "cross_attention": CrossAttention,
 }
-"""By `ModelConfig.block_conditioning`."""
+"""The class of each `ModelConfig.block_conditioning`."""
 
 
 def make_conditioning(config: ModelConfig, embodiments: int) -> BlockConditioning | None:

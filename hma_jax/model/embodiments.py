@@ -30,9 +30,8 @@ class Embodiment:
     `mean` and `std` are over single native actions, length `action_dim`, in raw units. The
     action chunk of a frame is `stride` native actions, flattened sub-step-major.
 
-    A model is given actions in standard deviations from the mean or, where there are `low` and
-    `high`, on the scale on which these are -1 and 1; they are the quantiles of 1 % and 99 %, say, and
-    values beyond are not cut off.
+    A model is given actions in standard deviations from the mean. If there are `low` and `high` (the 1 % and 99 %
+    quantiles, say), it is given actions on the scale where `low` is -1 and `high` is 1; values beyond are not clipped.
     """
 
     name: str
@@ -49,7 +48,7 @@ class Embodiment:
     def __post_init__(self):
         for name in ("mean", "std", "low", "high"):
             values = getattr(self, name)
-            if not isinstance(values, tuple):  # lists and arrays are as good, but have no hash
+            if not isinstance(values, tuple):  # lists and arrays are accepted, but cannot be hashed
                 object.__setattr__(self, name, tuple(np.asarray(values).tolist()))
         check_fields(self)
         require(
@@ -91,8 +90,8 @@ class Embodiment:
 
 
 class ActionUnits(NamedTuple):
-    """The scale that actions are normalised on: a table's (`EmbodimentTable.scale`), or inputs of a program that tables
-    of other statistics share."""
+    """The scale on which actions are normalised: that of a table (`EmbodimentTable.scale`), or inputs of a compiled
+    program that tables with different statistics share."""
 
     centre_EU: jax.Array | np.ndarray  # the raw values that are normalised to 0
     unit_EU: jax.Array | np.ndarray  # the raw differences that are normalised to 1; 0: no signal
@@ -112,7 +111,7 @@ class ActionUnits(NamedTuple):
         return actions * unit + centre
 
     def _of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, ...]:
-        """(centre, unit) of each example's robot, shaped to meet [B, ..., U]."""
+        """(centre, unit) of each example's robot, shaped to broadcast against [B, ..., U]."""
         shape = (-1, *(1,) * (ndim - 2), self.centre_EU.shape[1])
         return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self)
 
@@ -163,7 +162,8 @@ class EmbodimentTable:
         return ActionUnits(*self._tiled([(e.centre, e.unit) for e in self.entries]))
 
     def _tiled(self, values: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[np.ndarray, np.ndarray]:
-        """One (zero, one) of single actions per robot, as float32 [E, U]; `one` is 0 in dead dimensions."""
+        """Repeats each robot's two vectors, given for a single action, over its chunk: float32 [E, U] each. The second
+        is 0 in dead dimensions."""
         zero = np.zeros((self.size, self.action_width), np.float32)
         one = np.zeros((self.size, self.action_width), np.float32)
         for i, (e, (centre, unit)) in enumerate(zip(self.entries, values, strict=True)):
@@ -177,8 +177,8 @@ class EmbodimentTable:
         return self.statistics()[1] > 0
 
     def standardised(self) -> EmbodimentTable:
-        """The table of the same robots for actions that are normalised already: its `normalise` leaves them as they
-        are. Tables that differ in their statistics alone become equal."""
+        """The table of the same robots for actions that are already normalised: its scale leaves them as they are.
+        Tables that differ only in their statistics become equal."""
         return EmbodimentTable(
             tuple(
                 replace(e, mean=(0.0,) * e.action_dim, std=tuple(float(s > DEAD_STD) for s in e.std), low=(), high=())
@@ -188,6 +188,6 @@ class EmbodimentTable:
 
 
 def normalise(actions: Array, centre: Array, unit: Array, xp: Any = jnp) -> Array:
-    """Raw values in units of `unit` from `centre`, which broadcast; 0 where `unit` is 0. Given `xp` numpy, it computes
-    on numpy's arrays, on a CPU to the same bits."""
+    """Raw values in units of `unit` from `centre`, which broadcast; 0 where `unit` is 0. With `xp=numpy` it computes on
+    NumPy arrays; on a CPU the result is equal to the last bit."""
     return (actions - centre) * xp.where(unit > 0, 1 / xp.where(unit > 0, unit, 1), 0)

@@ -16,14 +16,14 @@ from hma_jax.model.heads import TIME_FEATURES
 def forward_flops_per_window(
     config: ModelConfig, table: EmbodimentTable, masking: MaskingConfig = MaskingConfig()
 ) -> float:
-    """One forward pass over one window of T frames; with latents also the denoisers, as often as in training.
+    """One forward pass over one window of T frames; with latents also the denoisers, evaluated as often as in training.
 
     With teacher forcing it is a pass over T - 1 frames and, beside them, over the T - 1 that follow them. What
     `masking` does not predict is not computed. An action head without a denoiser is too small to count.
 
-    Counted as published trials have it, so that budgets of training stay comparable: without teacher forcing all T
-    frames are read out, where training leaves out the first, and attention over time is causal, where that of the
-    setting `inverse` is not.
+    Two simplifications are kept because published trials were counted this way, and training budgets must stay
+    comparable: without teacher forcing all T frames are read out, although training leaves out the first; and attention
+    over time is causal, although it is not in the setting `inverse`.
     """
     t, diffusion = config.frames, config.diffusion
     frames, predicted = (2 * (t - 1), t - 1) if masking.teacher_forcing else (t, t)
@@ -42,7 +42,8 @@ def pass_flops(
     """One pass over `frames` frames of one window, up to the logits, or the denoiser's conditions, of `predicted` of
     them (None: all).
 
-    `seen`: frames that one attends to over time, itself among them, on average; T / 2 in a causal window of T.
+    `seen`: the number of frames, itself included, that a frame attends to over time, on average; T / 2 in a causal
+    window of T.
     """
     predicted = frames if predicted is None else predicted
     d, p = config.width, config.frame_tokens
@@ -63,10 +64,11 @@ def pass_flops(
 
 
 def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True, channels: int | None = None) -> float:
-    """One evaluation of the denoiser on so many tokens, or of that of other vectors with so many `channels`.
+    """One evaluation of the denoiser on `tokens` tokens; `channels` is given for a denoiser of other vectors, such as
+    actions.
 
-    `own_steps`: each token is at a step of its own, as in training. In sampling all are at the same one, and what
-    is made of it once for all tokens and examples is not counted.
+    `own_steps`: each token is at a noising step of its own, as in training. In sampling all tokens are at the same
+    step; what is computed from it once for all tokens and examples is not counted.
     """
     d, w, c = config.width, config.diffusion.width, channels or config.diffusion.token_channels
     blocks = config.diffusion.depth * 5 * w * w
@@ -75,7 +77,7 @@ def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True, cha
 
 
 def train_flops_per_step(config: ModelConfig, table: EmbodimentTable, train: TrainConfig) -> float:
-    """Forward and backward of the global batch: three times the forward pass, and once more for each round of an
+    """Forward and backward pass of the global batch: three times the forward pass, and once more for each round of
     `own_past`."""
     passes = 3.0 + (train.masking.own_past_rounds if train.masking.own_past else 0)
     return passes * train.batch * forward_flops_per_window(config, table, train.masking)

@@ -107,13 +107,14 @@ class Condition(nnx.Module):
 
 
 class Recall(nnx.Module):
-    """Adds, at masked tokens, the embedding of the token at the same place a frame earlier (`ModelConfig.recall`)."""
+    """Adds to masked tokens the embedding of the token at the same position one frame earlier
+    (`ModelConfig.recall`)."""
 
     def __init__(self, config: ModelConfig):
         self.gain = param((config.width,), ("D",), ones, role="vector")
 
     def __call__(self, x: jax.Array, unknown: jax.Array, earlier: jax.Array) -> jax.Array:
-        """x [..., S, D] with `earlier`, of that shape, added where bool `unknown` [..., S]."""
+        """x [..., S, D] with `earlier`, of the same shape, added where `unknown`, bool [..., S], is True."""
         return x + jnp.where(unknown[..., None], scaled(earlier, self.gain.get_value()), 0)
 
 

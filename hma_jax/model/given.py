@@ -1,4 +1,5 @@
-"""Checks of arrays that callers pass to a model, where JAX would compute something without an error."""
+"""Checks of the arrays that callers pass to a model. Without them JAX would compute something wrong without an
+error."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def require_known(
 
 
 def require_finite(actions: Array) -> None:
-    """Raises ConfigError for actions that are not finite, if their values are here, as in `require_known`."""
+    """Raises ConfigError for actions that are not finite, where their values are known, as in `require_known`."""
     require(not _has_values(actions) or bool(np.isfinite(np.asarray(actions)).all()), "the actions are not finite")
 
 
@@ -68,8 +69,8 @@ def checked_window(
     subject: str,
 ) -> Array:
     """A recorded window's frames in the type that the model takes. Raises ConfigError, which begins with `subject`, for
-    fewer than `shortest` frames, for more than the model's, and for shapes that fit neither the model nor each other;
-    as `require_known` for unknown values."""
+    fewer than `shortest` frames, for more frames than the model's window, and for shapes that do not fit the model or
+    each other. Raises as `require_known` for unknown values."""
     config, table = model.config, model.table
     batch_time, most = frames.shape[:2], config.frames
     wanted = {
@@ -90,7 +91,7 @@ def checked_window(
 
 
 def require_keys(key_B: jax.Array, batch: int) -> None:
-    """Raises ConfigError unless there is a key for each of so many examples."""
+    """Raises ConfigError unless `key_B` holds `batch` keys, one for each example."""
     typed = jnp.issubdtype(key_B.dtype, jax.dtypes.prng_key)
     require(
         typed and key_B.shape == (batch,),

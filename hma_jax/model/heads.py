@@ -38,7 +38,7 @@ def timestep_embedding(t: jax.Array, size: int = TIME_FEATURES) -> jax.Array:
 
 
 class ResBlock(nnx.Module):
-    """x + gate * mlp(norm(x) (1 + scale) + shift), all three from the condition."""
+    """x + gate * mlp(norm(x) (1 + scale) + shift), where scale, shift and gate come from the condition."""
 
     def __init__(self, width: int):
         init = xavier_uniform(width, width)
@@ -55,12 +55,13 @@ class ResBlock(nnx.Module):
 
 
 class Denoiser(nnx.Module):
-    """A residual MLP modulated by time and condition: noise and a variance fraction (reference section 2.4).
+    """A residual MLP, modulated by time and condition, that predicts noise and a variance fraction (reference section
+    2.4).
 
-    Its width does not follow the trunk's: only the condition's input scales under muP, as a
-    read-out's. DIFFERS: in every head modulation and last layer start at zero, time and condition
-    at N(0, 0.02), the rest at Xavier. The release draws all of the frames' head from N(0, 0.02), by
-    the order of its constructors, and the actions' with a Xavier gain of 0.1.
+    Its width does not follow the trunk's: under muP only the condition's input scales, as the input of a read-out does.
+    DIFFERS: in every head the modulation and the last layer start at zero, time and condition at N(0, 0.02), and the
+    rest at Xavier. The release, because of the order of its constructors, draws all of the frames' head from N(0,
+    0.02); it draws the action heads with a Xavier gain of 0.1.
     """
 
     def __init__(self, config: ModelConfig, channels: int, execution: ExecutionConfig, axis: str = "C"):
@@ -81,13 +82,13 @@ class Denoiser(nnx.Module):
     def __call__(self, x: jax.Array, time: jax.Array, z: jax.Array) -> jax.Array:
         """x [..., C] noised at `time` given z [..., D] -> float32 [..., 2 C], noise first.
 
-        `time` [...] may have axes of size 1: what they share is computed once.
+        `time` [...] may have axes of size 1: what depends on time alone is then computed once along them.
         """
         y = self.time_out(jax.nn.silu(self.time_in(timestep_embedding(time).astype(self.dtype))))
         y = y + self.condition((z / self.multiplier).astype(self.dtype))
         x = self._into(x.astype(self.dtype))
         for block in self.blocks:
-            if self.remat != "none":  # which keeps all on a mesh too: no block gathers weights of its own
+            if self.remat != "none":  # "none" keeps everything, on a mesh too: no block gathers weights of its own
                 block = remat.checkpointed(block.__call__, self.remat, scanned=False)
             x = block(x, y)
         shift, scale = jnp.split(self.modulation(jax.nn.silu(y)), 2, axis=-1)
@@ -100,7 +101,7 @@ class Denoiser(nnx.Module):
         return shifted(from_actions(x, self.into.kernel.astype(x.dtype)), self.into.bias.get_value())
 
     def _out(self, x: jax.Array) -> jax.Array:
-        """[..., F] -> [..., 2 C], in float32 at least."""
+        """[..., F] -> [..., 2 C], at least in float32."""
         w = self.out.astype(x.dtype)
         if self.of_actions:
             both = jnp.stack([to_actions(x, w[:, k]) for k in (0, 1)], -2)

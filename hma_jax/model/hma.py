@@ -1,6 +1,6 @@
 """HMA: frame embedding -> stems -> trunk -> heads.
 
-Puts the parts together in one forward pass, with the options that training, evaluation and generation need. Masking and
+One forward pass that joins the parts, with the options that training, evaluation and generation need. Masking and
 losses are in `objective`, decoding in `generation`.
 """
 
@@ -35,10 +35,10 @@ def causal_mask(frames: int) -> jax.Array:
 class Outputs(NamedTuple):
     """What a pass returns, for the frames that it was given or for those from `predict_from` on."""
 
-    # The frame head's output for each token, float32: logits [B, T, S, Q, V]; with chained factors the features that
-    # logits are computed from, and with latents the denoiser's conditions, both [B, T, S, D].
+    # The frame head's output for each token, float32: logits [B, T, S, Q, V]; with chained factors the features from
+    # which logits are computed, with latents the denoiser's conditions, both [B, T, S, D].
     token_outputs: jax.Array
-    action_features_BTD: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
+    action_features_BTD: jax.Array | None  # mean output of each frame's action tokens; None without such tokens
     cache: TemporalCache | None  # keys and values of the first `cache_frames` frames
 
 
@@ -49,7 +49,7 @@ class HMA(nnx.Module):
         self.config, self.table, self.dtype = config, table, jnp.dtype(execution.dtype)
         self._units: ActionUnits | None = None  # the table's
         self.embed = make_embed(config)
-        self.embed.mask.set_metadata(use="frames_predicted")  # no token is masked but to be predicted
+        self.embed.mask.set_metadata(use="frames_predicted")  # a token is masked only to be predicted
         self.recall = used("frames_predicted", Recall(config)) if config.recall else None
         shape = (config.frames, config.position_slots, config.width)
         self.positions = param(shape, ("T", "P", "D"), zeros, role="vector")
@@ -84,17 +84,17 @@ class HMA(nnx.Module):
         predict_from: int = 0,
         robot_row_B: jax.Array | None = None,
     ) -> Outputs:
-        """One pass over ids [B, T, S] or latents [B, T, S, C], masked where bool `masked` says.
+        """One pass over ids [B, T, S] or latents [B, T, S, C], masked where `masked` (bool) is True.
 
         `actions_BTU` are raw chunks as `align` arranges them: as released, frame t carries the
-        chunk executed after it was seen (reference section 1.3). Where `action_hidden_BT` the model is
-        not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
-        instead of actions runs without action tokens and conditioning. The frames stand at window positions
-        `positions` (int [T], default from 0 on); `visible` [T, T_past + T], or with a leading B, defaults to causal:
-        then padding at a window's end is seen by no real frame. `before`, of the shape of `frames`, is the frame that
-        precedes each of them, which `config.recall` reads; by default the one before it here. The cache of the first
-        `cache_frames` frames is returned; frames before `predict_from` get no predictions. Where the parameters hold
-        the slices of some robots only, `robot_row_B` [B] is each example's index into them.
+        chunk executed after it was seen (reference section 1.3). Where `action_hidden_BT` is True the model is not
+        shown them (`leak` allows the release's exceptions, see `MaskingConfig.action_leak`). With None instead of
+        actions, the pass runs without action tokens and conditioning. The frames stand at window positions `positions`
+        (int [T]; default: from 0 on). `visible` [T, T_past + T], or with a leading B, is causal by default: no real
+        frame then sees the padding at a window's end. `before`, of the shape of `frames`, holds the frame that precedes
+        each of them, which `config.recall` reads; by default it is the previous frame in `frames`. The cache of the
+        first `cache_frames` frames is returned; frames before `predict_from` get no predictions. If the parameters hold
+        the slices of only some robots, `robot_row_B` [B] is each example's index into them.
         """
         config = self.config
         count = frames.shape[1]
@@ -129,15 +129,15 @@ class HMA(nnx.Module):
         return Outputs(token_outputs, action_features_BTD, cache)
 
     def _a_frame_earlier(self, frames: jax.Array, unknown_BTS: jax.Array, before: jax.Array | None) -> jax.Array:
-        """[B, T, S, D]: what stood at each token a frame earlier, 0 where that is not known either."""
+        """[B, T, S, D]: the embedding at each token's position one frame earlier, 0 where that token is unknown too."""
         if before is not None:
             return self.embed(before, None, self.dtype)
         x = jnp.where(unknown_BTS[..., None], 0, self.embed(frames, None, self.dtype))
         return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
     def _hidden_through_leaks(self, action_hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array | None:
-        """bool [B, T]: frames whose action no leak shows. With `causal` alignment nothing led to the first one
-        (`align_hidden`); None: none."""
+        """bool [B, T]: the frames whose action is hidden despite the leak; None: there are none. With `causal`
+        alignment it is the first frame, to which no action led (`align_hidden`)."""
         if action_hidden_BT is None or self.config.action_alignment == "released":
             return None
         return action_hidden_BT & (positions == 0)
@@ -152,8 +152,8 @@ class HMA(nnx.Module):
         return over_tokens(feature_BTD, self.config.action_tokens)
 
     def with_action_units(self, units: ActionUnits) -> HMA:
-        """This model, changed in place, with `units` instead of its table's scale of actions. Within a traced function
-        they may be inputs of the program instead of constants. Evaluation uses this; training does not, and
+        """This model, changed in place, with `units` instead of its table's scale of actions. Inside a traced function
+        `units` can thus be an input of the program instead of a constant. Evaluation uses this; training does not, and
         `train_model` says why."""
         self._units = nnx.data(units)
         return self
@@ -167,15 +167,14 @@ class HMA(nnx.Module):
         return (self._units or self.table.scale()).unnormalise(actions, embodiment_B)
 
     def logits(self, token_outputs: jax.Array, ids: jax.Array) -> jax.Array:
-        """Logits [..., Q, V] of each factor from the `token_outputs` of tokens [...]; with chained factors, given the
-        factors of `ids` [...] before it."""
+        """Logits [..., Q, V] of each factor from the `token_outputs` of tokens [...]. With chained factors, those of a
+        factor are conditional on the factors of `ids` [...] before it."""
         digits = factorise(ids, self.config.factors, self.config.factor_vocab)
         return self.frame_head.decode_factors(token_outputs, lambda factor, _: digits[..., factor])[1]
 
     def align(self, actions: jax.Array) -> jax.Array:
-        """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own as released,
-        with `causal` alignment the one before (and some chunk on the first frame, which
-        `align_hidden` hides)."""
+        """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own chunk as released; with `causal`
+        alignment the one before it. (The first frame then has an arbitrary chunk, which `align_hidden` hides.)"""
         if self.config.action_alignment == "released":
             return actions
         return jnp.concatenate([actions[..., :1, :], actions[..., :-1, :]], axis=-2)
@@ -183,8 +182,8 @@ class HMA(nnx.Module):
     def align_hidden(self, action_hidden_BT: jax.Array | None, shape: tuple[int, int]) -> jax.Array | None:
         """Which recorded chunks are hidden (None: none) -> which frames are shown no action.
 
-        `shape` is (B, T). With `causal` alignment the first frame never is: nothing led to it, and
-        its own chunk lies in its future.
+        `shape` is (B, T). With `causal` alignment the first frame is never shown one: no action led to it, and its own
+        chunk lies in its future.
         """
         if self.config.action_alignment == "released":
             return action_hidden_BT

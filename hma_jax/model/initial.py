@@ -1,4 +1,4 @@
-"""Initialisers that depend on the configuration: what muP says of each role."""
+"""Initialisers that depend on the configuration: what muP prescribes for each role."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ READOUT_GAIN = 0.01
 
 
 def hidden_init(config: ModelConfig, fan_in: int, fan_out: int, gain: float) -> Initializer:
-    """Xavier, whose variance falls with the width of either side, as muP wants of hidden matrices."""
+    """Xavier, whose variance falls with the width of either side, as muP requires for hidden matrices."""
     missing = config.width_multiplier / config.mup_multiplier("init")
     return xavier_uniform(fan_in, fan_out, gain * missing**0.5)
 
@@ -24,10 +24,10 @@ def trunk_init(config: ModelConfig, fan_in: int, fan_out: int) -> Initializer:
 
 
 def input_fan_out(config: ModelConfig) -> float:
-    """The fan-out that Xavier counts for a matrix whose input has a fixed size.
+    """The fan-out that Xavier uses for a matrix whose input has a fixed size.
 
     DIFFERS: it is the base width at every width, so that entries stay as large as those of biases and embeddings,
-    which learn at the same rate. The release counts the true width: features shrink as 1 / sqrt(D).
+    which learn at the same rate. The release uses the true width, so features shrink as 1 / sqrt(D).
     """
     return config.width / config.mup_multiplier("init")
 

@@ -1,8 +1,8 @@
-"""The few layers everything is made of. Each declares its parameters through `params.param`.
+"""The few layers of which everything is made. Each declares its parameters through `params.param`.
 
-Two indices name an example's robot. `embodiment_B` is its row of the embodiment table; `robot_row_B` is its row on the
-embodiment axis of the parameters at hand. They differ in a training step, whose parameters are those of a few robots
-(`hma_jax.training.active_robots`).
+Two indices name an example's robot. `embodiment_B` is the robot's row in the embodiment table; `robot_row_B` is its row
+on the embodiment axis of the parameters at hand. They differ in a training step, which holds the parameters of only a
+few robots (`hma_jax.training.active_robots`).
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ class Linear(nnx.Module):
         self.bias = bias((sizes[1],), (axes[1],)) if with_bias else None
 
     def __call__(self, x: jax.Array, dtype: jnp.dtype | None = None) -> jax.Array:
-        """x [..., in] -> [..., out] in the type of x, or in `dtype`, which is then that of the sum."""
+        """x [..., in] -> [..., out] in the type of x, or in `dtype`, in which it is then summed."""
         y = contract(x, self.kernel.astype(x.dtype), dtype=dtype)
         return y if self.bias is None else shifted(y, self.bias.get_value())
 
 
 class EmbodimentLinear(nnx.Module):
-    """One linear map per robot; `robot_row_B` says which is each example's own."""
+    """One linear map per robot; `robot_row_B` is the index of each example's map."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class EmbodimentLinear(nnx.Module):
         role: Role,
     ):
         self.kernel = param((embodiments, *sizes), ("E", *axes), init, role=role)
-        self.bias = bias((embodiments, sizes[1]), ("E", axes[1]), precise=axes[1] == "U")  # as `to_actions` is
+        self.bias = bias((embodiments, sizes[1]), ("E", axes[1]), precise=axes[1] == "U")  # float32, as `to_actions` is
         self.map = find_map(axes)
 
     def __call__(self, x: jax.Array, robot_row_B: jax.Array) -> jax.Array:
@@ -85,8 +85,8 @@ class EmbodimentLinear(nnx.Module):
 
 
 def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array, Layouts | None], jax.Array]:
-    """The product of each example with its robot's matrix. Results must not depend on U, which the widest robot
-    sets."""
+    """The function that multiplies each example by its robot's matrix. Results must not depend on U, which the widest
+    robot determines."""
     if axes[0] == "U":
         return per_robot_from_actions
     return per_robot_to_actions if axes[1] == "U" else per_robot

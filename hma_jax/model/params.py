@@ -3,8 +3,8 @@
 A declaration says shape, logical axes (in the dimension letters), initialiser, muP role and
 whether weight decay applies. From it come the arrays (`Declared.init`), their sharding
 (`runtime.sharding`), the optimiser's multipliers, decay mask and embodiment axis
-(`training.optimizer`), and the counts. Flax NNX modules hold declarations; what is jitted
-are pure functions of the plain nested dict of arrays that `Declared.init` returns.
+(`training.optimizer`), and the counts. Flax NNX modules hold declarations; jitted functions are pure functions of the
+plain nested dict of arrays that `Declared.init` returns.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Role = Literal["hidden", "input", "output", "vector"]
 size), `vector` is a bias, a gain or an embedding."""
 
 Use = Literal["always", "actions_shown", "actions_hidden", "actions_predicted", "frames_predicted"]
-"""Which examples a parameter is trained by. A step without one leaves it as it is, like the parameters of an absent
-robot: no update, no decay, no count."""
+"""The examples that train a parameter. A step without such an example leaves it unchanged, like the parameters of an
+absent robot: no update, no decay, no count."""
 
 MatrixAxes = tuple[tuple[int, ...], tuple[int, ...]]
-"""The axes, counted from the last, that a `hidden` parameter maps from and to. Along others there are more such
+"""The axes, counted from the last, that a `hidden` parameter maps from and to. The other axes stack several such
 matrices."""
 
 Initializer = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
@@ -72,7 +72,7 @@ class ParamSpec:
         return math.prod(self.shape)
 
     def along_robots(self, x_E: jax.Array) -> jax.Array:
-        """One value per robot, shaped to broadcast against this parameter, which has an embodiment axis."""
+        """One value per robot, shaped to broadcast against this parameter, which must have an embodiment axis."""
         return x_E.reshape([-1 if axis == self.embodiment_axis else 1 for axis in range(len(self.shape))])
 
 
@@ -111,7 +111,7 @@ def ones(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def uniform(rng: np.random.Generator, shape: tuple[int, ...], bound: float | np.ndarray) -> np.ndarray:
-    """Uniform in +-bound, which may vary over the array."""
+    """Uniform in +-`bound`, which may vary over the array."""
     # In place: every process draws each array whole, and a copy of the largest takes gigabytes.
     x = rng.random(shape, np.float32)
     x *= 2
@@ -132,15 +132,16 @@ def normal(std: float) -> Initializer:
 def xavier_uniform(fan_in: float, fan_out: float, gain: float = 1.0) -> Initializer:
     """Uniform in +-gain * sqrt(6 / (fan_in + fan_out)).
 
-    Fans are given, not read off the shape: a fused, stacked or per-embodiment array has more
-    axes than the matrix it stands for.
+    Fans are arguments, not read from the shape: a fused, stacked or per-embodiment array has more axes than the matrix
+    it represents.
     """
     bound = gain * math.sqrt(6.0 / (fan_in + fan_out))
     return lambda rng, shape: uniform(rng, shape, bound)
 
 
 def stack(make: Callable[[], M], count: int, axis: str = LAYER_AXIS) -> M:
-    """`count` modules as one whose parameters have a leading axis, of layers unless named otherwise."""
+    """`count` modules as one module whose parameters have a leading axis; `axis` names it, by default the axis of
+    layers."""
     module = make()
     for variable in _params(module):
         one = variable.get_value()
@@ -171,8 +172,8 @@ class Declared(Generic[M]):
     def init(self, seed: int, shardings: Params | None = None) -> Params:
         """Arrays for every declaration, laid out by `shardings` (default: on the default device).
 
-        Each is drawn on the host (`draw`): nothing is compiled, and a mesh does not matter. One is drawn at a
-        time and placed shard by shard, so that no device ever holds a whole copy of what is split.
+        Each is drawn on the host (`draw`): nothing is compiled, and the values do not depend on the mesh. Arrays are
+        drawn one at a time and placed shard by shard, so that no device ever holds a whole copy of a split array.
         """
 
         def make(path: tuple[Any, ...], spec: ParamSpec, sharding: jax.sharding.Sharding | None = None) -> jax.Array:
@@ -193,8 +194,9 @@ class Declared(Generic[M]):
     def merge(self, params: Params) -> M:
         """The module with `params` in it; call it inside the traced function.
 
-        On a mesh, parameters without a layer or embodiment axis go to their compute layout here; those of layers do so
-        inside the loop over layers (`layer_for_compute`), and those of robots with the examples (`kernels.dense`).
+        On a mesh, parameters without a layer or embodiment axis are put into their compute layout here; those of layers
+        inside the loop over layers (`layer_for_compute`), and those of robots where they meet their examples
+        (`kernels.dense`).
         """
         specs = nnx.traversals.flatten_mapping(self.specs)
         flat = {
@@ -219,7 +221,7 @@ class Declared(Generic[M]):
 
 
 def declare(make: Callable[[], M], min_shard_size: int = MeshConfig.min_shard_size) -> Declared[M]:
-    """Reads the declarations of the module that `make` makes."""
+    """Reads the declarations of the module that `make` returns."""
     graphdef, state, _ = nnx.split(make(), nnx.Param, ...)
     # List indices become strings: checkpoints keep dictionaries with string keys only.
     flat = {tuple(map(str, path)): _spec(variable) for path, variable in nnx.to_flat_state(state)}
@@ -240,7 +242,7 @@ def is_spec(leaf: Any) -> bool:
 
 def layer_for_compute(layer: nnx.State, dtype: jnp.dtype) -> nnx.State:
     """One layer's slices of stacked parameters, in their compute layout on the current mesh. Matrices are communicated
-    in `dtype`, which they would be cast to anyway. Without a mesh, `layer` itself."""
+    in `dtype`, to which they would be cast anyway. Without a mesh, `layer` itself."""
     if not is_split():
         return layer
 
@@ -263,8 +265,8 @@ def layouts_of(variable: nnx.Param) -> Layouts | None:
 
 def inference_params(declared: Declared, params: Params, dtype: str) -> Params:
     """Parameters as generation and evaluation use them: in `dtype`, cast once, so that in bfloat16 a pass reads half
-    the bytes. What is computed is the same: a pass would cast them too, but for arrays of one axis and for those that
-    are used in float32 (`ParamSpec.precise`), which stay as they are."""
+    the bytes. The results are the same, because a pass would cast them too. Arrays of one axis and those that are used
+    in float32 (`ParamSpec.precise`) stay as they are."""
 
     def cast(spec: ParamSpec, x: jax.Array) -> jax.Array:
         return x if x.ndim < 2 or spec.precise else x.astype(jnp.dtype(dtype), copy=False)
@@ -273,7 +275,7 @@ def inference_params(declared: Declared, params: Params, dtype: str) -> Params:
 
 
 def require_params(declared: Declared, params: Params, what: str) -> None:
-    """Raises ConfigError, which begins with `what`, unless `params` are those that are declared, by name and shape."""
+    """Raises ConfigError, which begins with `what`, unless `params` have the declared names and shapes."""
     expected = {name: spec.shape for name, spec in declared.leaves().items()}
     given = {path_name(path): tuple(x.shape) for path, x in jax.tree.leaves_with_path(params)}
     for name in sorted(expected.keys() | given.keys()):

@@ -1,4 +1,4 @@
-"""From trunk outputs to logits of a token's factors, and how factors are chosen: independently or one after the
+"""From trunk outputs to logits of a token's factors, and how factors are chosen: independently, or one after the
 other."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hma_jax.model.layers import LayerNorm, Linear
 from hma_jax.model.params import normal, param, zeros
 
 Choose = Callable[[int, jax.Array], jax.Array]
-"""(q, logits [..., V] of factor q) -> its digits [...]."""
+"""(q, logits [..., V] of factor q) -> the digits [...] chosen for it."""
 
 
 class Readout(nnx.Module):
@@ -45,8 +45,8 @@ class Readout(nnx.Module):
 
 
 class ChainedReadout(nnx.Module):
-    """Logits of each factor given those before it (`ModelConfig.chain_factors`): those of `Readout`, plus the output of
-    a layer of width D that sees the trunk's output and the digits chosen so far. All of it in float32.
+    """Logits of each factor given those before it (`ModelConfig.chain_factors`): the logits of `Readout`, plus the
+    output of a layer of width D that sees the trunk's output and the digits chosen so far. Everything is in float32.
     """
 
     def __init__(self, config: ModelConfig):
@@ -80,7 +80,7 @@ class ChainedReadout(nnx.Module):
 
 def choose_sampled(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, top_k: int = 0) -> Choose:
     """A `Choose` that samples the factors of one example, whose logits have `shape` [..., Q, V]. Temperature 0 takes
-    the likeliest; `top_k` restricts to so many entries (0: all).
+    the likeliest digit; `top_k` restricts the choice to the k likeliest entries (0: all).
 
     The Gumbel noise is drawn for all factors at once: chained and independent factors see the same noise.
     """

@@ -1,8 +1,8 @@
-"""The stems: every robot's action chunks as features of the trunk's width.
+"""The stems: they map every robot's action chunks to features of the trunk's width.
 
 Reference section 1.3. What the trunk does with a feature is in `conditioning`. The paper's text
-gives one Xavier gain, 0.1, for "action projectors"; the release has it for the modulation and
-0.01 for the stems (reference section 1.10).
+gives one Xavier gain, 0.1, for "action projectors"; the release uses 0.1 for the modulation and 0.01 for the stems
+(reference section 1.10).
 """
 
 from __future__ import annotations

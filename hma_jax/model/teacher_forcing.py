@@ -27,8 +27,8 @@ def teacher_forced_pass(
     cache_frames: int = 0,
     robot_row_B: jax.Array | None = None,
 ) -> Outputs:
-    """Predictions for `frames` [B, T - 1, S (, C)] at positions 1 .. T-1, masked where bool `masked` says; frame t
-    attends to the first t of `past_frames`, of the same shape, at positions 0 .. T-2.
+    """Predictions for `frames` [B, T - 1, S (, C)] at positions 1 .. T-1, masked where `masked` (bool) is True. Frame t
+    attends to the first t of `past_frames`, which has the same shape and stands at positions 0 .. T-2.
 
     `actions_BTU` are the recorded chunks; `action_hidden_BT` and `leak` as for the model. The first `cache_frames` of
     `past_frames` are cached.
@@ -52,8 +52,8 @@ def teacher_forced_pass(
 
 
 def teacher_forcing_mask(past: jax.Array) -> jax.Array:
-    """bool [2 T, 2 T]: which frames each of T true frames, then T masked ones, attends to. A masked frame sees the true
-    frames that `past` [T, T] allows it, and itself; no other frame sees it."""
+    """bool [2 T, 2 T]: the frames that each of T true frames, and then each of T masked ones, attends to. A masked
+    frame sees itself and the true frames that `past` [T, T] allows; no other frame sees it."""
     count = len(past)
     return jnp.block([[causal_mask(count), jnp.zeros_like(past)], [past, jnp.eye(count, dtype=bool)]])
 

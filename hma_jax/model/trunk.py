@@ -18,9 +18,9 @@ from hma_jax.model.params import layer_for_compute, stack
 from hma_jax.runtime.sharding import constrain
 
 MAX_UNROLLED_LAYERS = 4
-"""Trunks of up to so many layers are unrolled: without slices of stacked arrays the steps of small models are a seventh
-faster on CPU, and so few layers compile as fast. At width 256 it gains nothing: four layers take 4.45 s a step unrolled
-and 4.20 s scanned."""
+"""Trunks with at most this many layers are unrolled: without slicing stacked arrays, steps of small models are a
+seventh faster on CPU, and so few layers compile as fast. At width 256 nothing is gained: four layers take 4.45 s a step
+unrolled and 4.20 s scanned."""
 
 
 class TemporalCache(NamedTuple):
@@ -34,7 +34,7 @@ class Block(nnx.Module):
     """Spatial attention, conditioning on the action, temporal attention, MLP.
 
     The order is the release's (reference section 1.4). There is no norm before temporal
-    attention: the released checkpoints were trained so. DIFFERS: the MLP has no dropout; the release's continuous
+    attention: the released checkpoints were trained that way. DIFFERS: the MLP has no dropout; the release's continuous
     configurations train with 0.05.
     """
 
@@ -73,7 +73,7 @@ class Block(nnx.Module):
 
 
 class Trunk(nnx.Module):
-    """The part all robots share, but for the conditioning inside its blocks."""
+    """The part that all robots share, except for the conditioning inside its blocks."""
 
     def __init__(self, config: ModelConfig, embodiments: int, execution: ExecutionConfig):
         self.blocks = stack(lambda: Block(config, embodiments, execution), config.layers)
@@ -91,8 +91,8 @@ class Trunk(nnx.Module):
     ) -> tuple[jax.Array, TemporalCache | None]:
         """Runs all blocks.
 
-        `visible` [T, T_past + T] says which frames each frame's temporal attention may see.
-        The cache of the first `cache_frames` new frames is returned; None if `cache_frames` is 0.
+        `visible` [T, T_past + T]: the frames that each frame's temporal attention may see. The cache of the first
+        `cache_frames` new frames is returned; None if `cache_frames` is 0.
         """
         block_def, layers = nnx.split(self.blocks)
 
@@ -109,9 +109,9 @@ class Trunk(nnx.Module):
 
 
 def _by_example(x_BTPD: jax.Array) -> jax.Array:
-    """Pins the layout of activations: every device has whole examples.
+    """Fixes the layout of activations: every device holds whole examples.
 
-    After every sum, not only after every block: left to itself, XLA (jax 0.10) gives passes over one frame on
-    a mesh with data, fsdp and tensor all above 1 other layouts, and then wrong numbers.
+    It is called after every sum, not only after every block: otherwise XLA (jax 0.10) chooses other layouts for passes
+    over one frame on a mesh with data, fsdp and tensor all above 1, and then computes wrong numbers.
     """
     return constrain(x_BTPD, ("B", None, None, "D_act"))
