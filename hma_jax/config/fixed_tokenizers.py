@@ -1,8 +1,7 @@
 """Configurations of the tokenizers that are not trained here: two pretrained ones, pixels, and the user's own.
 
-The trainable one is `hma_jax.config.TokenizerConfig`. All say how large an image is and what its
-tokens are; `kind` tells them apart where a configuration may be any of them. Nothing here imports
-JAX.
+The trainable one is `hma_jax.config.TokenizerConfig`. Each states the size of an image and what its tokens are; `kind`
+tells them apart where a configuration may be any of them. Nothing here imports JAX.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ class Latents(TokenGrid):
 
 @dataclass(frozen=True)
 class Magvit2Config(TokenGrid):
-    """The MAGVIT2 image tokenizer of 1X, and of Open-MAGVIT2 without adaptive normalisation; defaults are the one that
-    1X published (2^18 codes).
+    """The MAGVIT2 image tokenizer of 1X, and of Open-MAGVIT2 without adaptive normalisation. The defaults are those of
+    the tokenizer that 1X published (2^18 codes).
 
     Reference appendix A. Every level but the last halves the image. Tokens are ids of `bits` binary channels, split
     evenly into `factors`.
@@ -87,11 +86,11 @@ class Magvit2Config(TokenGrid):
 
 @dataclass(frozen=True)
 class SvdVaeConfig(Latents):
-    """The VAE of Stable Video Diffusion (AutoencoderKLTemporalDecoder); defaults are the published one.
+    """The VAE of Stable Video Diffusion (AutoencoderKLTemporalDecoder); the defaults are those of the published model.
 
     An image of 256 pixels becomes 32 x 32 cells of 4 channels, and as released 2 x 2 cells make one
-    token. Tokens are the posterior mean times `scale`, what released models see: about unit
-    deviation. (The release stores the mean itself and multiplies when it loads.)
+    token. Tokens are the posterior mean times `scale`, as released models see them, with a standard deviation of about
+    1. (The release stores the mean itself and multiplies when it loads.)
     """
 
     kind: Literal["svd-vae"] = "svd-vae"
@@ -154,7 +153,7 @@ class PythonConfig:
     image_size: int = 256
     grid: int = 16  # tokens along one side of the image
     vocab_size: int = 0  # V^Q; 0: tokens are latents
-    factors: int = 1  # Q: an id is split into as many digits; without meaning for latents
+    factors: int = 1  # Q: digits that an id is split into; without meaning for latents
     channels: int = 0  # C: values per token; 0: tokens are ids
 
     def __post_init__(self):
@@ -168,7 +167,7 @@ class PythonConfig:
         )
         require(
             self.factor_vocab**self.factors == self.vocab_size or self.channels > 0,
-            f"python.vocab_size {self.vocab_size} is no whole number to the power of factors {self.factors}, so ids "
+            f"python.vocab_size {self.vocab_size} is not a whole number to the power of factors {self.factors}, so ids "
             "cannot be split evenly; take one factor, or a larger vocab_size of which some ids stay unused",
         )
 
@@ -198,7 +197,7 @@ AnyTokenizerConfig = TokenizerConfig | Magvit2Config | SvdVaeConfig | PixelsConf
 
 
 def _check_levels(name: str, widths: list[int] | tuple[int, ...], groups: int) -> None:
-    """Raises ConfigError unless every level's channels split into groups of normalisation."""
+    """Raises ConfigError unless the channels of every level split into `groups` normalisation groups."""
     require(groups >= 1, f"{name}.groups must be at least 1, got {groups}")
     for width in widths:
         require(

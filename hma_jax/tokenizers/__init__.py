@@ -1,7 +1,7 @@
 """Tokenizers: frames to discrete ids or latent vectors and back, behind one interface
 (`base.Tokenizer`).
 
-Trained here: `lfq` and `continuous`, on the network of `network`. Trained by others: `pretrained`, on
-those of `magvit2` and `svd_vae`. Of the user's own code: `python`. Without a network: `pixels`. `io`
-keeps one table of all kinds.
+Trained here: `lfq` and `continuous`, with the network in `network`. Trained by others: `pretrained`, with the networks
+in `magvit2` and `svd_vae`. From the user's own code: `python`. Without a network: `pixels`. `io` has the table of all
+kinds.
 """

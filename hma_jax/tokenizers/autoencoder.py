@@ -32,7 +32,7 @@ class AutoencoderTokenizer(Tokenizer):
         return declare_tokenizer(config)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
-        # float32 is float32 on accelerators too: their default would flip bits of latents near zero.
+        # Full float32 on accelerators too: their default precision would flip bits of latents near zero.
         with jax.default_matmul_precision("highest"):
             return self._from_latents(self._declared.merge(params).encoder(from_pixels(images)))
 

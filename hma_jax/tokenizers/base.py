@@ -1,4 +1,5 @@
-"""What a tokenizer is, and what every one here shares: checked weights, identity, batches of one size on each device.
+"""The interface of tokenizers, and what all of them share: checked weights, identity, batches of one size on each
+device.
 
 Subclasses decide what a token is, and encode and decode.
 """
@@ -28,10 +29,10 @@ PIECE = 64
 """Images per call of a jitted encoder or decoder; smaller batches are padded to it."""
 
 LARGEST_LATENT = float(np.finfo(np.float16).max)
-"""Token stores keep latents in half precision, where a larger one would be infinite."""
+"""The largest latent: token stores keep latents in half precision, where a larger one would be infinite."""
 
 PIXELS = 2**18
-"""Pixels that go through a large network at once: four images of 256 x 256."""
+"""The most pixels that go through a large network at once: four images of 256 x 256."""
 
 
 class Tokenizer(abc.ABC):
@@ -39,20 +40,21 @@ class Tokenizer(abc.ABC):
 
     A token is an id, int32, or a vector of C latent channels, float32 of about unit standard deviation. Tokens run over
     a grid row by row, a square one where images are square. An id is sum_q digit_q V^q: factor 0 in the low digits.
-    Both directions are deterministic, and an image's result does not depend on the others of its batch: tokens made in
-    one job equal those made in another. Another kind of device sums products in another order, which may turn a bit
-    whose latent is all but 0.
+    Both directions are deterministic, and the result for an image does not depend on the other images of its batch:
+    tokens made in one job equal those made in another. A different kind of device sums products in a different order,
+    which may flip a bit whose latent is almost 0.
 
-    All devices of this process share every batch: `piece` images at a time go through the network on each of them, so
-    that tokens do not depend on how many there are.
+    All devices of this process share every batch. On each of them `piece` images at a time go through the network, so
+    that tokens do not depend on the number of devices.
     """
 
     kind: ClassVar[str]
     config_class: ClassVar[type]
     ignored: ClassVar[tuple[str, ...]] = ()
-    """Settings without effect on this kind, left out of its identity."""
+    """Settings that have no effect on this kind, and are left out of its identity."""
     measured: ClassVar[tuple[str, ...]] = ()
-    """Numbers beside the weights that the tokens depend on: attributes, and arguments by name."""
+    """Names of numbers, besides the weights, on which the tokens depend; they are attributes and constructor
+    arguments."""
 
     def __init__(self, config: Any, params: Params, *, piece: int | None = None):
         """Raises ConfigError if `params` are not those that `config` declares, or for a `piece` without an image."""
@@ -68,7 +70,7 @@ class Tokenizer(abc.ABC):
         self._decode = self._jit_over_devices(self.decode_uint8_fn)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For pickling; where it is unpickled, it uses the devices of that process."""
+        """For pickling; after unpickling, a tokenizer uses the devices of the new process."""
         options = {name: getattr(self, name) for name in self.measured} | {"piece": self.piece}
         return partial(type(self), **options), (self.config, self.params)
 
@@ -163,7 +165,7 @@ class Tokenizer(abc.ABC):
     def decode(self, tokens: np.ndarray) -> np.ndarray:
         """Tokens [B, S] or [B, S, C] -> uint8 [B, H, W, 3].
 
-        Raises ConfigError for another shape or type, and for values that are no tokens.
+        Raises ConfigError for another shape or type, and for values that are not tokens.
         """
         tokens = self._checked(np.asarray(tokens))
         return in_pieces(lambda piece: self._decode(self._device_params, piece), tokens, self.at_once)
@@ -173,8 +175,8 @@ class Tokenizer(abc.ABC):
         return np.asarray(self.decode(self.encode(images)))
 
     def require_tokens(self, tokens: np.ndarray, what: str, advice: str) -> None:
-        """Raises ConfigError, which begins with `what` made them and ends with `advice`, for values that are no tokens.
-        Compiled programs do not look: what they make is checked where it comes to the host."""
+        """Raises ConfigError, which begins with `what` made them and ends with `advice`, for values that are not
+        tokens. Compiled programs do not check: their results are checked when they reach the host."""
         wanted = f"finite numbers within ±{LARGEST_LATENT:,.0f}" if self.channels else f"in [0, {self.vocab_size})"
         require(
             self._are_tokens(tokens),
@@ -183,7 +185,7 @@ class Tokenizer(abc.ABC):
 
     def _are_tokens(self, values: np.ndarray) -> bool:
         if self.channels:
-            return bool((np.abs(values) <= LARGEST_LATENT).all())  # NaN is not
+            return bool((np.abs(values) <= LARGEST_LATENT).all())  # false for NaN
         return bool(0 <= values.min(initial=0) and values.max(initial=0) < self.vocab_size)
 
     def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
@@ -192,7 +194,7 @@ class Tokenizer(abc.ABC):
         return jnp.round(self.decode_fn(params, tokens)).astype(jnp.uint8)
 
     def _checked(self, tokens: np.ndarray) -> np.ndarray:
-        """`tokens` in the type that is decoded; ConfigError if they cannot be."""
+        """`tokens` in the type that is decoded. Raises ConfigError if they cannot be decoded."""
         if self.channels:
             return self._checked_latents(tokens)
         require(
@@ -221,7 +223,7 @@ class Tokenizer(abc.ABC):
 
     @property
     def at_once(self) -> int:
-        """Images of one call: `piece` on every device. A smaller batch is padded to it."""
+        """Images per call: `piece` on every device. A smaller batch is padded to this number."""
         return self.piece * self._mesh.size
 
     def _jit_over_devices(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:
@@ -229,12 +231,12 @@ class Tokenizer(abc.ABC):
         if self._mesh.size == 1:
             return jax.jit(function)
         whole, rows = PartitionSpec(), PartitionSpec(BATCH)
-        # One program per device, of the shape that a single one has: the same rounding on any number.
+        # One program per device, with the shape that it has on a single device: so rounding is the same on any number.
         return jax.jit(jax.shard_map(function, mesh=self._mesh, in_specs=(whole, rows), out_specs=rows))
 
     @cached_property
     def _device_params(self) -> Params:
-        """The parameters where the devices need them."""
+        """The parameters, on every device."""
         if self._mesh.size == 1:
             return self.params
         return jax.device_put(self.params, replicated(self._mesh))
@@ -250,7 +252,7 @@ def require_images(images: np.ndarray, shape: tuple[int, int], what: str) -> Non
 
 
 def token_mismatch(model: ModelConfig, tokenizer: Tokenizer) -> str:
-    """How the tokens that a model takes differ from those that a tokenizer makes; '' if they do not."""
+    """A message about how the tokens that a model takes differ from those that a tokenizer makes; '' if they do not."""
     if model.diffusion:
         takes = (model.tokens, 0, 0, model.diffusion.token_channels)
     else:
@@ -263,15 +265,15 @@ def token_mismatch(model: ModelConfig, tokenizer: Tokenizer) -> str:
 
 
 def fitting_piece(image_shape: tuple[int, int]) -> int:
-    """Images that a large network takes at a time: at most PIECE of them, and PIXELS."""
+    """The number of images that a large network takes at a time: at most PIECE images, with at most PIXELS pixels."""
     return max(1, min(PIECE, PIXELS // math.prod(image_shape)))
 
 
 def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int) -> np.ndarray:
     """Applies `function` to consecutive pieces of exactly `size` rows; the last one is padded with copies of a row.
 
-    One static shape means one compilation, and rounding that does not depend on the number of rows: a latent near zero
-    must not change its sign with the batch it came in.
+    One static shape means one compilation, and rounding that does not depend on the number of rows: the sign of a
+    latent near zero must not depend on its batch.
     """
     require(len(rows) > 0, "an empty batch cannot be encoded or decoded")
     results = []
@@ -279,7 +281,7 @@ def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int
         piece = rows[start : start + size]
         missing = size - len(piece)
         if missing:
-            # Not with zeros, of which a network that normalises may make no numbers.
+            # Not with zeros, for which a network that normalises may give NaN.
             piece = np.concatenate([piece, np.repeat(piece[-1:], missing, axis=0)])
         results.append(function(piece))  # dispatched asynchronously: the device works while the next is sliced
     return np.concatenate([np.asarray(r) for r in results])[: len(rows)]

@@ -1,9 +1,9 @@
 """The continuous tokenizer: the same autoencoder without a quantiser.
 
-Latents are handed out with unit standard deviation, so that a generative model of them needs no
-tuning to the tokenizer. One number does it, measured on training frames when training ends (the
-release multiplies its latents by 0.18215 for the same purpose). It is one for all channels on
-purpose: noise of one size on all of them made the encoder spread its channels by importance.
+Latents are scaled to unit standard deviation, so that a generative model of them needs no tuning to the tokenizer. The
+scale is one number, measured on training frames when training ends (the release multiplies its latents by 0.18215 for
+the same purpose). It is deliberately the same for all channels: because training adds noise of one size to all of them,
+the encoder gives more important channels a larger spread.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hma_jax.model.params import Params
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
 
 SCALE_BATCHES = 32
-"""Batches of training frames that the scale is measured on."""
+"""The number of batches of training frames on which the scale is measured."""
 
 
 class ContinuousTokenizer(AutoencoderTokenizer):
@@ -32,9 +32,10 @@ class ContinuousTokenizer(AutoencoderTokenizer):
     measured = ("latent_std",)
 
     def __init__(self, config: TokenizerConfig, params: Params, latent_std: float, *, piece: int | None = None):
-        """`latent_std`: of the encoder's own output.
+        """`latent_std`: the standard deviation of the encoder's own output.
 
-        Raises ConfigError if `params` are not those that `config` declares, or if it is no scale.
+        Raises ConfigError if `params` are not those that `config` declares, or if `latent_std` is not a positive
+        number.
         """
         require(not config.quantise, "a tokenizer for latents needs tokenizer.quantise=false")
         require(

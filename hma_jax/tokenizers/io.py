@@ -1,7 +1,7 @@
 """Tokenizers on disk, of every kind: `tokenizer.json` and `weights.npz`, or `files/` with the user's own code.
 
-The JSON holds kind, configuration, identity and what was measured beside the weights, such as the
-scale of latents. It is written last, so a directory holds a whole tokenizer or none.
+The JSON holds kind, configuration, identity and numbers that were measured besides the weights, such as the scale of
+latents. It is written last, so a directory holds a whole tokenizer or none.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from hma_jax.tokenizers.python import PythonTokenizer, copy_folder, folder_ident
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
 FILES = "files"
-"""The folder of a tokenizer of the user's own code."""
+"""The folder that holds the user's own code."""
 KINDS: dict[str, type[Tokenizer]] = {
     cls.kind: cls
     for cls in (
@@ -47,7 +47,7 @@ ADVICE = "train, make, import or copy the tokenizer again"
 
 
 def save_tokenizer(tokenizer: Tokenizer, directory: str | Path) -> None:
-    """Writes into `directory`, replacing a tokenizer that is there. Raises ConfigError if it cannot."""
+    """Writes into `directory`, replacing a tokenizer that is there. Raises ConfigError if it cannot be written."""
     directory = Path(directory)
     description = {
         "kind": tokenizer.kind,
@@ -77,11 +77,11 @@ def load_tokenizer(
     *,
     piece: int | None = None,
 ) -> Tokenizer:
-    """The tokenizer in `directory`. `piece` is explained at `Tokenizer`. Of the kind "python", its code is run, if
-    it was saved by this user or trusted (`trust_tokenizer`).
+    """The tokenizer in `directory`. `piece` is explained in `Tokenizer`. The code of a tokenizer of kind "python" is
+    run, if this user saved or trusted it (`trust_tokenizer`).
 
-    Raises ConfigError if none is there, if a file is damaged, or if its configuration is not
-    `expect` (when given), naming every field that differs.
+    Raises ConfigError if there is none, if a file is damaged, or if its configuration is not `expect` (when given); the
+    error then names every field that differs.
     """
     directory = Path(directory)
     description = _read_description(directory)
@@ -109,8 +109,8 @@ def load_tokenizer(
 
 
 def trust_tokenizer(directory: Path) -> str:
-    """Lets the Python code of a tokenizer run for this user; returns its identity. Raises ConfigError for a tokenizer
-    of another kind, and for files that are not those of which it was made."""
+    """Allows the Python code of a tokenizer to run for this user; returns its identity. Raises ConfigError for a
+    tokenizer of another kind, and if its files are not those from which it was made."""
     description = _read_description(directory)
     require(
         KINDS[description["kind"]] is PythonTokenizer,
@@ -131,16 +131,15 @@ def _require_described(path: Path, what: str, identity: str, description: dict[s
 
 
 def load_config(directory: Path) -> AnyTokenizerConfig:
-    """The configuration of the tokenizer in `directory`; neither are its weights read nor its
-    code run.
+    """The configuration of the tokenizer in `directory`. Its weights are not read, and its code is not run.
 
-    Raises ConfigError if none is there or its description is damaged.
+    Raises ConfigError if there is none or its description is damaged.
     """
     return _config(Path(directory), _read_description(Path(directory)))
 
 
 def read_identity(directory: Path) -> str:
-    """What tells the tokenizer in `directory` from others, as its description says; otherwise as `load_config`."""
+    """The identity of the tokenizer in `directory`, as its description says. Otherwise as `load_config`."""
     return _read_description(Path(directory))["identity"]
 
 

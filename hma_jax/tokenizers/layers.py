@@ -1,8 +1,8 @@
-"""Layers of the pretrained networks: what PyTorch calls Conv2d, Conv3d, Linear and GroupNorm.
+"""Layers of the pretrained networks, which PyTorch calls Conv2d, Conv3d, Linear and GroupNorm.
 
-Channels come last: images [B, H, W, C], clips [B, T, H, W, C]. Everything is computed in the type of
-its input, normalisation and softmax in float32. Attributes are named as in the files the
-weights come from, so that names on both sides differ by a rule (`convert.pretrained`).
+Channels come last: images [B, H, W, C], clips [B, T, H, W, C]. Everything is computed in the type of its input, except
+normalisation and softmax, which are in float32. Attributes are named as in the files from which the weights come, so
+that names on both sides differ by a rule (`convert.pretrained`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from flax import nnx
 from hma_jax.model.params import bias, normal, ones, param
 
 PRECISION = jax.lax.Precision.HIGHEST
-"""float32 is float32 on accelerators too: their default would flip bits of latents near zero."""
+"""Full float32 on accelerators too: their default precision would flip bits of latents near zero."""
 
 
 class Conv(nnx.Module):
-    """[B, H, W, c_in] -> [B, H', W', c_out]; `padding` is that of ((top, bottom), (left, right))."""
+    """[B, H, W, c_in] -> [B, H', W', c_out]; `padding` (before, after) is that of both ((top, bottom), (left,
+    right))."""
 
     def __init__(
         self,
@@ -63,7 +64,7 @@ class TimeConv(nnx.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         frames, kernel = x.shape[1], self.kernel[...].astype(x.dtype)
         padded = jnp.pad(x, ((0, 0), (1, 1), (0, 0), (0, 0), (0, 0)))
-        # In a clip of one frame the outer taps see zeros alone: two thirds of the work.
+        # In a clip of one frame the outer taps, two thirds of the work, see only zeros.
         taps = (0, 1, 2) if frames > 1 else (1,)
         terms = [jnp.matmul(padded[:, i : i + frames], kernel[i], precision=PRECISION) for i in taps]
         return sum(terms) + self.bias[...].astype(x.dtype)
@@ -82,9 +83,9 @@ class Dense(nnx.Module):
 
 
 class GroupNorm(nnx.Module):
-    """Normalises [B, ..., C] over everything but the batch and the group of the channel.
+    """Normalises [B, ..., C] over all positions and the channels of a group.
 
-    Of a clip that includes its frames: they share one mean and deviation.
+    The frames of a clip are included: they share one mean and deviation.
     """
 
     def __init__(self, channels: int, groups: int, eps: float = 1e-6):
@@ -94,7 +95,7 @@ class GroupNorm(nnx.Module):
 
     def __call__(self, x: jax.Array) -> jax.Array:
         flat = x.astype(jnp.float32).reshape(x.shape[0], -1, x.shape[-1])
-        # Two passes: images of hardly any contrast have deviations far below their mean.
+        # Two passes, because images of very low contrast have deviations far below their mean.
         centred = flat - self._over_groups(flat.mean(1))
         deviation = jax.lax.rsqrt(self._over_groups(jnp.square(centred).mean(1)) + self.eps)
         y = centred * (deviation * self.gain[...]) + self.bias[...]
@@ -131,7 +132,7 @@ class ResBlock(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """One head over all positions of an image, with what goes in added: [B, H, W, C] -> the same."""
+    """One head over all positions of an image, with the input added: [B, H, W, C] -> the same shape."""
 
     def __init__(self, channels: int, groups: int):
         self.group_norm = GroupNorm(channels, groups)

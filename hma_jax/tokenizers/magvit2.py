@@ -1,6 +1,7 @@
 """The networks of the MAGVIT2 tokenizer: images to latents whose signs are the bits, and back.
 
-Those of 1X, and of Open-MAGVIT2 before its decoder got adaptive normalisation. Reference appendix A. NHWC throughout.
+The networks are those of 1X, and of Open-MAGVIT2 before its decoder had adaptive normalisation. Reference appendix A.
+NHWC throughout.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ class Down(nnx.Module):
 
 
 class Upsample(nnx.Module):
-    """[B, H, W, C] -> [B, 2H, 2W, C]: four times the channels, the position among the four first."""
+    """[B, H, W, C] -> [B, 2H, 2W, C]: a convolution makes four times the channels, ordered by position first, then by
+    channel."""
 
     def __init__(self, channels: int):
         self.conv1 = Conv(channels, 4 * channels)
@@ -96,7 +98,7 @@ class Decoder(nnx.Module):
         self.dtype = config.compute_dtype
         self.conv_in = Conv(config.bits, widths[-1])
         self.mid_block = _blocks(config, widths[-1], widths[-1])
-        # As the encoder's, levels count from the image inwards; they are passed from the last on.
+        # As in the encoder, levels are counted from the image inwards; they are applied in reverse order.
         self.up = nnx.List(
             [Up(config, c_in, c_out, last=i == 0) for i, (c_in, c_out) in enumerate(zip(inputs, widths, strict=True))]
         )
@@ -111,7 +113,7 @@ class Decoder(nnx.Module):
 
 
 class Magvit2(nnx.Module):
-    """Both, in one parameter tree."""
+    """Encoder and decoder in one parameter tree."""
 
     def __init__(self, config: Magvit2Config):
         self.encoder = Encoder(config)

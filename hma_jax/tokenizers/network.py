@@ -1,8 +1,8 @@
 """The convolutional encoder and decoder around the latents. NHWC, no batch statistics.
 
-The encoder is one convolution with the stride of a token and 1x1 layers after it: a token
-depends on its own patch of the image alone. So a patch in which nothing moves keeps its token,
-whatever happens beside it, and a world model can copy it. Only the decoder looks around.
+The encoder is one convolution with the stride of a token, followed by 1x1 layers, so a token depends only on its own
+patch of the image. A patch in which nothing moves therefore keeps its token, whatever happens beside it, and a world
+model can copy it. Only the decoder sees beyond a patch.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from hma_jax.model.params import bias, normal, ones, param
 class Conv(nnx.Module):
     """A stride-1 convolution with bias, "same" padding: [B, H, W, c_in] -> [B, H, W, c_out].
 
-    Written as one matrix product over shifted copies: XLA's gradient of a convolution is many
-    times slower on CPUs, and on accelerators both become the same product.
+    Written as one matrix product over shifted copies: XLA's gradient of a convolution is many times slower on CPUs,
+    while on accelerators both become the same product.
     """
 
     def __init__(self, c_in: int, c_out: int, size: int = 1, gain: float = 1.0):
@@ -43,7 +43,7 @@ class Conv(nnx.Module):
 
 
 class Norm(nnx.Module):
-    """RMS norm over channels, each position by itself."""
+    """RMS norm over channels, separately at each position."""
 
     def __init__(self, channels: int):
         self.gain = param((channels,), ("C_in",), ones, role="vector", decay=False)
@@ -79,8 +79,8 @@ class Encoder(nnx.Module):
         x = self.stem(rearrange(images, "b (h p) (w q) c -> b h w (p q c)", p=self.patch, q=self.patch))
         for block in self.blocks:
             x = block(x)
-        # Bounded: an unbounded latent far from zero would hardly ever change its sign, and one that
-        # is not quantised would outgrow the noise it is trained with.
+        # Bounded: an unbounded latent far from zero would hardly ever change its sign, and one that is not quantised
+        # would outgrow the noise with which it is trained.
         return rearrange(jnp.tanh(self.head(self.norm(x))), "b h w c -> b (h w) c")
 
 

@@ -1,7 +1,7 @@
 """No tokenizer at all: tokens are the pixels themselves, patch by patch.
 
-Store, model and decoding are the same as for latents. Nothing is lost: the way back ends at the
-pixels it began with, also from float16, as the token store keeps latents.
+Store, model and decoding are the same as for latents. Nothing is lost: decoding gives the original pixels, even from
+float16, in which the token store keeps latents.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from hma_jax.tokenizers.network import from_pixels, to_pixels
 
 
 class PixelTokenizer(Tokenizer):
-    """Tokens are float32 [B, S, 3 patch^2]: a patch row by row, each pixel's channels together."""
+    """Tokens are float32 [B, S, 3 patch^2]: a patch is flattened row by row, with the channels of each pixel
+    together."""
 
     kind = "pixels"
     config_class = PixelsConfig

@@ -1,7 +1,7 @@
-"""The tokenizers that others trained, behind the interface of our own.
+"""Tokenizers that others trained, with the same interface as our own.
 
-`Magvit2Tokenizer` makes the ids, `SvdVaeTokenizer` the latents that released HMA models were trained
-on. Reading their weights from the files they are published in is `convert.pretrained`'s business.
+`Magvit2Tokenizer` makes the ids, and `SvdVaeTokenizer` the latents, on which released HMA models were trained.
+`convert.pretrained` reads their weights from the published files.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
 from hma_jax.tokenizers.svd_vae import SvdVae
 
 LATENT_LIMIT = 25.0
-"""What unscaled latents are clipped to before they are decoded, as in the release."""
+"""The limit to which unscaled latents are clipped before they are decoded, as in the release."""
 
 
 class Magvit2Tokenizer(Tokenizer):

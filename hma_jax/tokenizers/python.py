@@ -1,8 +1,8 @@
-"""Tokenizers of the user's own Python code: a folder with `tokenizer.py`, whose `make_tokenizer(folder)` makes one.
+"""Tokenizers from the user's own Python code: a folder with `tokenizer.py`, whose `make_tokenizer(folder)` returns one.
 
-What it makes says what its tokens are, encodes and decodes (docs/own_data.md). With `params` it computes in JAX and
-becomes a part of compiled programs. Otherwise it computes on the host, with NumPy or PyTorch say, and compiled programs
-call it there. A change in any file of the folder makes it another tokenizer.
+The returned object states what its tokens are, and encodes and decodes (docs/own_data.md). If it has `params`, it
+computes in JAX and becomes a part of compiled programs. Otherwise it computes on the host, with NumPy or PyTorch say,
+and compiled programs call it there. A change in any file of the folder makes it a different tokenizer.
 """
 
 from __future__ import annotations
@@ -36,27 +36,29 @@ from hma_jax.tokenizers.base import Tokenizer, fitting_piece, in_pieces
 FILE, FUNCTION = "tokenizer.py", "make_tokenizer"
 PAGE = 'docs/own_data.md, "Your own tokenizer"'
 FACTS = ("image_size", "grid", "vocab_size", "factors", "channels")
-"""What an object may say of its tokens: the fields of `PythonConfig`, by its attributes."""
+"""The attributes with which an object describes its tokens: the fields of `PythonConfig`."""
 
 NEIGHBOURS = 0.01
-"""Tokens, of all, that may depend on the other images of a batch: rounding turns an id that is all but another one."""
+"""The share of tokens that may depend on the other images of a batch, because rounding can change an id that is close
+to another one."""
 
 GREY_LEVELS = 1.0
-"""By which, in the mean, an image may depend on how many are decoded: other sums of a network in bfloat16, say."""
+"""The mean difference that the number of decoded images may make to an image, because a network in bfloat16, say, then
+sums in another order."""
 
 log = logging.getLogger(__name__)
 
 
 class PythonTokenizer(Tokenizer):
-    """Tokens are what the code makes of an image: ids, int32 [B, S], or latents, float32 [B, S, C]."""
+    """Tokens are what the code returns for an image: ids, int32 [B, S], or latents, float32 [B, S, C]."""
 
     kind = "python"
     config_class = PythonConfig
 
     def __init__(self, config: PythonConfig | None, folder: Path, *, piece: int | None = None):
-        """Runs the code of `folder`. `config` is what it must say of its tokens; None: whatever it says.
+        """Runs the code of `folder`. `config` is how it must describe its tokens; None: any description.
 
-        Raises ConfigError if there is no such code, if it fails, and for facts that are missing or wrong.
+        Raises ConfigError if there is no such code, if it fails, or if its description is incomplete or wrong.
         """
         self.folder, self._file, self._lock = Path(folder), Path(folder) / FILE, threading.Lock()
         self._hash = hash_folder(self.folder)
@@ -91,14 +93,14 @@ class PythonTokenizer(Tokenizer):
     @classmethod
     def declare(cls, config: PythonConfig) -> Declared:
         del config
-        return declare(nnx.Module)  # its parameters are its own affair
+        return declare(nnx.Module)  # its parameters are not declared
 
     @cached_property
     def identity(self) -> str:
         return _identity(self.config, self._hash)
 
     def encode(self, images: np.ndarray) -> np.ndarray:
-        """As `Tokenizer.encode`. Raises ConfigError for what are no tokens."""
+        """As `Tokenizer.encode`. Raises ConfigError if the code returns values that are not tokens."""
         tokens = super().encode(images)
         self._require_encoded(tokens)
         return tokens
@@ -121,7 +123,7 @@ class PythonTokenizer(Tokenizer):
         return jnp.clip(self._checked_images(images, len(tokens)).astype(jnp.float32), 0, 255)
 
     def decode_alone(self, tokens: np.ndarray) -> np.ndarray:
-        """Tokens [S] or [S, C] of one image -> uint8 [H, W, 3]: not padded to a piece, as a simulator decodes."""
+        """Tokens [S] or [S, C] of one image -> uint8 [H, W, 3]; not padded to a piece, as when a simulator decodes."""
         return np.asarray(self._decode(self._device_params, np.stack([tokens] * self._mesh.size)))[0]
 
     # --- On the host -------------------------------------------------------------------------
@@ -156,8 +158,8 @@ class PythonTokenizer(Tokenizer):
         self.require_tokens(tokens, f"{self._file}: encode", f" ({PAGE})")
 
     def _rounded(self, images: np.ndarray, tokens: np.ndarray) -> np.ndarray:
-        """uint8. ConfigError for images that are not finite, unless their tokens are not either: a model made those,
-        and whoever has them says so."""
+        """Images as uint8. Raises ConfigError for images that are not finite, unless their tokens are not finite
+        either: a model made those, and the caller reports them."""
         if images.dtype == np.uint8:
             return images
         wrong = ~np.isfinite(images).all((1, 2, 3)) & np.isfinite(tokens).reshape(len(tokens), -1).all(1)
@@ -185,10 +187,10 @@ class PythonTokenizer(Tokenizer):
 def _call_host(
     function: Callable[[np.ndarray], np.ndarray], described: jax.ShapeDtypeStruct, x: jax.Array
 ) -> jax.Array:
-    """What `function` makes of `x`, as `described`, in a compiled program.
+    """`function(x)`, of the shape and type `described`, inside a compiled program.
 
-    On CPUs `pure_callback` can wait forever where a process has a single core: it copies a large `x` on the thread that
-    it keeps busy. A buffer is read in place.
+    On CPUs `pure_callback` can wait for ever in a process with a single core, because it copies a large `x` on the
+    thread that it blocks. A buffer is read in place.
     """
 
     def on_host(x: Any) -> np.ndarray:
@@ -205,9 +207,9 @@ def _call_host(
 
 
 def try_out(tokenizer: PythonTokenizer) -> None:
-    """Encodes and decodes a few images: of noise, a black and a white one. Raises ConfigError for results of another
-    shape, type or range than the code says, for black images, and if an image's tokens, or what is decoded from them,
-    depend on the images beside it."""
+    """Encodes and decodes a few images: noise, a black and a white one. Raises ConfigError for results whose shape,
+    type or range is not as described, for decoded images that are all black, and if an image's tokens, or the image
+    decoded from them, depend on the images beside it."""
     file, images = tokenizer.folder / FILE, np.zeros((5, *tokenizer.image_shape, 3), np.uint8)
     images[:3] = np.random.default_rng(0).integers(0, 256, images[:3].shape, np.uint8)
     images[4] = 255
@@ -215,29 +217,29 @@ def try_out(tokenizer: PythonTokenizer) -> None:
     other = (np.abs(together[1:2] - alone.astype(np.float64)) > 1e-2 * np.abs(alone)).mean()
     require(
         other <= NEIGHBOURS,
-        f"{file}: an image beside others has other tokens ({other:.0%} of them) than alone; encode must be "
-        "deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
+        f"{file}: an image encoded beside others has different tokens ({other:.0%} of them) than alone; encode must "
+        "be deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
     )
     decoded = tokenizer.decode(together)
     require(
         decoded.max() > 1,
-        f"{file}: decode makes black images of noise; floats must be in 0..255 (not in 0..1 or -1..1) ({PAGE})",
+        f"{file}: decode turns noise into black images; floats must be in 0..255 (not in 0..1 or -1..1) ({PAGE})",
     )
     apart = np.abs(decoded[1].astype(np.float64) - tokenizer.decode_alone(together[1])).mean()
     require(
         apart <= GREY_LEVELS,
-        f"{file}: an image decoded beside others is another one (by {apart:.1f} grey levels) than alone; decode must be "
-        "deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
+        f"{file}: an image decoded beside others differs (by {apart:.1f} grey levels) from the same one decoded alone; "
+        "decode must be deterministic, and normalise nothing over a batch (PyTorch: call eval() on the network)",
     )
 
 
 def _plain(value: Any) -> Any:
-    """NumPy's numbers as Python's: of `np.prod(levels)`, say."""
+    """A NumPy number, such as `np.prod(levels)`, as a Python number; other values unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 def folder_identity(config: PythonConfig, folder: Path) -> str:
-    """The identity of a tokenizer of these files that says `config` of itself; none of its code is run."""
+    """The identity of a tokenizer with these files that describes itself as `config`; its code is not run."""
     return _identity(config, hash_folder(folder))
 
 
@@ -247,7 +249,8 @@ def _identity(config: PythonConfig, files: str) -> str:
 
 
 def hash_folder(folder: Path) -> str:
-    """Over the names and bytes of all files of a tokenizer's folder. Raises ConfigError if it has no tokenizer.py."""
+    """A hash of the names and bytes of all files of a tokenizer's folder. Raises ConfigError if it has no
+    tokenizer.py."""
     digest = hashlib.sha256()
     for name in _files(folder):
         with (folder / name).open("rb") as file:
@@ -256,7 +259,7 @@ def hash_folder(folder: Path) -> str:
 
 
 def copy_folder(folder: Path, to: Path) -> None:
-    """Copies all files of a tokenizer's folder, in place of what is there."""
+    """Copies all files of a tokenizer's folder to `to`, replacing what is there."""
     if to.resolve() == folder.resolve():
         return
     shutil.rmtree(to, ignore_errors=True)
@@ -266,7 +269,7 @@ def copy_folder(folder: Path, to: Path) -> None:
 
 
 def _files(folder: Path) -> list[str]:
-    """The files of a folder, by their paths in it; without hidden ones and Python's bytecode."""
+    """The paths, within a folder, of its files, without hidden ones and Python's bytecode."""
     require(
         (folder / FILE).is_file(),
         f"{folder / FILE}: no such file; a tokenizer of your own is a folder with {FILE}, which has a function "
@@ -287,8 +290,8 @@ def _files(folder: Path) -> list[str]:
 
 
 def _run(folder: Path, files: str) -> Any:
-    """`make_tokenizer` of tokenizer.py, which is run as a package of its own: other files of the folder are
-    `from .network import Network` there, and are not confused with those of another tokenizer."""
+    """`make_tokenizer` from tokenizer.py, which is run as a package of its own. It can import other files of the
+    folder, as in `from .network import Network`, and these are not confused with those of another tokenizer."""
     path, name = folder / FILE, f"own_tokenizer_{files[:16]}"
     _say(path)
     for known in [known for known in sys.modules if known == name or known.startswith(name + ".")]:
@@ -310,7 +313,7 @@ def _say(path: Path) -> None:
 
 @contextmanager
 def _no_bytecode() -> Iterator[None]:
-    """Python writes no bytecode into the folder."""
+    """Prevents Python from writing bytecode into the folder."""
     before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         yield

@@ -1,11 +1,11 @@
 """Lookup-free quantisation: a token is the signs of its latent channels.
 
-Owns the arithmetic between latents, bits and token ids, and the regularisers of the latents.
-It has no parameters and knows no images.
+This module has the arithmetic between latents, bits and token ids, and the regularisers of the latents. It has no
+parameters and does not deal with images.
 
-Conventions, those of the official tokenizer: bit k of an id is channel k (channel 0 is the
-lowest), bit = 1 where the channel is positive, the code value of a bit is 2 bit - 1. Factor 0
-of an id is its low bits / factors bits.
+The conventions are those of the official tokenizer: bit k of an id is channel k (channel 0 is the lowest bit), a bit is
+1 where the channel is positive, and the code value of a bit is 2 bit - 1. Factor 0 of an id is its low bits / factors
+bits.
 
 Reference: Yu et al. 2023, "Language Model Beats Diffusion: Tokenizer is Key to Visual
 Generation", section 3.1.
@@ -40,7 +40,7 @@ def quantize(z: jax.Array) -> jax.Array:
 
 
 def commitment(z: jax.Array) -> jax.Array:
-    """Mean squared distance of latents to their own code: holds them near +-1."""
+    """Mean squared distance of latents from their own code; as a loss it keeps them near +-1."""
     return jnp.mean((z - nearest_code(z)) ** 2)
 
 
@@ -49,9 +49,9 @@ def entropies(z: jax.Array, factors: int, temperature: float) -> tuple[jax.Array
 
     A code c of a factor is assigned softly, p(c | z) ~ exp(-|z - c|^2 / temperature). Because
     codes are all sign patterns, p is a product over the channels. `uncertainty` is the
-    mean entropy of p(. | z): low when every latent is close to its code. `diversity` is the entropy of
-    p(.) averaged over all positions of the batch, jointly over the codes of a factor: high
-    when all codes are used equally. The bonus is uncertainty - diversity, to be minimised.
+    mean entropy of p(. | z): low when every latent is close to its code. `diversity` is the entropy of p(.) averaged
+    over all positions of the batch, jointly over the codes of a factor: high when all codes are used equally. The loss
+    term to be minimised is uncertainty - diversity.
     """
     z = z.reshape(-1, factors, z.shape[-1] // factors)  # [n, Q, bits per factor]
     # |z + 1|^2 - |z - 1|^2 = 4 z is the log odds of the bit.

@@ -1,9 +1,9 @@
 """The networks of Stable Video Diffusion's VAE: images to a Gaussian over latents, latents to clips.
 
-The encoder sees single images. The decoder mixes the frames of a clip: after every residual block
-over space comes one over time, and a learned number weighs the two. Tokens of HMA models, released ones
-too, are decoded as clips of one frame; longer clips show that the network is the original's. Source: the
-diffusers library's AutoencoderKLTemporalDecoder.
+The encoder sees single images. The decoder mixes the frames of a clip: every residual block over space is followed by
+one over time, and a learned number weighs the two. Tokens of HMA models, including released ones, are decoded as clips
+of one frame; longer clips are used to check that the network equals the original. Source: the diffusers library's
+AutoencoderKLTemporalDecoder.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _block(config: SvdVaeConfig, c_in: int, c_out: int) -> ResBlock:
 
 
 class Downsample(nnx.Module):
-    """Half the size; padded below and on the right only."""
+    """Halves the size; pads only below and on the right."""
 
     def __init__(self, channels: int):
         self.conv = Conv(channels, channels, stride=2, padding=(0, 1))
@@ -114,8 +114,8 @@ class SpaceTimeBlock(nnx.Module):
 
 
 class TimeMidBlock(nnx.Module):
-    """As released: attention comes once, after the first block, and blocks beyond the second are never
-    reached (the published decoder has two)."""
+    """As released: attention comes once, after the first block, and blocks beyond the second are never used (the
+    published decoder has two)."""
 
     def __init__(self, config: SvdVaeConfig, channels: int):
         self.resnets = nnx.List([SpaceTimeBlock(config, channels, channels) for _ in range(config.layers)])
@@ -179,7 +179,7 @@ class Decoder(nnx.Module):
 
 
 def _by_frame(function: Callable[[jax.Array], jax.Array], clips: jax.Array) -> jax.Array:
-    """`function` of images, over the frames of [B, T, ...] each by itself."""
+    """Applies `function`, which takes images, to each frame of clips [B, T, ...] separately."""
     out = function(clips.reshape(-1, *clips.shape[2:]))
     return out.reshape(*clips.shape[:2], *out.shape[1:])
 
@@ -188,7 +188,7 @@ def _by_frame(function: Callable[[jax.Array], jax.Array], clips: jax.Array) -> j
 
 
 class VideoDecoder(nnx.Module):
-    """The half that decodes; a parameter tree of its own where there is no encoder."""
+    """The decoder; it has a parameter tree of its own where there is no encoder."""
 
     def __init__(self, config: SvdVaeConfig):
         self.decoder = Decoder(config)
@@ -197,7 +197,7 @@ class VideoDecoder(nnx.Module):
     def decode(self, latents: jax.Array, frames: int = 1) -> jax.Array:
         """Unscaled latents [B, h, w, c] -> float32 [B, f h, f w, 3], about -1..1.
 
-        Every `frames` consecutive entries of the batch are a clip.
+        Each group of `frames` consecutive entries of the batch is a clip.
         """
         clips = latents.astype(self.dtype).reshape(-1, frames, *latents.shape[1:])
         images = self.decoder(clips).astype(jnp.float32)

@@ -1,6 +1,6 @@
-"""Training the tokenizer: its loss and step, run by the project's one training loop.
+"""Training the tokenizer: its loss and step, which the project's one training loop runs.
 
-Where the images come from is the caller's business.
+The caller provides the images.
 """
 
 from __future__ import annotations
@@ -43,11 +43,12 @@ def train_tokenizer(
     progress: Progress | None = None,
     records: Records = lambda index: (),
 ) -> AutoencoderTokenizer:
-    """Trains, or goes on training, in `run_dir`; saves the tokenizer there and returns it.
+    """Trains, or continues training, in `run_dir`; saves the tokenizer there and returns it.
 
     `make_batches(start)` yields uint8 images [B, image_size, image_size, 3] from step `start`
     on; `provenance` says where they come from, `records` what a batch is made of. Raises DivergedError, Interrupted,
-    CheckpointError when `run_dir` holds a run of another configuration or other images, and ConfigError for others.
+    CheckpointError if `run_dir` holds a run with another configuration or other images, and ConfigError for images of
+    another shape or type.
     """
     declared = declare_tokenizer(config)
     optimizer = make_optimizer(train, declared)
@@ -92,7 +93,7 @@ def _modernise(described: dict[str, Any]) -> dict[str, Any]:
 
 
 def make_optimizer(train: TokenizerTrainConfig, declared: Declared) -> optax.GradientTransformation:
-    """AdamW, clipped, with linear warm-up and a cosine down to `final_fraction`."""
+    """AdamW with gradient clipping, a linear warm-up and a cosine decay to `final_fraction`."""
     rate = train.learning_rate
     # A run shorter than its warm-up still reaches the end of its cosine.
     warmup = min(train.warmup_steps, train.steps // 2)
@@ -107,8 +108,8 @@ def make_optimizer(train: TokenizerTrainConfig, declared: Declared) -> optax.Gra
 def tokenizer_loss(
     declared: Declared, params: Params, images: jax.Array, config: TokenizerConfig, key: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """(loss, metrics) of images [B, H, W, 3] in 0..255: squared error of what comes back through
-    quantised or noisy latents, plus the quantiser's terms. `key` is for the noise."""
+    """(loss, metrics) of images [B, H, W, 3] in 0..255: squared error of the images decoded from quantised or noisy
+    latents, plus the quantiser's terms. `key` is for the noise."""
     model = declared.merge(params)
     target = from_pixels(images)
     z = model.encoder(target)
@@ -126,7 +127,7 @@ def tokenizer_loss(
 def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
     """(weighted sum, terms): losses that keep latents [B, S, bits] close to their codes, and all codes in use."""
     if not (config.entropy_weight or config.commitment_weight):
-        z = jax.lax.stop_gradient(z)  # they are measured only: their gradient, all zeros, is not computed
+        z = jax.lax.stop_gradient(z)  # the terms are only measured: their gradient, all zeros, is not computed
     commit = commitment(z)
     if not config.has_entropies:
         return config.commitment_weight * commit, {"commitment": commit}
@@ -137,8 +138,9 @@ def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dic
 
 @lru_cache(maxsize=4)
 def _jitted_step(make: Callable[..., Callable], config: TokenizerConfig, train: TokenizerTrainConfig) -> Callable:
-    """The step that `make` makes (`make_train_step`, or what a test put in its place, which must not meet the kept
-    one), kept for the next training of this process, which is often the same one, resumed."""
+    """The compiled step of `make`, kept for the next training in this process, which is often the same one, resumed.
+    `make` is `make_train_step`, or what a test puts in its place; it is an argument so that the two have separate cache
+    entries."""
     return jax.jit(make(config, train, declare_tokenizer(config)), donate_argnums=0)
 
 
