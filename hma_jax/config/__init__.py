@@ -1,9 +1,9 @@
 """Configuration: frozen dataclasses, validated when made. Nothing here imports JAX.
 
-A default lives here and nowhere else; named instances are `experiments.presets`. `model`, `training`,
-`tokenizer`, `fixed_tokenizers` and `evaluation` hold what determines a result, `execution` how it is
-computed; paths, clocks and verbosity belong to the code that calls. `json` reads and writes all of them.
-Finished results are named by these fields: one that is added is declared with `base.later`.
+A default lives here and nowhere else; named instances are `experiments.presets`. `model`, `training`, `tokenizer`,
+`fixed_tokenizers` and `evaluation` hold what determines a result, `execution` how it is computed. Paths, clocks and
+verbosity belong to the calling code. `json` reads and writes all of them. Finished results are named by these fields,
+so a new field must be declared with `base.later`.
 """
 
 from hma_jax.config.base import ConfigError, require

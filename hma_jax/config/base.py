@@ -15,7 +15,7 @@ BEFORE = "before"
 """The key of a field's metadata under which `later` keeps its value."""
 
 SCALARS = (bool, int, float, str)
-"""Types of a single value that are checked, as no other but configs and tuples is."""
+"""Types of single values. Besides configs and tuples, only values of these types are checked."""
 
 UNIONS = (typing.Union, types.UnionType)
 
@@ -25,9 +25,10 @@ class ConfigError(ValueError):
 
 
 def later(default: Any, *, before: Any = dataclasses.MISSING) -> Any:
-    """A field that was added after things were named by its configuration: finished trials, trained tokenizers, token
-    stores. `before` is the value that computes what was computed without the field, if that is not its default. A field
-    that has this value is part of no name (`json.identity_of`); read from a file without the field, it has it."""
+    """A field that was added after things had been named by its configuration: finished trials, trained tokenizers,
+    token stores. `before` is the value that computes what was computed without the field, if that is not its default. A
+    field with this value is part of no name (`json.identity_of`), and a configuration read from a file without the
+    field gets this value."""
     return dataclasses.field(default=default, metadata={BEFORE: default if before is dataclasses.MISSING else before})
 
 
@@ -38,8 +39,8 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_shapes(what: str, found: Mapping[str, Any], wanted: Mapping[str, tuple[int, ...]]) -> None:
-    """Raises ConfigError, which begins with `what`, unless the arrays in `found` have the shapes `wanted`; None has
-    none, and what is not an array is named by its type."""
+    """Raises ConfigError, which begins with `what`, unless the arrays in `found` have the shapes `wanted`. None has no
+    shape; anything else that is not an array is named by its type."""
     shapes = {
         name: None if array is None else getattr(array, "shape", type(array).__name__) for name, array in found.items()
     }
@@ -49,7 +50,7 @@ def require_shapes(what: str, found: Mapping[str, Any], wanted: Mapping[str, tup
 
 def require_seed(seed: int, where: str) -> None:
     """Raises ConfigError, which begins with `where`, unless `seed` is in [0, 2^32): JAX uses 32 bits of a seed, so that
-    2^32 would be the same as 0, and numpy takes no negative one."""
+    2^32 would be the same as 0, and NumPy accepts no negative seed."""
     require(0 <= seed < 2**32, f"{where} must lie in [0, 2^32), got {seed}")
 
 
@@ -63,12 +64,12 @@ def check_fields(config: Any, infinite_allowed: tuple[str, ...] = ()) -> None:
     """Raises ConfigError for a field of a dataclass whose value is not of its declared type (`as_declared`), and for a
     number that is not finite. Fields in `infinite_allowed` may be infinite: no limit.
 
-    A list is replaced by a tuple: configurations are hashed, as keys of compiled programs. A number of NumPy is
-    replaced by Python's, which JSON has."""
+    A list is replaced by a tuple, because configurations are hashed, as keys of compiled programs. A NumPy number is
+    replaced by a Python number, which JSON can hold."""
     where = type(config).__name__
     for name, hint in hints_of(type(config)).items():
         value = getattr(config, name)
-        if type(value) is not hint:  # of most it is
+        if type(value) is not hint:  # usually it is
             value = as_declared(hint, value, f"{where}.{name}", _as_made)
             object.__setattr__(config, name, value)
         finite = (
@@ -77,7 +78,7 @@ def check_fields(config: Any, infinite_allowed: tuple[str, ...] = ()) -> None:
         require(finite, f"{where}.{name} must be finite, got {value}")
 
 
-@functools.cache  # by class; thousands are made and read
+@functools.cache  # cached by class: thousands of configs are made and read
 def hints_of(cls: type) -> dict[str, Any]:
     """The types of a dataclass's fields, by their names."""
     hints = typing.get_type_hints(cls)
@@ -85,9 +86,9 @@ def hints_of(cls: type) -> dict[str, Any]:
 
 
 def as_declared(hint: Any, value: Any, where: str, plain: Callable[[Any, Any, str], Any]) -> Any:
-    """`value` for a field of type `hint`: a choice of a Literal, a tuple (from a list too), of a union the member that
-    `value` looks like. Of other types it is what `plain(hint, value, where)` returns. Raises ConfigError, which begins
-    with `where`."""
+    """`value` for a field of type `hint`: one of the choices of a Literal, a tuple (also made from a list), or, for a
+    union, the member that `value` looks like. For other types it is what `plain(hint, value, where)` returns. Raises
+    ConfigError, which begins with `where`."""
     if choices := _choices(hint):
         require_choice(value, choices, where)
         return value
@@ -108,12 +109,12 @@ def as_declared(hint: Any, value: Any, where: str, plain: Callable[[Any, Any, st
 
 
 def as_scalar(hint: type, value: Any, where: str) -> Any:
-    """`value` for a field of one of the types `SCALARS`. A number of NumPy becomes Python's, and 1000.0 becomes 1000
-    where `hint` is int; 1 stays 1 where it is float. Raises ConfigError, which begins with `where`, for all else: no
-    bool is a number, and no number a bool."""
+    """`value` for a field of one of the types `SCALARS`. A NumPy number becomes a Python number. 1000.0 becomes 1000
+    where `hint` is int; 1 stays 1 where `hint` is float. Raises ConfigError, which begins with `where`, for everything
+    else: a bool is not a number, and a number is not a bool."""
     given = value
     if getattr(value, "shape", None) == ():
-        value = value.item()  # of NumPy, or an array of one number
+        value = value.item()  # a NumPy number, or an array of one number
     if hint is int and isinstance(value, float) and value.is_integer():
         value = int(value)
     kinds = (int, float) if hint is float else hint
@@ -134,9 +135,9 @@ def _as_made(hint: Any, value: Any, where: str) -> Any:
 
 
 def _member(options: list[Any], value: Any, where: str) -> Any:
-    """The member of a union that `value` is meant for: the tuple if it is a list, its class, or among configs the one
-    with the same `kind`; else the first."""
-    if len(options) == 1:  # which may be one that `isinstance` refuses, as Any
+    """The member of a union that `value` is meant for: the tuple if it is a list, its own class, or, among configs, the
+    one with the same `kind`; otherwise the first member."""
+    if len(options) == 1:  # it may be one that `isinstance` refuses, such as Any
         return options[0]
     for option in options:
         kinds = (list, tuple) if typing.get_origin(option) is tuple else option

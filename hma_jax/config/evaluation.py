@@ -11,17 +11,16 @@ from hma_jax.config.model import ModelConfig
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
 
 SMALLEST_LPIPS_IMAGE = 31
-"""Pixels along a side of which the last layers of LPIPS's network still see one position."""
+"""Side, in pixels, of the smallest image for which the last layers of LPIPS's network still have one position."""
 
 
 @dataclass(frozen=True)
 class SamplerConfig:
     """How clean vectors are drawn (`diffusion.sample`).
 
-    `ddpm` is ancestral sampling, as released; `ddim` (eta 0), as the paper states, draws nothing
-    after the initial noise. `dpm++`, DPM-Solver++(2M) (Lu et al. 2022), needs the fewest steps for
-    the spread that samples should have. `temperature` multiplies noise; 0 leaves what the condition
-    implies.
+    `ddpm` is ancestral sampling, as released; `ddim` (eta 0), as the paper states, draws nothing after the initial
+    noise. `dpm++`, DPM-Solver++(2M) (Lu et al. 2022), needs the fewest steps to give samples the right spread.
+    `temperature` multiplies the noise; at 0 only what the condition implies is left.
     """
 
     kind: SamplerKind = "ddpm"  # sampler of the diffusion heads
@@ -60,8 +59,8 @@ class DecodeConfig:
     """How a masked frame is filled (`decoding`).
 
     `temperature` divides the logits of discrete tokens; 0 takes the most likely entry of each
-    factor. DIFFERS: the release divides probabilities, which a renormalising draw ignores
-    (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
+    factor. DIFFERS: the release divides probabilities by it, which has no effect, since drawing renormalises them
+    (reference section 3.2). Continuous tokens use the `sampler` and its temperature.
     """
 
     unmask_steps: int = 2  # M: unmasking steps per frame
@@ -114,7 +113,7 @@ class EvalConfig:
 
     @property
     def first_predicted(self) -> int:
-        """The first frame of a window that is compared."""
+        """The first frame of a window that is compared with the recorded one."""
         return self.prompt_frames if self.context == "generated" else 1
 
     def check_images(self, shape: tuple[int, int]) -> None:
@@ -127,7 +126,7 @@ class EvalConfig:
 
 
 def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:
-    """Raises ConfigError for a way of filling frames that tokens of `model` do not have."""
+    """Raises ConfigError for a way of filling frames that does not exist for the tokens of `model`."""
     if model.diffusion is None:
         require(
             decode.top_k <= model.factor_vocab,

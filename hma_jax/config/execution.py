@@ -1,6 +1,6 @@
-"""How a program is executed: recorded with a run, but no part of its identity.
+"""How a program is executed: recorded with a run, but not part of its identity.
 
-A run may be resumed with any other execution (`training.train`); results differ by rounding at most.
+A run may be resumed with any other execution (`training.train`); results differ at most by rounding.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hma_jax.config.base import check_fields, require
 Dtype = Literal["float32", "bfloat16"]
 
 MAX_THREADS = 1024
-"""Threads that read windows, at most: a system starts only some thousands, and a program that asks for more hangs."""
+"""The most threads that may read windows. A system starts only a few thousand; a program that asks for more hangs."""
 
 Remat = Literal["none", "products", "attention", "everything", "offload"]
 """What a block of the trunk or a diffusion head keeps for its backward pass; what it does not keep is computed again.
@@ -25,7 +25,7 @@ Remat = Literal["none", "products", "attention", "everything", "offload"]
     everything  the block's input alone
     offload     the block's input alone, in the trunk in the memory of the host
 
-On CPUs diffusion heads keep everything: XLA merges their second computation with the first.
+On CPUs diffusion heads keep everything, because XLA merges their second computation with the first.
 """
 
 Attention = Literal["auto", "plain", "cpu", "cudnn", "splash"]

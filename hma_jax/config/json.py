@@ -1,7 +1,7 @@
 """Configs as JSON, both ways, with a stable hash and a readable difference.
 
-Works on any frozen dataclass of scalars, tuples and further such dataclasses (see `config`):
-nothing here knows a field by name.
+It works on any frozen dataclass of scalars, tuples and other such dataclasses (see `config`): no field is known here by
+name.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ def to_dict(config: Any) -> Any:
 
 
 def identity_of(config: Any, named: Collection[str] = ()) -> Any:
-    """What `config` is called and compared by: `to_dict` without the fields that came later (`base.later`) where they
-    have the value that computes what was computed before. Equal for equal results, whatever fields are added. Fields
-    `named` stay with any value, as in names that earlier versions gave."""
+    """What names `config` and what it is compared by: `to_dict` without the later fields (`base.later`) that have the
+    value which computes what was computed before. It is equal for equal results, whatever fields are added. The fields
+    in `named` stay whatever their value, as in names that earlier versions gave."""
     return _plain(config, named)
 
 
 def _plain(config: Any, named: Collection[str] | None = None) -> Any:
-    """`named` None: with all fields."""
+    """`to_dict` where `named` is None, otherwise `identity_of`."""
     if config is None or isinstance(config, (str, int, float)):  # most of what there is
         return config
     if dataclasses.is_dataclass(config):
@@ -48,8 +48,8 @@ def _plain(config: Any, named: Collection[str] | None = None) -> Any:
 
 
 def completed(values: Any, like: Any) -> Any:
-    """`values`, as any version wrote them of a config such as `like` or of a dict with some, with the fields that came
-    later (`base.later`) and are missing: they have the value from before. Comparable with `to_dict(like)`."""
+    """`values`, as any version wrote them for a config such as `like` or for a dict that holds some, with the missing
+    later fields (`base.later`) added: they get the value from before. Comparable with `to_dict(like)`."""
     before = {}
     if dataclasses.is_dataclass(like):
         before = {f.name: to_dict(f.metadata[BEFORE]) for f in dataclasses.fields(like) if BEFORE in f.metadata}
@@ -60,11 +60,11 @@ def completed(values: Any, like: Any) -> Any:
 
 
 def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
-    """A `cls` from `to_dict`'s output, of an earlier version too, or from `identity_of`'s: a missing field that came
-    later (`base.later`) has the value from before, any other its default.
+    """A `cls` from the output of `to_dict`, also of an earlier version's, or of `identity_of`. A missing later field
+    (`base.later`) gets the value from before, any other missing field its default.
 
-    Unknown keys, missing ones without a default, values of the wrong kind and choices that are not on offer raise
-    ConfigError naming the field.
+    Unknown keys, missing ones without a default, values of the wrong kind and unknown choices raise ConfigError, which
+    names the field.
     """
     hints = hints_of(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}
@@ -91,7 +91,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 
 
 def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Every value of `to_dict`'s output that is no nested config, by its dotted path."""
+    """Every value in the output of `to_dict` that is not itself a nested config, by its dotted path."""
     found = {}
     for name, value in values.items():
         found |= leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
@@ -103,20 +103,21 @@ def to_json(config: Any) -> str:
 
 
 def to_strict_json(values: Any) -> str:
-    """For any program: null for the numbers that are not finite, which JSON does not have."""
+    """JSON that any program can read: numbers that are not finite, which JSON does not have, are null."""
     return json.dumps(json.loads(json.dumps(values), parse_constant=lambda _: None), indent=1)
 
 
 def to_plain_json(values: Any) -> str:
-    """For any program, and for `from_dict` to read back: numbers that are not finite, which JSON does not have, are
-    strings, of which "Infinity" and "-Infinity" are read as numbers."""
+    """JSON that any program can read, and `from_dict` can read back: numbers that are not finite, which JSON does not
+    have, are strings. `from_dict` reads "Infinity" and "-Infinity" as numbers."""
     return json.dumps(json.loads(json.dumps(values), parse_constant=str), indent=1)
 
 
 def stable_hash(config: Any) -> str:
-    """Hex digest of the canonical JSON, of configs within it by their `identity_of`: the same on every machine, with
-    every Python version and after fields were added."""
-    # Not `identity_of` all of it: most of what is hashed is JSON already, and copying it takes longer than the rest.
+    """Hex digest of the canonical JSON, in which configs are represented by their `identity_of`: the same on every
+    machine, with every Python version, and after fields were added."""
+    # `identity_of` is not applied to the whole: most of what is hashed is JSON already, and copying it takes longer
+    # than the rest.
     canonical = json.dumps(config, sort_keys=True, separators=(",", ":"), default=_of_dataclass)
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

@@ -13,10 +13,9 @@ from hma_jax.config.base import check_fields, later, require
 class MupConfig:
     """Width transfer (paper section 3.5; practice in Tensor Programs V).
 
-    `base_width` is where the multipliers are 1. Learning rate and initial variance of hidden
-    matrices scale with base_width / D, the read-out's input with base_width / D, attention
-    logits with `attention_scale` / head width. `without` takes single ingredients away, to show
-    that each is needed.
+    `base_width` is the width at which the multipliers are 1. Learning rate and initial variance of hidden matrices
+    scale with base_width / D, the read-out's input with base_width / D, attention logits with `attention_scale` / head
+    width. `without` switches off single ingredients, to show that each is needed.
     """
 
     enabled: bool = True  # use muP: scale learning rates, initial values and logits with the width
@@ -101,11 +100,11 @@ class ModelConfig:
     # to it is then seen through temporal attention) or the one that led to it (`causal`).
     action_alignment: Literal["released", "causal"] = "released"
     action_heads: bool = True  # whether the model has heads that predict actions; forward dynamics needs none
-    # Add to the embedding of a masked token that of the token at its place in the frame before, so that the first block
-    # already sees what is to move. DIFFERS: at masked tokens the release has one learned vector alone.
+    # Add to the embedding of a masked token that of the token at the same position one frame earlier, so that the first
+    # block already sees what is to move. DIFFERS: in the release masked tokens are only one learned vector.
     recall: bool = later(False)
     # Predict a token's factors one after the other, each given those before it. DIFFERS: the release draws them as if
-    # independent, so that where two tokens are likely it may show a third, made of a piece of each.
+    # they were independent. Where two tokens are likely, it may then show a third one, made of a part of each.
     chain_factors: bool = later(False)
     mlp_ratio: float = 4.0  # width of a block's MLP, as a multiple of the trunk's
     qkv_bias: bool = False  # biases of queries, keys and values
@@ -128,7 +127,7 @@ class ModelConfig:
             self.width * self.mlp_ratio >= 1,
             f"model.mlp_ratio {self.mlp_ratio} makes the MLP of model.width {self.width} less than 1 wide; increase it",
         )
-        for name in ("trunk_gain", "stem_gain"):  # of matrices that are all zero no gradient leads away
+        for name in ("trunk_gain", "stem_gain"):  # matrices that are all zero would get no gradient
             require(getattr(self, name) > 0, f"model.{name} must be positive, got {getattr(self, name)}")
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
         require(
@@ -156,7 +155,7 @@ class ModelConfig:
 
     @property
     def block_conditioning(self) -> str | None:
-        """How actions act inside every block (`model.conditioning.IN_BLOCKS`); None: as tokens only."""
+        """How actions act inside every block (`model.conditioning.IN_BLOCKS`); None: they enter only as tokens."""
         return "+".join(way for way in self.conditioning.split("+") if way != "concat") or None
 
     @property
@@ -176,8 +175,8 @@ class ModelConfig:
 
     @property
     def position_slots(self) -> int:
-        """Position embeddings kept per frame. As released there are some for latent cells that
-        patches never reach, and for action tokens whether or not there are any."""
+        """Position embeddings kept per frame. As released, there is one for every latent cell, although patches use
+        fewer, and one for every action token, whether or not actions enter as tokens."""
         cells = self.diffusion.cells if self.diffusion else 1
         return self.tokens * cells + self.action_tokens
 
@@ -191,5 +190,5 @@ class ModelConfig:
         return self.width / self.mup.base_width if self.mup.enabled else 1.0
 
     def mup_multiplier(self, ingredient: str) -> float:
-        """m where `ingredient` of muP applies, 1 where it was taken away."""
+        """m where `ingredient` of muP applies, 1 where it is switched off."""
         return 1.0 if ingredient in self.mup.without else self.width_multiplier

@@ -1,4 +1,4 @@
-"""What all tokenizers say of their tokens; the tokenizer that is trained here, and its training."""
+"""What all tokenizers state about their tokens; the tokenizer that is trained here, and its training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ ImageSize = int | tuple[int, int]
 """Pixels along the sides of an image: one number for a square, else (height, width)."""
 
 ENTROPY_BITS = 12
-"""Bits of a factor, at most, whose entropies are computed: they take an array of all its codes for every token."""
+"""The most bits of a factor for which entropies are computed: they need an array of all its codes for every token."""
 
 
 class TokenGrid:
@@ -64,12 +64,12 @@ class TokenGrid:
 
 @dataclass(frozen=True)
 class TokenizerConfig(TokenGrid):
-    """The small convolutional tokenizer, with lookup-free quantisation or without.
+    """The small convolutional tokenizer, with or without lookup-free quantisation.
 
     An image of `image_size` x `image_size` becomes (image_size / downsample)^2 tokens. Quantised
     (`tokenizers.lfq`), a token is an id of `bits` binary channels, split evenly into `factors`
-    vocabulary factors. Otherwise (`tokenizers.continuous`) it is a vector of `bits` real
-    channels; `factors`, the entropy and the commitment then mean nothing.
+    vocabulary factors. Otherwise (`tokenizers.continuous`) it is a vector of `bits` real channels; `factors`, the
+    entropy and the commitment settings then have no effect.
     """
 
     image_size: int = 32  # side of an image in pixels
@@ -84,9 +84,9 @@ class TokenizerConfig(TokenGrid):
     entropy_temperature: float = 1.0  # temperature of the soft code assignment in the entropy loss
     commitment_weight: float = 0.0  # weight of the commitment loss: the distance of values from their codes
     # Without quantisation: standard deviation of the noise that training adds to the latents, which lie in
-    # -1..1. It makes the decoder bear the errors of a generative model: on
-    # the suite 0.1 costs 0.6 dB without errors and gains 1.7 dB where they are 0.2 (of latents
-    # scaled to 1); 0.2 costs 1.3 dB and is better only from errors of 0.3 on.
+    # -1..1. It makes the decoder tolerate the errors of a generative model: on the suite, 0.1 costs 0.6 dB without
+    # errors and gains 1.7 dB where errors are 0.2 (of latents scaled to 1); 0.2 costs 1.3 dB and is better only for
+    # errors of 0.3 or more.
     latent_noise: float = 0.1
 
     def __post_init__(self):
@@ -152,7 +152,7 @@ class TokenizerTrainConfig:
     learning_rate: float = 3e-3  # peak learning rate, after the warm-up; then a cosine schedule
     warmup_steps: int = 50  # steps in which the learning rate rises from 0
     final_fraction: float = 0.01  # learning rate at the end, as a fraction of the peak
-    weight_decay: float = 1e-4  # AdamW's weight decay, of matrices and convolution kernels
+    weight_decay: float = 1e-4  # AdamW's weight decay; applies to matrices and convolution kernels
     clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
     seed: int = 0  # random seed of initial values and order of frames
 

@@ -26,8 +26,8 @@ Matrices = Literal["adamw", "muon"]
 """Optimisers of the trunk's hidden matrices."""
 
 ActionScale = Literal["deviation", "quantiles"]
-"""What actions are measured in: standard deviations from their mean, or such that their quantiles of 1 % and
-99 % become -1 and 1."""
+"""The scale of actions: standard deviations from their mean, or the scale on which their 1 % and 99 % quantiles are -1
+and 1."""
 
 
 @dataclass(frozen=True)
@@ -41,37 +41,38 @@ class MaskingConfig:
     # Mask rate of a frame: cos(pi/2 u), with u uniform between this value and 1. DIFFERS: the release calls
     # it the minimum mask ratio, but a larger value lowers the largest rate.
     mask_angle_min: float = 0.0
-    # Lowest mask rate of a frame, in the schedule of paper section 3.5, which the release lacks; horizon_gain
+    # Lowest mask rate of a frame, in the schedule of paper section 3.5, which the release does not have; horizon_gain
     # raises it over the window. At 1 the last frame is fully masked.
     min_ratio: float = 0.0
     horizon_gain: float = 0.0  # by how much min_ratio rises from the first to the last frame of a window
-    # Continuous variant: mask whole patches or single latent cells. DIFFERS: the release masks single cells, so that
-    # patches are partly masked in training and never at inference; `cell` is as released.
+    # Continuous variant: mask whole patches or single latent cells. DIFFERS: the release masks single cells (`cell`),
+    # so that patches are partly masked in training but never at inference.
     mask_unit: Literal["patch", "cell"] = "patch"
     # Predict masked frames from the true frames before them, as in generation. DIFFERS: the release
     # masks all frames of a window in one pass, so that each is predicted from masked ones. A step passes over every
     # frame twice; docs/models.md shows when that pays.
     teacher_forcing: bool = False
-    # With teacher forcing and discrete tokens: replace past frames, up to this share of them, by frames that the model
-    # generated itself (scheduled sampling; `objective.own_past`). DIFFERS: the release corrupts the past with random
-    # tokens alone (`max_corrupt_rate`, which does so here too).
+    # With teacher forcing and discrete tokens: replace up to this share of the past frames by frames that the model
+    # generated itself (scheduled sampling; `objective.own_past`). DIFFERS: the release corrupts the past only with
+    # random tokens (`max_corrupt_rate`, which exists here too).
     own_past: float = 0.0
     # Rounds in which own_past generates frames, each from the frames of the round before; each round costs one more
     # pass over every frame per training step.
     own_past_rounds: int = later(1)
-    # With teacher forcing: probability that a rectangle of the past frames shows the contents of another place, for
-    # some frames (`objective.displaced`). DIFFERS: the release has nothing like it.
+    # With teacher forcing: probability that a rectangle of the past shows, for some frames, the contents of another
+    # place (`objective.displaced`). DIFFERS: the release has nothing like it.
     displaced_past: float = later(0.0)
     # Weight in the loss of discrete tokens that differ from the token at the same place one frame earlier; tokens that
-    # do not change, most of a video, have weight 1. DIFFERS: the release counts all alike. Effect: docs/models.md.
+    # do not change, most of a video, have weight 1. DIFFERS: the release weighs all tokens equally. Effect:
+    # docs/models.md.
     change_weight: float = later(1.0)
     max_corrupt_rate: float = 0.2  # models on ids: largest share of tokens replaced by random ones
     # Models on ids: smallest share of tokens kept in the first frame after an unmasked prompt.
     clean_rate_min: float = 0.2
     label_smoothing: float = 0.01  # models on ids: share of the target that is spread evenly over all entries
-    # Where masked actions are visible to the model: nowhere, in the blocks or everywhere. DIFFERS: the release shows
-    # them to the blocks (`conditioning`, discrete variant) or everywhere (`all`, continuous variant), so that the
-    # objective gives them away.
+    # Where hidden actions are still visible to the model: nowhere, in the blocks, or everywhere. DIFFERS: the release
+    # shows them in the blocks (`conditioning`, discrete variant) or everywhere (`all`, continuous variant), so that the
+    # model is given what it has to predict.
     action_leak: ActionLeak = "none"
 
     def __post_init__(self):
@@ -142,7 +143,7 @@ class MaskingConfig:
 
     @property
     def ignores_actions(self) -> bool:
-        """Whether frames are predicted without actions, so that none has an effect."""
+        """Whether frames are predicted without actions, so that actions have no effect."""
         return self.predicts_frames and self.hides_all_actions
 
 
@@ -161,11 +162,12 @@ class OptimizerConfig:
     beta1: float = 0.9  # AdamW: decay rate of the first moment
     beta2: float = 0.95  # AdamW: decay rate of the second moment
     epsilon: float = 1e-8  # AdamW: term added to the denominator
-    # Weight decay of all parameters but biases, as released: also of gains, position and token embeddings.
+    # Weight decay of all parameters except biases, as released: it also applies to gains and to position and token
+    # embeddings.
     weight_decay: float = 0.05
     clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
     # Optimiser of the trunk's hidden matrices: AdamW, as for all other parameters, or Muon, which orthogonalises their
-    # momentum (Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
+    # momentum (Jordan et al. 2024). DIFFERS: the release has only AdamW. What Muon gains: docs/models.md.
     matrices: Matrices = later("adamw")
 
     def __post_init__(self):
@@ -196,8 +198,9 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
     only: tuple[str, ...] = ()  # train only these robots' own parameters; []: train everything
-    # Decay of a moving average of the weights, which is kept too; 0: none. It rises to this value, which a short run
-    # does not reach: after t steps it is at most (1 + t) / (10 + t), such as 0.99 after 890 and 0.999 after 8,990.
+    # Decay rate of a moving average of the weights, which is kept beside them; 0: none. The rate rises to this value,
+    # which a short run does not reach: after t steps it is at most (1 + t) / (10 + t), such as 0.99 after 890 steps and
+    # 0.999 after 8,990.
     ema_decay: float = 0.0
     action_scale: ActionScale = "deviation"  # how actions of new robots are normalised
 
