@@ -1,7 +1,7 @@
 """Generation: whole rollouts, one frame at a time, teacher-forced passes, and policies.
 
-One way of filling a frame (`decoding`), one cache of finished frames (`cache`), three ways to the next one
-(`steps`); the rest is who asks for which frame.
+There is one way to fill a frame (`decoding`), one cache of finished frames (`cache`), and there are three ways to make
+the next frame (`steps`). The other modules decide which frames are made.
 """
 
 from hma_jax.generation.policy import predict_actions, predict_next_actions, read_actions

@@ -1,9 +1,8 @@
 """Passes over a window of T positions, with a cache of its finished frames.
 
-Spatial attention stays inside a frame and temporal attention is causal, so all that later frames need of a
-finished one is its keys and values. `Window.start` caches a prompt, `query` predicts a masked frame, and
-`extend_and_query` adds a finished one to the cache and predicts the one after it for the first time, both in one
-pass. `steps` combines them.
+Spatial attention stays inside a frame and temporal attention is causal, so later frames need only the keys and values
+of a finished one. `Window.start` caches a prompt, `query` predicts a masked frame, and `extend_and_query` adds a
+finished frame to the cache and predicts the next one for the first time, both in one pass. `steps` combines them.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class FrameCache(NamedTuple):
 
 
 class Window(NamedTuple):
-    """What all passes over the positions of a window share."""
+    """What all passes over a window have in common."""
 
     model: HMA
     actions_BTU: jax.Array  # as `HMA.align` arranges them
@@ -51,12 +50,12 @@ class Window(NamedTuple):
     def over(
         cls, model: HMA, chunks_BTU: jax.Array, action_hidden_BT: jax.Array | None, embodiment_B: jax.Array
     ) -> Window:
-        """A window of recorded chunks. Those that `action_hidden_BT` marks (None: none) are not shown to the model."""
+        """A window of recorded chunks. Chunks that `action_hidden_BT` marks (None: none) are not shown to the model."""
         shape = chunks_BTU.shape[:2]
         return cls(model, model.align(chunks_BTU), model.align_hidden(action_hidden_BT, shape), embodiment_B)
 
     def empty(self, batch: int, capacity: int) -> FrameCache:
-        """A cache without frames."""
+        """A cache that holds no frames, with `capacity` slots."""
         blank = blank_frame(self.model.config, batch)
 
         def one_frame() -> TemporalCache | None:
@@ -88,11 +87,11 @@ class Window(NamedTuple):
         slot: int | jax.Array,
         positions: jax.Array | None = None,
     ) -> tuple[FrameCache, jax.Array]:
-        """(the cache with frames `finished` [B, n, S (, C)] from `slot` on, predictions for the wholly masked frame
-        after them), in one pass.
+        """Returns (the cache with the frames `finished` [B, n, S (, C)] from `slot` on, predictions for the wholly
+        masked frame after them), computed in one pass.
 
-        The frames take the actions from `at` on, and those positions unless `positions` [n + 1] are given.
-        Without a cache they are the first of the window.
+        The frames, the masked one included, take the actions of the positions from `at` on; they also stand at these
+        positions, unless `positions` [n + 1] are given. Without a cache they are the first frames of the window.
         """
         count = finished.shape[1]
         blank = blank_frame(self.model.config, len(finished))
@@ -101,7 +100,7 @@ class Window(NamedTuple):
         if cache is None:
             out = self._pass(values, masked, at, cache_frames=count, predict_from=count)
             return FrameCache(out.cache, jnp.ones(count, bool)), out.token_outputs[:, 0]
-        # What `finished` takes the place of was still before it, but is past the masked frame's window.
+        # The frames that `finished` overwrites are in its own past, but outside the window of the masked frame.
         slots = jnp.arange(cache.capacity)
         remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
         earlier = jnp.stack([cache.valid] * count + [remaining])
@@ -119,8 +118,8 @@ class Window(NamedTuple):
         positions: jax.Array | None = None,
         **options: Any,
     ) -> Outputs:
-        """One pass over frames that take the actions from `at` on, and those positions unless `positions` are given;
-        `options` are the model's."""
+        """One pass over frames that take the actions of the positions from `at` on; they also stand at these positions,
+        unless `positions` are given. `options` are passed to the model."""
         count = values.shape[1]
         hidden = None if self.action_hidden_BT is None else cut(self.action_hidden_BT, at, count)
         return self.model(

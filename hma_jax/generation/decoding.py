@@ -1,7 +1,7 @@
-"""Filling one masked frame, step by step: the part of generation that differs between variants.
+"""Filling one masked frame, step by step: the part of generation that differs between the two variants.
 
-A frame is a `Frame`: the tokens known so far and which are still masked. Each unmasking step predicts it once, samples
-values for masked tokens and commits some of them; the rest wait for another step.
+A frame is a `Frame`: the tokens known so far, and which tokens are still masked. Each unmasking step predicts the frame
+once, samples values for masked tokens, and commits some of them; the others are sampled again in a later step.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def cosine_schedule(progress: float) -> float:
 def masked_counts(config: ModelConfig, steps: int) -> list[int]:
     """Tokens still masked after each step: cos(pi/2 (k+1)/M) S, and none after the last.
 
-    As released the discrete variant rounds up; the continuous one down, but to at least one and
-    at most S - 1 (reference sections 3.2 and 3.3). Where the share is one half the last bit decides, so
-    each multiplies in the order in which the release does.
+    As released, the discrete variant rounds up; the continuous one rounds down, but to at least 1 and at most S - 1
+    (reference sections 3.2 and 3.3). Where the share is one half, the last bit decides; so each variant multiplies in
+    the release's order.
     """
     size = config.tokens
     if config.diffusion:
@@ -69,9 +69,9 @@ def sample_tokens(
 
 
 def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_masked: int | jax.Array) -> Frame:
-    """Fills masked positions of a discrete frame but for the `still_masked` ones with the lowest score.
+    """Fills the masked positions of a discrete frame, except the `still_masked` positions with the lowest scores.
 
-    Known positions are never drawn again.
+    Known positions keep their values.
     """
     filled = jnp.where(frame.masked, sampled_BS, frame.values)
     still = frame.masked & (_ranks(jnp.where(frame.masked, score_BS, jnp.inf)) < still_masked)
@@ -79,8 +79,8 @@ def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_maske
 
 
 def choose_patches(order_BS: jax.Array, before: int, after: int) -> jax.Array:
-    """Token numbers [B, n] that a step samples: those that leave the mask when the first `before`
-    of an order become the first `after`, in ascending order."""
+    """The tokens that a step samples, as ascending indices [B, n]: the masked ones shrink from the first `before`
+    tokens of the order to the first `after`."""
     return jnp.sort(order_BS[:, after:before], axis=-1)
 
 
@@ -118,16 +118,16 @@ def _decode_tokens(
 
     counts = masked_counts(model.config, decode.unmask_steps)
     frame = fill(blank_frame(model.config, batch), token_outputs, 0, counts[0])
-    # A loop, so that one pass is compiled and not one for each of M.
+    # A loop, so that one pass is compiled, not M.
     later = jnp.arange(1, len(counts)), jnp.asarray(counts[1:], jnp.int32)
     return jax.lax.scan(unmask_step, frame, later)[0].values
 
 
 def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
-    """Patches in a random order fixed at the start, each predicted once.
+    """Samples patches in a random order that is fixed at the start, each once.
 
-    DIFFERS: the release never marks what it has predicted and samples it again in every step,
-    all of it in the last (reference section 3.3); `resample` does so too.
+    DIFFERS: the release never marks what it has predicted, and samples it again in every step, in the last step the
+    whole frame (reference section 3.3). `resample` does the same.
     """
     batch, size = z.shape[:2]
     frame = blank_frame(model.config, batch)
@@ -135,10 +135,10 @@ def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array
     before = size
     for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
         chosen = choose_patches(order, size if decode.resample else before, still_masked)
-        if not chosen.size:  # of more steps than tokens, the first few leave as many masked as the one before
+        if not chosen.size:  # with more steps than tokens, the first steps may leave as many tokens masked as before
             continue
         keys = fold_in_each(key_B, step)
-        # The denoiser, not the trunk, costs most: it sees only the patches it is asked for.
+        # The denoiser costs more than the trunk, so it is given only the chosen patches.
         new = denoise(model, jnp.take_along_axis(z, chosen[..., None], axis=1), keys, decode)
         frame = commit(frame, chosen, new)
         before = still_masked
@@ -160,6 +160,6 @@ def denoise(model: HMA, z: jax.Array, key_B: jax.Array, decode: DecodeConfig) ->
 
 
 def commit(frame: Frame, chosen_Bn: jax.Array, values_BnC: jax.Array) -> Frame:
-    """`values` written into the chosen tokens, which are known from now on."""
+    """The frame with `values_BnC` written into the chosen tokens, which are known from now on."""
     row = jnp.arange(len(chosen_Bn))[:, None]
     return Frame(frame.values.at[row, chosen_Bn].set(values_BnC), frame.masked.at[row, chosen_Bn].set(False))

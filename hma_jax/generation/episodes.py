@@ -1,7 +1,7 @@
-"""Many simulated episodes at once, each of its own length: a batch of sessions of one example.
+"""Many simulated episodes at once, each with its own length: a batch of sessions of one example each.
 
 Every array of `Episodes` has a leading axis B, so an episode may start, wait, be copied or be rewound independently of
-the others. The computation is `session`'s for one example, under `jax.vmap`.
+the others. The computation is that of `session` for one example, under `jax.vmap`.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ def start_each(
     *,
     hidden: bool = False,
 ) -> Episodes:
-    """Episodes that have seen the first `given_B` of `frames` [B, T - 1, S (, C)], with at least one each.
+    """Episodes that have seen the first `given_B` (at least 1 each) of `frames` [B, T - 1, S (, C)].
 
-    `chunks_BTU` [B, T - 2, U] are those executed between them; what stands after the given ones is arbitrary.
-    `count_B` are the frames of each episode so far: as many as given, or more where `given_B` is T - 1 and older
-    ones have left the window. `hidden`: the model is shown no action.
+    `chunks_BTU` [B, T - 2, U] are the chunks executed between the frames; frames and chunks after the given ones are
+    arbitrary. `count_B` is the number of frames of each episode so far: as many as given, or more where `given_B` is T
+    - 1 and older frames have left the window. `hidden`: the model is shown no action.
     """
 
     def one(frames: jax.Array, chunks: jax.Array, robot: jax.Array, given: jax.Array, count: jax.Array) -> Session:
         unseen = jnp.full((1, len(chunks)), hidden)
         session = start(model, frames[None], chunks[None], robot[None], action_hidden_BT=unseen)
         capacity = session.cache.capacity
-        # Attention is causal: no frame that is kept attended to the arbitrary ones after it.
+        # Attention is causal: no frame that is kept has attended to the arbitrary ones after it.
         cache = session.cache._replace(valid=jnp.arange(capacity) < given - 1)
-        # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it. Slots are the only axis of
+        # Past the window, frame j is in slot j mod (T - 1), where `steps.stream` puts it. Slots are the only axis of
         # `valid`, and the third one of all other arrays.
         cache = jax.tree.map(lambda x: jnp.roll(x, count - given, axis=0 if x.ndim == 1 else 2), cache)
         return session._replace(cache=cache, count=count)
@@ -61,9 +61,10 @@ def advance_each(
     *,
     hidden: bool = False,
 ) -> tuple[Episodes, jax.Array]:
-    """(episodes, frames [B, S (, C)]): `session.advance` for every episode, wherever in its window it stands.
+    """(episodes, frames [B, S (, C)]): `session.advance` for every episode, whether its window is full or not.
 
-    Frame t of an episode is drawn from fold_in(key, t), t being its own count. `hidden`: the model is shown no action.
+    Frame t of an episode is drawn from fold_in(key, t), where t counts the frames of that episode. `hidden`: the model
+    is shown no action.
     """
 
     def each(phase: Phase) -> tuple[Episodes, jax.Array]:
@@ -84,7 +85,8 @@ def advance_each(
     filled, slid = unless_none(filling_B, "filling"), unless_none(~filling_B, "sliding")
     new, frames = choose(filling_B, filled, slid)
     if decode.slide == "exact":
-        # Past the window no pass reads an episode's cache: all take what filling leaves, and no cache is copied.
+        # Past the window no pass reads an episode's cache, so all episodes take the caches that filling leaves, and
+        # none is copied.
         new = new._replace(cache=filled[0].cache)
     return new, frames
 
@@ -95,11 +97,11 @@ def choose(which_B: jax.Array, new: T, old: T) -> T:
 
 
 def take(episodes: Episodes, rows_B: jax.Array) -> Episodes:
-    """Episode b goes on as a copy of episode `rows_B[b]`."""
+    """Episode b continues as a copy of episode `rows_B[b]`."""
     return jax.tree.map(lambda x: jnp.take(x, rows_B, axis=0), episodes)
 
 
 def put(episodes: Episodes, rows_n: jax.Array, new: Episodes) -> Episodes:
-    """Episode `rows_n[i]` goes on as the i-th of `new`, the others as they are. A row may stand twice with equal
-    ones."""
+    """Episode `rows_n[i]` continues as the i-th of `new`; the others are unchanged. A row may occur twice if its new
+    episodes are equal."""
     return jax.tree.map(lambda whole, part: whole.at[rows_n].set(part), episodes, new)

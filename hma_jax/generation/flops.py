@@ -1,8 +1,8 @@
 """Floating-point operations of generation by formula, counted as in `hma_jax.model.flops`.
 
-A frame costs passes of the trunk, which the window's caches make few, and with latents the evaluations of the
-denoiser: one per sampler step, on every token that is drawn. For the base model with 100 steps these are nine
-tenths of a frame.
+A frame costs passes of the trunk, most of them over one frame thanks to the cache. With latents it also costs
+evaluations of the denoiser: one per sampler step, on every token that is drawn. For the base model with 100 steps these
+are nine tenths of the cost.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import denoiser_flops, pass_flops
 
 Way = Literal["fill", "slide", "stream", "recompute"]
-"""How a frame is made: as in `hma_jax.generation.steps`, or by passes over a whole window for every unmasking step."""
+"""How a frame is made: as in `hma_jax.generation.steps`, or (`recompute`) with a pass over the whole window in every
+unmasking step."""
 
 
 def frame_flops(
@@ -23,8 +24,8 @@ def frame_flops(
 ) -> float:
     """One new frame of one example.
 
-    `earlier`: finished frames before it, by default all that fit a window, T - 1. `recompute` takes a window of
-    `earlier` + 1 frames; `slide` and `stream` come where T - 1 are there.
+    `earlier`: the number of finished frames before it, by default all that fit in a window, T - 1. `recompute` passes
+    over a window of `earlier` + 1 frames; `slide` and `stream` always have T - 1 frames before.
     """
     whole, steps = config.frames, decode.unmask_steps
     earlier = whole - 1 if earlier is None else earlier
@@ -32,7 +33,7 @@ def frame_flops(
     def one(seen: int, predicted: int = 1) -> float:
         return pass_flops(config, table, 1, seen, predicted)
 
-    # A finished frame that enters the cache beside the first step is not read out.
+    # The finished frame that enters the cache in the first step is not read out.
     if way == "fill":
         trunk = one(earlier, predicted=0) + steps * one(earlier + 1)
     elif way == "stream":
@@ -47,7 +48,7 @@ def frame_flops(
 def sampler_flops(config: ModelConfig, decode: DecodeConfig) -> float:
     """The denoiser's part of one frame; 0 for ids.
 
-    Every token is drawn once or, with `resample`, again at each step after the one that unmasked it. Every kind of
+    Every token is drawn once or, with `resample`, again in each step after the one that unmasked it. Every kind of
     sampler evaluates the denoiser once per step.
     """
     if config.diffusion is None:
@@ -67,9 +68,10 @@ def rollout_flops(
     sequences: int = 1,
     naive: bool = False,
 ) -> float:
-    """`rollout` of one example from `prompt` frames to `frames` under so many action sequences, or `rollout_naive`.
+    """`rollout` of one example from `prompt` to `frames` frames under `sequences` action sequences; with `naive`,
+    `rollout_naive`.
 
-    Of a prompt longer than T - 1 only the last frames are seen, and the prompt is read once for all sequences.
+    Only the last T - 1 frames of a longer prompt are seen. The prompt is read once for all sequences.
     """
     old = max(prompt - (config.frames - 1), 0)
     frames, prompt = frames - old, prompt - old

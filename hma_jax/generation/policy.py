@@ -29,10 +29,10 @@ def predict_actions(
 ) -> jax.Array:
     """Raw chunks [B, T, U] predicted at every frame; chunks that `action_hidden_BT` marks are not shown to the model.
 
-    As a policy a frame's chunk is predicted from frames up to it and what is shown of the
-    actions; with `causally` False from the whole window (inverse dynamics), of which frames that are not
-    `real_BT` (None: all are) are no part. Padding is 0. Raises ConfigError as `next_frame_outputs`, and for a model
-    without an action head.
+    With `causally` True, as a policy, a frame's chunk is predicted from the frames up to it and the actions that are
+    shown. With False (inverse dynamics) it is predicted from the whole window, without frames where `real_BT` is False
+    (None: all are real). Padding is 0. Raises ConfigError as `next_frame_outputs`, and for a model without an action
+    head.
     """
     frames = checked_window(model, frames, actions_BTU, embodiment_B, action_hidden_BT, shortest=1, subject="actions")
     count = frames.shape[1]
@@ -51,7 +51,7 @@ def predict_next_actions(
     decode: DecodeConfig,
 ) -> jax.Array:
     """Raw chunks [B, T, U]: the policy's action at every frame of a recorded window, given the frames up to it and all
-    actions before.
+    earlier actions.
 
     One pass. With causal alignment no frame is shown its own chunk; otherwise the window is followed by a copy of
     itself whose actions are hidden, under the mask of teacher forcing. Raises ConfigError as `predict_actions`.
@@ -98,14 +98,14 @@ def read_actions(
 def _sample_actions(
     model: HMA, features_BTD: jax.Array, embodiment_B: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> jax.Array:
-    """Normalised chunks [B, T, U]. Each value has random numbers of its own: those of a robot do not depend
-    on U, which others decide."""
+    """Normalised chunks [B, T, U]. Each value has its own random numbers, so that those of a robot do not depend on U,
+    which other robots may determine."""
     config, width = model.config.diffusion, model.table.action_width
     process = sampling_process(make_process(config.steps), decode.sampler)
     shape = (*features_BTD.shape[:2], width)
     value = Tag.PER_FRAME * jnp.arange(shape[1])[:, None] + jnp.arange(width)
     keys = jax.vmap(lambda key: jax.vmap(jax.vmap(lambda n: jax.random.fold_in(key, n)))(value))(key_B)
-    # In training padding and dead dimensions are 0 also when noised.
+    # In training, padding and dead dimensions are 0 even in noised chunks.
     alive_BTU = jnp.asarray(model.table.alive())[embodiment_B][:, None]
 
     def network(x: jax.Array, t: jax.Array) -> jax.Array:

@@ -1,8 +1,9 @@
 """Whole rollouts in one compiled call, and a naive implementation that they must equal.
 
-`rollout` costs one pass over the prompt; while the window fills, M + 1 one-frame passes per new frame; when it slides,
-one window pass and M - 1 one-frame passes, where the release runs the whole window M times per frame. `rollout_naive`
-does it the release's way. How a frame is decoded is in `decoding`; everything here serves both variants.
+`rollout` costs one pass over the prompt. While the window fills, a new frame costs M + 1 passes over one frame; when
+the window slides, one pass over the window and M - 1 passes over one frame. The release makes M passes over the whole
+window for every frame, and so does `rollout_naive`. How a frame is decoded is in `decoding`; everything here serves
+both variants.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from hma_jax.model.hma import HMA
 
 
 class Sequences(NamedTuple):
-    """Action sequences of B examples in a row, R of each, and what belongs to them."""
+    """The action sequences of B examples, R of each example in a row, with their marks, robots and keys."""
 
     chunks: jax.Array  # raw [B R, T, U]
     hidden: jax.Array | None  # [B R, T]
@@ -52,15 +53,14 @@ def rollout(
 ) -> jax.Array:
     """Continues each prompt, [B, T', S] or [B, T', S, C], under R action sequences.
 
-    Returns the frames after the prompt, [B, R, frames - T', S] (or with C), for as many frames as
-    there are chunks: past the model's window of T it slides as `decode.slide` says, and of a
-    longer prompt the last T - 1 frames are seen. The sequences of one example may differ from the
-    chunk of the last prompt frame on; what comes before is read from the first sequence and
-    computed once. All R sequences use the same random numbers (a function of the example's key
-    and the frame), so that they differ by their actions alone. `action_hidden_BT` marks chunks
-    that the model is not shown: those that it was trained without (`objective.masking.hidden_at_inference`).
-    Raises ConfigError for shapes and types that do not fit the model or each other, and, where arrays are not traced,
-    for unknown ids and robots and for actions that are not finite.
+    Returns the frames after the prompt, [B, R, frames - T', S] (or with C); with the prompt there are as many frames as
+    chunks. Past T frames the window slides as `decode.slide` says; of a prompt longer than T - 1 frames only the last T
+    - 1 are seen. The sequences of one example may differ from the chunk of the last prompt frame on; everything before
+    is read from the first sequence and computed once. All R sequences use the same random numbers (a function of the
+    example's key and the frame), so that they differ only by their actions. `action_hidden_BT` marks chunks that the
+    model is not shown because it was trained without them (`objective.masking.hidden_at_inference`). Raises ConfigError
+    for shapes and types that do not fit the model or each other, and, where arrays are not traced, for unknown ids and
+    robots and for actions that are not finite.
     """
     _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B, action_hidden_BT)
     require_known(model.config, model.table, prompt, actions_BRTU, embodiment_B)
@@ -119,7 +119,7 @@ def _slide(
 def _stream(
     model: HMA, sequences: Sequences, cache: FrameCache, past: jax.Array, times: jax.Array, decode: DecodeConfig
 ) -> jax.Array:
-    """The same, approximately, from the cache of the first window."""
+    """The same frames as `_slide`, approximately, from the cache of the first window."""
     size = past.shape[1] + 1
 
     def step(carry: tuple[FrameCache, jax.Array], t: jax.Array):
@@ -140,7 +140,7 @@ def rollout_naive(
     *,
     action_hidden_BT: jax.Array | None = None,
 ) -> jax.Array:
-    """What `rollout` must equal: the whole window again for every pass over a frame."""
+    """What `rollout` must equal: every unmasking step is a pass over the whole window."""
     prompt, actions_BRTU, action_hidden_BT = _recent(model, prompt, actions_BTU[:, None], action_hidden_BT)
     batch, _, frames, _ = actions_BRTU.shape
     count = prompt.shape[1]

@@ -1,4 +1,5 @@
-"""Rollouts one frame at a time, for callers that choose actions by the frames: the same frames as `rollout`'s.
+"""Rollouts one frame at a time, for callers that choose actions by looking at frames. The frames equal those of
+`rollout`.
 
 A session's arrays keep their shapes, so one compiled `advance` serves an episode of any length:
 
@@ -21,15 +22,15 @@ from hma_jax.model.given import Array, as_frames, require_finite, require_keys, 
 from hma_jax.model.hma import HMA
 
 Phase = Literal["filling", "sliding"]
-"""Whether the next frame still fits in the window with all before it, or the oldest leaves."""
+"""Whether the next frame still fits in the window (`filling`), or the oldest frame leaves it (`sliding`)."""
 
 
 class Session(NamedTuple):
     """The state of B simulated episodes of equal length."""
 
-    cache: FrameCache  # of finished frames but the newest; T - 1 slots
+    cache: FrameCache  # of all finished frames except the newest; T - 1 slots
     frames: jax.Array  # the newest T - 1, oldest first: [B, T - 1, S (, C)]
-    chunks_BTU: jax.Array  # raw, the one executed after each of them, then one spare
+    chunks_BTU: jax.Array  # raw [B, T, U], the chunk executed after each of these frames, and a spare one
     action_hidden_BT: jax.Array  # chunks the model is not shown
     embodiment_B: jax.Array
     count: jax.Array  # int32: frames so far
@@ -43,7 +44,7 @@ def start(
     *,
     action_hidden_BT: Array | None = None,
 ) -> Session:
-    """A session that has seen `prompt` [B, T', S (, C)], of which the last T - 1 frames count.
+    """A session that has seen `prompt` [B, T', S (, C)]; only the last T - 1 frames are used.
 
     `chunks_BTU` [B, T' - 1, U] are those executed between its frames. Raises ConfigError for shapes that do not fit the
     model or each other, and for unknown ids and robots as `rollout`.
@@ -82,13 +83,13 @@ def advance(
     action_hidden_B: Array | None = None,
     phase: Phase | None = None,
 ) -> tuple[Session, jax.Array]:
-    """(session, frame [B, S (, C)]) after `chunk_BU`, raw, was executed.
+    """(session, frame [B, S (, C)]) after the raw chunk `chunk_BU` was executed.
 
-    Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also
-    shown the chunk that comes after it: `next_chunk_BU`, or the same again where nobody knows it
-    (as the release's simulator does). `action_hidden_B` marks chunks the model is not shown. A caller who knows
-    which `phase` the session is in saves the program of the other. Raises ConfigError as `start`; within `jax.jit`
-    for shapes alone, where no values are known.
+    Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also shown the chunk that
+    comes after it: `next_chunk_BU`, or, if that is None, `chunk_BU` again (as in the release's simulator).
+    `action_hidden_B` marks chunks that the model is not shown. If the caller gives the `phase` that the session is in,
+    the program of the other phase is not compiled. Raises ConfigError as `start`; inside `jax.jit`, where values are
+    not known, only for shapes.
     """
     capacity, t = model.config.frames - 1, session.count
     batch, _, width = session.chunks_BTU.shape

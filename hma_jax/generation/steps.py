@@ -1,9 +1,9 @@
-"""The next frame, in the three ways that a window allows.
+"""The three ways to make the next frame.
 
-`fill` while the window fills: a pass over two frames (the newest finished one enters the cache, the new one is
-predicted for the first time) and M - 1 passes over one. Positions are absolute: once the window slides, every frame in
-it has another position and another past. `slide` computes the window again for each new frame, which is
-exact. `stream` keeps what was computed, which is an approximation.
+`fill` is used while the window fills: one pass over two frames (the newest finished frame enters the cache, the new one
+is predicted for the first time) and M - 1 passes over one frame. Positions are absolute: once the window slides, every
+frame in it has another position and another past. `slide` computes the window again for each new frame, which is exact.
+`stream` reuses what was computed before, which is an approximation.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def slide(window: Window, past: jax.Array, key_B: jax.Array, decode: DecodeConfi
 def stream(
     window: Window, cache: FrameCache, last: jax.Array, t: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> tuple[FrameCache, jax.Array]:
-    """Frame t >= T at the last position, over a ring of what the T - 1 frames before it left.
+    """Frame t >= T at the last position. The cache is a ring of the keys and values of the T - 1 frames before it.
 
-    Approximate: those frames were computed at other positions and had seen older ones.
+    Approximate: these frames were computed at other positions and had seen older frames.
     """
     end = cache.capacity
     oldest = (t - 1) % end  # the slot of frame t - T, which leaves the window

@@ -1,4 +1,4 @@
-"""Teacher forcing: every frame of a recorded window, masked, after its true past, all at once."""
+"""Teacher forcing: every frame of a recorded window is predicted from its true past, all at once."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def next_frames(
     decode: DecodeConfig,
     action_hidden_BT: Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """(predictions, frames): those of `next_frame_outputs`, and frames 1 .. T-1 [B, T - 1, S (, C)] decoded from them,
-    each after its true past.
+    """(predictions, frames): the predictions of `next_frame_outputs`, and frames 1 .. T-1 [B, T - 1, S (, C)] decoded
+    from them, each after its true past.
 
-    Frame t is drawn from fold_in(key, t), as in `rollout`. M passes over T - 1 masked frames and
-    one over the true ones, where the official evaluation makes M (T - 1) over the window. Raises ConfigError as
+    Frame t is drawn from fold_in(key, t), as in `rollout`. This takes M passes over T - 1 masked frames and one pass
+    over the true ones; the official evaluation makes M (T - 1) passes over the window. Raises ConfigError as
     `next_frame_outputs`.
     """
     frames = checked_window(
@@ -100,5 +100,5 @@ def _by_frame(x: jax.Array) -> jax.Array:
 
 
 def _by_window(x: jax.Array, count: int) -> jax.Array:
-    """The inverse."""
+    """The inverse of `_by_frame`."""
     return x.reshape(-1, count, *x.shape[1:])
