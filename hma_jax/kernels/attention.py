@@ -1,4 +1,4 @@
-"""Attention as the model calls it, and the table of what computes it.
+"""Attention as the model calls it, and the table of the backends that compute it.
 
 Queries, keys and values are [B, T, P, H, I]: T frames of P tokens with H heads of width I. All backends
 compute softmax(scale q.k) v, with logits and softmax in float32, and agree with `plain` up to rounding.
@@ -42,17 +42,18 @@ BACKENDS = {
 OF_PLATFORM = {"cpu": "cpu", "gpu": "cudnn", "cuda": "cudnn", "tpu": "splash"}
 
 ONLY_ON = {"cudnn": "an NVIDIA GPU", "splash": "a TPU"}
-"""Backends with a kernel that no other platform runs."""
+"""Backends whose kernel runs on one platform only."""
 
 
 def backend_of(platform: str) -> str:
-    """The name of what `auto` means on a platform as JAX calls it."""
+    """The backend that `auto` stands for on `platform`, a platform by JAX's name."""
     return OF_PLATFORM.get(platform, "plain")
 
 
 def find_backend(name: str) -> Backend:
-    """The backend called `name`; `auto` is the one of the platform that is compiled for: of the mesh, or else of the
-    default device. Raises ConfigError for a name that is unknown, or a kernel that the platform has not."""
+    """The backend called `name`; `auto` is the backend for the platform that is compiled for: that of the mesh, or else
+    of the default device. Raises ConfigError for an unknown name, and for a kernel that does not run on the
+    platform."""
     mesh_device = jax.sharding.get_abstract_mesh().abstract_device
     platform = mesh_device.platform if mesh_device else jax.default_backend()
     suits = backend_of(platform)

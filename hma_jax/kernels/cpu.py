@@ -1,5 +1,5 @@
-"""Attention for CPUs: one frame's attention weights at a time, which fit in the processor's cache; those of all frames
-do not.
+"""Attention for CPUs: the attention weights of one frame at a time. They fit in the processor's cache; those of all
+frames together do not.
 
 The backward pass recomputes a frame's weights from the log-sum-exp of its logits. Heads are split into a few groups of
 independent operations: XLA's thread pool runs those in parallel, but not the matrices of one batched product. With a
@@ -19,17 +19,17 @@ from hma_jax.kernels.pointwise import sum_over
 from hma_jax.runtime.sharding import is_split
 
 CACHED_BYTES = 2**20
-"""Frames whose attention weights are smaller are left to `plain`: they stay in the cache anyway."""
+"""Frames with attention weights of at most this size are left to `plain`: they stay in the cache anyway."""
 
 HEAD_GROUPS = 2
-"""Groups of heads that are computed in parallel. Measured on two cores, of which a single group used one."""
+"""Groups of heads that are computed in parallel. Measured on two cores: a single group used only one of them."""
 
 MAX_SINGLE_FRAMES = 2
-"""With up to so many frames, each attends to the cache on its own."""
+"""With at most this many frames, each attends to the cache on its own."""
 
 
 def within(qkv: jax.Array, scale: float) -> jax.Array:
-    """As `plain.within`. Small frames, and what a mesh splits, are left to it."""
+    """As `plain.within`, to which small frames and arrays split over a mesh are left."""
     frame = qkv.shape[2] ** 2 * qkv.shape[4] * 4
     if frame <= CACHED_BYTES or is_split():
         return plain.within(qkv, scale)
@@ -50,7 +50,7 @@ def _forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tuple[jax.Array, 
 
 def _backward(scale: float, saved: tuple[jax.Array, ...], dy: jax.Array) -> tuple[jax.Array]:
     qkv, y, log_sum = saved
-    # Mean of each row of dweights weighted by its attention weights, which equals dy.y.
+    # For each row, the mean of dweights under the attention weights, which equals dy.y.
     delta = jnp.swapaxes(sum_over(dy.astype(jnp.float32) * y.astype(jnp.float32), -1)[..., 0], -1, -2)
     frames, dy, delta = (x.reshape(-1, *x.shape[2:]) for x in (qkv, dy, delta))
     dqkv = jax.lax.map(partial(_in_head_groups, partial(_attend_backward, scale)), (frames, dy, log_sum, delta))
@@ -61,8 +61,8 @@ _by_frame.defvjp(_forward, _backward)
 
 
 def _in_head_groups(attend: Callable, frame: tuple[jax.Array, ...]):
-    """Applies `attend` to groups of heads. Arrays [P, ..., H, I] are passed as [H, ..., P, I] and [H, P] as they are;
-    results come back in the first layout."""
+    """Applies `attend` to groups of heads. Arrays [P, ..., H, I] are passed as [H, ..., P, I], arrays [H, P] as they
+    are; results are returned in the original layout."""
     heads = frame[0].shape[-2]
     size = -(-heads // HEAD_GROUPS)
     by_head = [x if x.ndim == 2 else jnp.moveaxis(x, (-2, 0), (0, -2)) for x in frame]
@@ -72,7 +72,7 @@ def _in_head_groups(attend: Callable, frame: tuple[jax.Array, ...]):
 
 
 def _attend(scale: float, qkv: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """qkv [H, 3, P, I] -> what is attended to [H, P, I], and log sum exp of the logits [H, P]."""
+    """qkv [H, 3, P, I] -> the output of attention [H, P, I], and the log-sum-exp of the logits [H, P]."""
     q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
     logits = scale * jnp.einsum("hpi,hsi->hps", q, k, preferred_element_type=jnp.float32)
     highest = jnp.max(logits, axis=-1, keepdims=True)
@@ -108,10 +108,10 @@ def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.
 def _one_frame(
     q: jax.Array, keys: tuple[jax.Array, ...], values: tuple[jax.Array, ...], visible: jax.Array, scale: float
 ) -> jax.Array:
-    """q [B, P, H, I] attends to frames [B, T, P, H, I] given in several arrays, which are not concatenated: the cache
-    is not copied.
+    """q [B, P, H, I] attends to frames [B, T, P, H, I] that are given in several arrays. These are not concatenated, so
+    the cache is not copied.
 
-    Sums are in float32, as those inside a product of matrices are.
+    Sums are in float32, like those inside a matrix product.
     """
     q32 = q.astype(jnp.float32)[:, None]
     logits = jnp.concatenate([sum_over(q32 * k.astype(jnp.float32), -1)[..., 0] for k in keys], axis=1)

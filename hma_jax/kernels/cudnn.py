@@ -1,7 +1,7 @@
 """Attention on NVIDIA GPUs by cuDNN's fused kernel, which never writes the weights to memory.
 
-It takes 16-bit numbers and heads whose width is a multiple of 8; everything else is left to `plain`. Over
-time, sequences of a dozen frames are too short for it.
+The kernel takes 16-bit numbers and heads whose width is a multiple of 8 and at most 128; everything else is left to
+`plain`. So is attention over time, whose sequences of a dozen frames are too short for the kernel.
 """
 
 from __future__ import annotations

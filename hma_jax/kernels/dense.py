@@ -1,8 +1,8 @@
 """Products with a weight, with one weight per robot, and look-ups in tables; gradients are written out.
 
 On CPU the narrower factor of a weight gradient is first transposed into a copy, because XLA's products of transposed
-factors are slow. A robot's gradient is summed over its examples by a product with their one-hot assignment: there is no
-scatter, and the sum is the same on every run.
+factors are slow. A robot's gradient is summed over its examples by a product with their one-hot assignment; without a
+scatter the sum is the same on every run.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from hma_jax.runtime.sharding import BATCH, Layouts, batch_ways, is_split, mesh_
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def contract(x: jax.Array, w: jax.Array, axes: int = 1, dtype: jnp.dtype | None = None) -> jax.Array:
-    """`jnp.tensordot` of x [..., in] and w [in, ...], whose weight gradient copies the narrower factor on CPU; with
-    `axes` 2 both have two axes for `in`. The result has the type of x, or `dtype`, in which it is then summed."""
+    """`jnp.tensordot` of x [..., in] and w [in, ...], whose weight gradient copies the narrower factor on CPU. With
+    `axes` 2, `in` is two axes of both. The result has the type of x, or `dtype`, in which it is then summed."""
     return jnp.tensordot(x, w, axes, preferred_element_type=dtype)
 
 
@@ -31,7 +31,7 @@ def _contract_backward(
     dy = dy.astype(x.dtype)
     outs = w.ndim - axes
     dx = jnp.tensordot(dy, w, (tuple(range(dy.ndim - outs, dy.ndim)), tuple(range(axes, w.ndim))))
-    if is_split():  # a split dimension must stay one of its own
+    if is_split():  # a split dimension must not be merged with others
         dw = jnp.tensordot(x.reshape(-1, *w.shape[:axes]), dy.reshape(-1, *w.shape[axes:]), (0, 0))
         return dx, dw
     wide, narrow = math.prod(w.shape[:axes]), math.prod(w.shape[axes:])
@@ -216,7 +216,7 @@ def sum_by_robot(x: jax.Array, robot_row_B: jax.Array, robots: int) -> jax.Array
     if robots == 1:
         return jnp.sum(x, axis=0, keepdims=True)
     one_hot = (jnp.arange(robots)[:, None] == robot_row_B).astype(x.dtype)
-    if is_split():  # a split dimension must stay one of its own
+    if is_split():  # a split dimension must not be merged with others
         return jnp.tensordot(one_hot, x, 1)
     return (one_hot @ x.reshape(len(x), -1)).reshape(robots, *x.shape[1:])
 

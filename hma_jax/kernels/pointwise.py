@@ -51,23 +51,22 @@ layer_norm.defvjp(_layer_norm_forward, _layer_norm_backward)
 
 @jax.custom_jvp
 def gelu(x: jax.Array) -> jax.Array:
-    """The exact one: x times the normal distribution function of x, in float32."""
+    """The exact GELU: x times the standard normal CDF at x, in float32."""
     return (x * _normal_cdf(x)).astype(x.dtype)
 
 
 @gelu.defjvp
 def _gelu_slope(x: tuple[jax.Array], tangent: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
     (x,), (t,) = x, tangent
-    # Behind a barrier, or XLA computes erf once for value and slope, and stores it between them: on CPU the
-    # slower way.
+    # Without the barrier XLA computes erf once for value and slope, and stores it in between, which is slower on CPU.
     x32 = jax.lax.platform_dependent(x, cpu=jax.lax.optimization_barrier, default=lambda x: x).astype(jnp.float32)
     slope = _normal_cdf(x32) + x32 * jnp.exp(-0.5 * jnp.square(x32)) / math.sqrt(2 * math.pi)
     return gelu(x), t * slope.astype(t.dtype)
 
 
 def _normal_cdf(x: jax.Array) -> jax.Array:
-    """The standard normal CDF, by erf. The erfc of jax.nn.gelu is accurate in the far tail too, but takes over twice as
-    long."""
+    """The standard normal CDF, computed with erf. The erfc in jax.nn.gelu is also accurate in the far tail, but takes
+    more than twice as long."""
     return 0.5 + 0.5 * jax.lax.erf(x.astype(jnp.float32) * math.sqrt(0.5))
 
 
@@ -112,7 +111,7 @@ scaled.defvjp(lambda x, scale: (scaled(x, scale), (x, scale)), _scaled_backward)
 
 @jax.custom_vjp
 def replaced(x: jax.Array, where: jax.Array, vector: jax.Array) -> jax.Array:
-    """x [..., D] in its type, `vector` (which broadcasts) where bool `where` [...] says."""
+    """x [..., D], replaced by `vector` (which broadcasts) where `where`, bool [...], is True; in the type of x."""
     return jnp.where(where[..., None], vector.astype(x.dtype), x)
 
 
@@ -126,7 +125,8 @@ replaced.defvjp(lambda x, where, vector: (replaced(x, where, vector), (where, ve
 
 
 def _sum_to(dy: jax.Array, like: jax.Array) -> jax.Array:
-    """The gradient of what broadcast from the shape of `like`, in its type; summed in float32."""
+    """The gradient of an array that was broadcast from the shape of `like`: `dy` summed, in float32, to that shape, and
+    in the type of `like`."""
     leading = dy.ndim - like.ndim
     axes = [axis for axis in range(dy.ndim) if axis < leading or like.shape[axis - leading] < dy.shape[axis]]
     total = jnp.sum(dy.astype(jnp.float32), axis=axes, keepdims=True)

@@ -1,7 +1,7 @@
 """Random numbers that are quick to compile, and the same whatever JAX's own settings are.
 
-A run's numbers are a function of its seed. So keys of the library are made by `key_of`, and what draws with one says
-the type of the numbers: those of JAX's default types are others under JAX_ENABLE_X64.
+A run's random numbers must be a function of its seed. The library therefore makes its keys with `key_of`, and names the
+type of the numbers in every draw: with JAX's default types, other numbers are drawn under JAX_ENABLE_X64.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ GENERATOR = generators.define_prng_impl(
     name="hma_threefry2x32",
     tag="hma",
 )
-"""JAX's default, from which JAX_DEFAULT_PRNG_IMPL may lead away; of others, numbers depend on batches and devices."""
+"""JAX's default generator, also where JAX_DEFAULT_PRNG_IMPL names another one: with others, numbers depend on batches
+and devices."""
 
 
 class Tag:
-    """What `fold_in` is given to branch a stream of random numbers off a key. Results depend on the values.
+    """The tags that `fold_in` takes to branch a stream of random numbers off a key. Results depend on their values.
 
     Streams of one key need different tags. `jax.random.split(key, n)[i]` is `fold_in(key, i)` with this generator, so a
     split takes the tags 0 .. n - 1. `->` is one `fold_in`:
@@ -63,7 +64,7 @@ class Tag:
                                          models on latents: value u of the chunk of frame t
         key of a sampler -> step         noise of each step of the process; the initial noise has the tag after the last
 
-    Those of an evaluation are in `evaluation.draws`.
+    The streams of an evaluation are in `evaluation.draws`.
     """
 
     HIDDEN_ACTIONS = 1
@@ -88,11 +89,11 @@ def fold_in_each(key_B: jax.Array, tag: int | jax.Array) -> jax.Array:
 
 
 def draw_flat(sample: Sample, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """`sample(key, shape, float32)`, the same numbers. `key` may be an array of keys, each with numbers of its own:
-    [*key.shape, *shape].
+    """The numbers of `sample(key, shape, float32)`. `key` may be an array of keys, each with numbers of its own: the
+    result is then [*key.shape, *shape].
 
-    Drawn in a row and then given its shape: XLA's CPU compiler takes three to four times as long for three axes as for
-    one.
+    They are drawn as one axis and then reshaped: XLA's CPU compiler takes three to four times as long for three axes as
+    for one.
     """
     numbers = jax.vmap(lambda one: sample(one, (math.prod(shape),), jnp.float32))(key.reshape(-1))
     return numbers.reshape(*key.shape, *shape)

@@ -1,7 +1,7 @@
 """What a block keeps for its backward pass.
 
 Values worth keeping are tagged where they are made; `ExecutionConfig.remat` decides which tags are kept. All other
-values are computed again. To tag a value does not change it.
+values are computed again. A tag does not change the value.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def tag_gathered(w: jax.Array) -> jax.Array:
 
 
 def checkpointed(block: Callable[..., Any], remat: Remat, scanned: bool) -> Callable[..., Any]:
-    """`block` (carry, xs) -> (carry, ys), one of many, keeping what `remat` says.
+    """`block` (carry, xs) -> (carry, ys), one of many, which keeps what `remat` says.
 
     `scanned`: it is the body of a loop, in which XLA cannot merge a second computation with the first.
     """
@@ -65,5 +65,6 @@ def checkpointed(block: Callable[..., Any], remat: Remat, scanned: bool) -> Call
 
 
 def _fused(primitive: Any, *_: Any, **__: Any) -> bool:
-    """What cuDNN's kernel leaves for its gradient, which bears no mark. JAX traces it under a name with a suffix."""
+    """Whether `primitive` is cuDNN's kernel, whose saved values for the gradient carry no tag. JAX traces it under a
+    name with a suffix."""
     return primitive.name.startswith("dot_product_attention_fwd")

@@ -1,7 +1,7 @@
 """Attention on TPUs by the splash kernel of Pallas, which never writes the weights to memory.
 
-Frames are padded to whole blocks of tokens. A kernel does not partition itself: under a mesh each device is
-given its own examples and heads by `shard_map`.
+Frames are padded to whole blocks of tokens. The kernel does not partition itself: on a mesh `shard_map` gives each
+device its own examples and heads.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hma_jax.kernels import plain, remat
 from hma_jax.runtime.sharding import is_split, partition
 
 BLOCK = 128
-"""Tokens of a block: the lanes of a vector register."""
+"""Tokens per block: as many as a vector register has lanes."""
 
 MIN_TOKENS = 128
 """Frames of fewer tokens are left to `plain`: they would be mostly padding."""
@@ -39,7 +39,7 @@ def within(qkv: jax.Array, scale: float) -> jax.Array:
 
 def _attend(qkv: jax.Array, scale: float, interpret: bool = False) -> jax.Array:
     """With `interpret` the kernel is run step by step on any platform, for tests."""
-    # Not with the module, which every process imports: Pallas is an eighth of the time that takes.
+    # Imported here and not with the module, which every process imports: Pallas takes an eighth of that time.
     from jax.experimental.pallas.ops.tpu import splash_attention
 
     batch, frames, tokens, _, heads, width = qkv.shape
