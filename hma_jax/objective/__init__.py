@@ -1,1 +1,1 @@
-"""What is learnt: masking, losses, and the mathematics of diffusion."""
+"""What a model is trained for: masking, losses, and the mathematics of diffusion."""

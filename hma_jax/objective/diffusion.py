@@ -2,10 +2,9 @@
 
 Epsilon prediction and learned-range variance (reference sections 2.4 and 2.5). The denoising
 network is an argument everywhere: network(x_t [..., C], t [...]) -> [..., 2 C], the predicted noise
-and then the variance, where t is int32 and counts steps of the original process also when a respaced
-one is run. In sampling, where all vectors are at the same step, the axes of t have size 1. Which
-tokens are noised, at which t, and how their losses are weighted is the caller's business, and so are
-the parameters. Computation is float32.
+and then the variance, where t is int32 and counts steps of the original process even when a respaced one is run. In
+sampling, where all vectors are at the same step, the axes of t have size 1. The caller decides which tokens are noised,
+at which t, and how their losses are weighted; it also holds the parameters. Computation is float32.
 """
 
 from __future__ import annotations
@@ -90,8 +89,8 @@ def _gaussian_kl(gap: jax.Array, log_variance: jax.Array, model_log_variance: ja
 def _binned_log_likelihood(x: jax.Array, gap: jax.Array, log_variance: jax.Array) -> jax.Array:
     """Log-probability, in nats, of the bin x +- 1/255 under a Gaussian with mean x - gap.
 
-    As released: bins for 8-bit images, so that beyond +-0.999 they are open-ended although
-    latents go further; tanh approximates the error function.
+    As released: the bins are those of 8-bit images, so those beyond +-0.999 are open-ended although latents go further;
+    tanh approximates the error function.
     """
 
     def cdf(z: jax.Array) -> jax.Array:
@@ -115,7 +114,7 @@ def sample(
     sampler: SamplerConfig,
     clip: float,
 ) -> jax.Array:
-    """Clean vectors of `shape` [..., C], the noise of a step drawn when the step is run.
+    """Clean vectors of `shape` [..., C]. The noise of a step is drawn when the step is run.
 
     `key` is one key, or an array of keys along the first axes of `shape`, so that what is drawn
     for one example does not depend on its neighbours.
@@ -140,7 +139,7 @@ def run_sampler(
     sampler: SamplerConfig,
     clip: float,
 ) -> jax.Array:
-    """Clean vectors [..., C] from noise_init [..., C], by every step of `process`, from its last index down to 0.
+    """Clean vectors [..., C] from noise_init [..., C], through every step of `process`, from its last index down to 0.
 
     `noise_at`: index -> the noise [..., C] of that step; it is called only where `sampler.noisy_steps`.
     """
@@ -168,7 +167,7 @@ def sampler_step(
 
     def step(carry: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[jax.Array, jax.Array]:
         x, before = carry
-        # Every vector is at the same step: what the network makes of the step alone, it makes once.
+        # Every vector is at the same step, so what the network computes from the step alone is computed once.
         t = jnp.full((1,) * (x.ndim - 1), index)
         predicted = _predict(network, x, t, process)
         from_xt, from_eps = _at(process.clean_from_xt, index), _at(process.clean_from_eps, index)
@@ -179,7 +178,7 @@ def sampler_step(
             if sampler.noisy_steps:
                 x += sampler.temperature * _at(solver.fresh, index) * noise_at(index)
         elif sampler.kind == "ddim":
-            eps = (from_xt * x - x0) / from_eps  # what the clipped x0 leaves
+            eps = (from_xt * x - x0) / from_eps  # the noise that agrees with the clipped x0
             cleaner = process.alphas_cumprod_prev
             x = _at(np.sqrt(cleaner), index) * x0 + _at(np.sqrt(1.0 - cleaner), index) * eps
         elif sampler.kind == "ddpm":

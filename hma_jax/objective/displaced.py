@@ -1,7 +1,7 @@
-"""Augments the past in training by displaced rectangles, so that a model learns to restore what a rollout lost.
+"""Augments the past in training with displaced rectangles, so that a model learns to restore what a rollout lost.
 
 In a rollout, an object that was once drawn as background is missing from the past of all later frames. Recorded pasts
-never lack an object, so that a model never learns to bring one back. Here a rectangle of the past shows, for some
+never lack an object, so a model does not learn to bring one back. Here a rectangle of the past shows, for some
 consecutive frames, the content of another place in the same frame: background in place of an object, or an object where
 there is none. The true frames that follow are still the targets.
 """
@@ -14,16 +14,16 @@ import jax
 import jax.numpy as jnp
 
 PATCHES = 3
-"""Rectangles of an example."""
+"""Rectangles per example."""
 
 LARGEST = 0.5
 """Greatest side of a rectangle, as a share of the frame's."""
 
 
 def displace_patches(past: jax.Array, share: float, key_B: jax.Array) -> jax.Array:
-    """Tokens `past` [B, T - 1, S] or [B, T - 1, S, C] of square frames; each of `PATCHES` rectangles of an example is
-    displaced with probability `share`. Its sides, place and frames are uniform, and so is how far off it takes its
-    tokens from, around the frame's edges."""
+    """`past`, the tokens [B, T - 1, S] or [B, T - 1, S, C] of square frames, with rectangles displaced: each of the
+    `PATCHES` rectangles of an example with probability `share`. The sides, place and frames of a rectangle are uniform,
+    and so is the distance to the place that its tokens are taken from, which wraps around the frame's edges."""
     frames, tokens = past.shape[1:3]
     side = math.isqrt(tokens)
     y_S, x_S = jnp.divmod(jnp.arange(tokens), side)

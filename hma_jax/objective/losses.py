@@ -1,7 +1,7 @@
-"""What is learnt: the losses of masked tokens and hidden actions, for both variants.
+"""The losses of masked tokens and hidden actions, for both variants.
 
-Discrete tokens cost their cross-entropy and actions their squared error (paper section 3.3, equation 2);
-continuous ones cost what diffusion costs (equation 3).
+The loss of discrete tokens is their cross-entropy, that of actions the squared error (paper section 3.3, equation 2).
+In the continuous variant both have a diffusion loss (equation 3).
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class LossSums(NamedTuple):
     """Sums over a batch's targets; divide by their number in the whole batch."""
 
     tokens: jax.Array
-    correct: jax.Array  # targets whose likeliest id is right, weighted alike; 0 in the continuous variant
+    correct: jax.Array  # targets whose likeliest id is right, with the same weights; 0 in the continuous variant
     actions: jax.Array
 
 
 class TargetCounts(NamedTuple):
-    """How many targets a batch has, tokens weighted (`weigh_tokens`). A mean over none is 0."""
+    """How many targets a batch has, at least 1, so that a mean over none is 0. Tokens are weighted (`weigh_tokens`)."""
 
     tokens: jax.Array
     actions: jax.Array
@@ -59,8 +59,8 @@ def noise_keys(key: jax.Array, rows: int) -> jax.Array:
 
 
 def weigh_tokens(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> jax.Array:
-    """float32 [B, T, S]: how much each of `tokens`, as recorded, counts in the loss: 0 where it is no target, else 1,
-    or `masking.change_weight` where it is another than a frame earlier. Accuracy is weighted alike."""
+    """float32 [B, T, S]: the weight of each of the recorded `tokens` in the loss: 0 where it is no target, otherwise 1,
+    or `masking.change_weight` where it differs from the token one frame earlier. Accuracy has the same weights."""
     weight = masked.targets_TS.astype(jnp.float32)
     if masking.change_weight == 1:
         return weight
@@ -78,8 +78,8 @@ def smoothed_cross_entropy(logits: jax.Array, labels: jax.Array, smoothing: floa
     """Logits [..., Q, V], labels [..., Q] -> (the loss per position, summed over factors; bool, whether every
     factor's label has its highest logit), both [...].
 
-    Written with the logarithm of the sum, so that no array of log-probabilities is made, and with a mask for
-    the label, whose gradient is no scatter.
+    It uses logsumexp, so that no array of log-probabilities is made, and a mask that picks the label, so that the
+    gradient needs no scatter.
     """
     total = jax.nn.logsumexp(logits, axis=-1)
     is_label = jnp.arange(logits.shape[-1]) == labels[..., None]
@@ -106,8 +106,8 @@ def masked_loss(
     `masking.own_past` and `displaced_past` ask for; `robot_row_B` as for the model.
 
     `real_BT` (bool; None: all) is False for frames that only fill up a window, at its end. They have no targets
-    (`masking`), and where attention is causal no real frame sees them; where it is not, they are hidden here.
-    `training` as for `frame_diffusion_loss`.
+    (`masking`). With causal attention no real frame sees them; with other attention they are hidden here. `training` as
+    for `frame_diffusion_loss`.
     """
     robot_row_B = embodiment_B if robot_row_B is None else robot_row_B
     out = _masked_pass(model, masked, actions_BTU, embodiment_B, masking, key_B, robot_row_B, real_BT)
@@ -164,7 +164,8 @@ def _masked_pass(
 
 
 def bidirectional_mask(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
-    """bool [T, T] or [B, T, T]: every frame attends to every real one (`real_BT` None: all are), later ones too."""
+    """bool [T, T] or [B, T, T]: every frame attends to every real frame (`real_BT` None: all are real), also to later
+    ones."""
     everything = jnp.ones((frames, frames), bool)
     return everything if real_BT is None else everything & real_BT[:, None]
 
@@ -174,8 +175,8 @@ def frame_diffusion_loss(
 ) -> jax.Array:
     """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4).
 
-    Which steps are drawn, and what the error counts at each, is configured for `training` alone
-    (`DiffusionConfig.time_shift`, `weight_cap`): models are judged alike.
+    The distribution of steps, and the weight of the error at each, are configurable only for `training`
+    (`DiffusionConfig.time_shift`, `weight_cap`), so that all models are judged in the same way.
     """
     config = model.config.diffusion
     process = make_process(config.steps)
@@ -213,7 +214,8 @@ def action_loss_per_step(
     robot_row_B: jax.Array,
     key_B: jax.Array,
 ) -> jax.Array:
-    """[B, T]: error of predicted, normalised actions, averaged over each robot's own live values.
+    """[B, T]: error of the predicted, normalised actions, averaged over the values that are alive
+    (`EmbodimentTable.alive`).
 
     DIFFERS: the release compares with raw actions and averages over everything times the mean
     of the mask (reference section 1.8).

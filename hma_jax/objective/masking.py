@@ -10,10 +10,10 @@ settings of paper section 3.1 differ only in which frames' tokens are masked and
     policy    none            from a random frame on    hidden actions
     inverse   none            all                       hidden actions but the last; attention is not causal
 
-With causal alignment no frame is shown the chunk that follows it, so that all of them can be
-predicted, not only the hidden ones. For inverse dynamics the chunk of a window's last frame is no
-target: no frame shows where it led. A robot without recorded actions has all of them hidden and
-none predicted; one whose video is no target has no token masked. Each trains what it can.
+With causal alignment no frame is shown the chunk that follows it, so all chunks can be predicted, not only the hidden
+ones. For inverse dynamics the chunk of a window's last frame is not a target: no frame shows where it led. A robot
+without recorded actions has all of them hidden and none predicted; a robot whose video is not a target has no token
+masked. Each robot trains the parts for which it has data.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Masked(NamedTuple):
     action_targets_T: jax.Array  # bool: recorded chunks that the loss counts
 
     def without_padding(self, real_T: jax.Array) -> Masked:
-        """The same without targets in frames where `real_T` is False; bool [T], or [B, T] of a batch."""
+        """The same without targets in frames where `real_T`, bool [T] or [B, T] for a batch, is False."""
         return self._replace(
             targets_TS=self.targets_TS & real_T[..., None], action_targets_T=self.action_targets_T & real_T
         )
@@ -100,7 +100,7 @@ def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> Masking
 def corrupt(tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig) -> jax.Array:
     """Random-token corruption, and degradation of late frames in prompt mode (reference section 1.9).
 
-    In prompt mode (first_masked > 1) frames from there on are degraded, later ones more.
+    In prompt mode (first_masked > 1) frames from first_masked on are degraded, later ones more.
     """
     ids = factorise(tokens_TS, config.factors, config.factor_vocab)
     replace = draws.u_replace_TSQ < masking.max_corrupt_rate * draws.u_corrupt
@@ -113,22 +113,22 @@ def corrupt(tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, mask
 
 
 def min_mask_ratio(frames: int, masking: MaskingConfig) -> np.ndarray:
-    """[T]: the least mask rate of each frame, 0 as released (paper section 3.5).
+    """[T]: the lowest mask rate of each frame, 0 as released (paper section 3.5).
 
     The paper says that there is a minimum ratio and that a cosine schedule masks more tokens at later steps of
-    the training horizon. The formula is ours: from `min_ratio` the minimum rises by `horizon_gain` of what is left
-    to 1, along 1 - cos(pi/2 t / (T - 1)).
+    the training horizon. The formula is ours: the minimum starts at `min_ratio` and rises along 1 - cos(pi/2 t / (T -
+    1)), by the share `horizon_gain` of the distance to 1.
     """
     rise = 1.0 - np.cos(np.pi / 2 * np.arange(frames) / max(frames - 1, 1))
     return masking.min_ratio + (1.0 - masking.min_ratio) * masking.horizon_gain * rise
 
 
 def mask_tokens(u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array, masking: MaskingConfig) -> jax.Array:
-    """bool like `u_mask` [T, ...]: a frame's rate is cos(pi/2 u), its mean 2 / pi for u over [0, 1).
+    """bool like `u_mask` [T, ...]: a frame's mask rate is cos(pi/2 u), which is 2 / pi on average over u in [0, 1).
 
-    Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3). A minimum m
-    that is not 0 makes the rate m + (1 - m) cos(pi/2 u) (`min_mask_ratio`). DIFFERS: the release draws again where
-    nothing of a batch was masked; here such a batch, which only tiny ones are, has a loss of 0.
+    Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3). A minimum m that
+    is not 0 makes the rate m + (1 - m) cos(pi/2 u) (`min_mask_ratio`). DIFFERS: the release draws again if nothing in a
+    batch was masked; here such a batch, which only happens with tiny batches, has a loss of 0.
     """
     angle = masking.mask_angle_min + (1 - masking.mask_angle_min) * u_rate_T
     rate = jnp.cos(jnp.pi / 2 * angle)
@@ -143,8 +143,8 @@ def mask_tokens(u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array,
 def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Array:
     """bool [T]: the chunks of one example that are hidden from the model.
 
-    DIFFERS: with `full`, every step by itself, by a rate of the example, as in the release's discrete variant; its
-    continuous one hides all chunks from a random frame on (reference section 2.4).
+    With `full` each chunk is hidden independently, at a rate drawn for the example, as in the release's discrete
+    variant. DIFFERS: the release's continuous variant hides all chunks from a random frame on (reference section 2.4).
     """
     if masking.shows_all_actions:  # asked first: where it is True, `masked_loss` does not look at what is hidden
         return jnp.zeros(frames, bool)
@@ -159,14 +159,15 @@ def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Arr
 
 
 def followed(real_T: jax.Array) -> jax.Array:
-    """bool [..., T], frames that are no padding -> those of them that another one follows."""
+    """bool [..., T], the frames that are not padding -> those that are followed by another such frame."""
     return jnp.concatenate([real_T[..., 1:], jnp.zeros_like(real_T[..., :1])], axis=-1)
 
 
 def hidden_at_inference(
     table: EmbodimentTable, setting: MaskingSetting, embodiment_B: jax.Array, frames: int
 ) -> jax.Array | None:
-    """bool [B, T]: chunks to hide from a model trained for `setting`, because it was never shown any; None: none."""
+    """bool [B, T]: the chunks to hide from a model trained for `setting`, because its training showed none of them;
+    None: none."""
     shape = (len(embodiment_B), frames)
     if MaskingConfig(setting=setting).ignores_actions:
         return jnp.ones(shape, bool)
@@ -212,9 +213,9 @@ def mask_batch(
     table: EmbodimentTable,
     real_BT: jax.Array | None = None,
 ) -> Masked:
-    """Masks every example with its own key, fold_in(key, row): the layout of the batch over
-    devices, processes and micro-batches does not change an example's masks. Frames that are not
-    `real_BT` (None: all are) have no targets."""
+    """Masks every example with its own key, fold_in(key, row), so that the layout of the batch over devices, processes
+    and micro-batches does not change an example's masks. Frames where `real_BT` is False (None: all are real) have no
+    targets."""
     has_actions = jnp.asarray(table.chunks > 0)[embodiment_B]
     has_video = jnp.array([e.video_targets for e in table.entries])[embodiment_B]
 

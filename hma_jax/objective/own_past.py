@@ -1,9 +1,11 @@
-"""Scheduled sampling: a past that the model drew itself, for training, since generated frames follow generated ones.
+"""Scheduled sampling: the model is trained on a past that it sampled itself, because in generation frames follow
+generated frames.
 
 Some past frames of a teacher-forced window are replaced by samples of the model's predictions for them; the true
-frames that follow are still the targets, so that the model learns to correct its errors. One round draws all of them at
-once after their true past: errors of a single frame. Each further round draws them again after those of the round
-before, and so accumulates the errors of one more frame, as a rollout does. A round is one pass without gradient.
+frames that follow are still the targets, so that the model learns to correct its errors. The first round samples all of
+them at once, each after its true past: they have the errors of a single frame. Each further round samples them again,
+after the frames of the previous round, and so accumulates the errors of one more frame, as a rollout does. A round is
+one pass without gradient.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ def draw_own_past(
     robot_row_B: jax.Array,
     leak: ActionLeak = "none",
 ) -> jax.Array:
-    """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `share` u, u uniform in [0, 1)
-    of each example, by ids drawn from the model's own distribution at temperature 1, in so many `rounds`.
+    """Ids `before` [B, T - 1, S], in which each frame from the second on is replaced with probability `share` u (u
+    uniform in [0, 1), drawn per example) by ids sampled from the model at temperature 1, in `rounds` rounds.
 
     The other arguments are as in `objective.losses.masked_loss`.
     """
@@ -65,7 +67,7 @@ def draw_own_past(
         )
         # Nothing follows the last frame.
         token_outputs = jax.lax.stop_gradient(out.token_outputs[:, :-1])
-        # The first round draws what it draws where it is the only one.
+        # The first round uses the same keys however many rounds there are.
         keys = fold_in_each(ids_key_B, number) if number else ids_key_B
         own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, token_outputs), before[:, 1:])
         past = jnp.concatenate([before[:, :1], own], axis=1)

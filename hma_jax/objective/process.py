@@ -41,12 +41,13 @@ class Process:
 
     @property
     def half_log_snr(self) -> np.ndarray:
-        """log(sqrt(abar) / sqrt(1 - abar)), falling: lambda of DPM-Solver, half the log of the
+        """log(sqrt(abar) / sqrt(1 - abar)), which falls with the step: DPM-Solver's lambda, half the log of the
         signal-to-noise ratio abar / (1 - abar)."""
         return 0.5 * np.log(self.alphas_cumprod / (1.0 - self.alphas_cumprod))
 
     def noise_over_signal(self, cap: float) -> np.ndarray:
-        """(1 - abar) / abar, at most `cap`: the squared error of the noise times this is that of the clean vector."""
+        """(1 - abar) / abar, at most `cap`. The squared error of the noise times (1 - abar) / abar is that of the clean
+        vector."""
         return np.minimum(1.0 / self.alphas_cumprod - 1.0, cap)
 
 
@@ -92,8 +93,7 @@ def _require_count(process: Process, count: int) -> None:
 def respace(process: Process, count: int) -> Process:
     """The process that visits `count` steps of `process`, evenly spaced from first to last.
 
-    Positions are summed up in floating point and then rounded, as released, so that ties fall
-    the same way.
+    Positions are accumulated in floating point and then rounded, as released, so that ties are rounded the same way.
     """
     _require_count(process, count)
     stride = (process.steps - 1) / (count - 1)
@@ -105,7 +105,7 @@ def respace(process: Process, count: int) -> Process:
 
 
 def _visit(process: Process, chosen: Sequence[int]) -> Process:
-    """The process that visits the steps `chosen` of `process`, in ascending order, and no other."""
+    """The process that visits only the steps `chosen` of `process`, which are in ascending order."""
     abar = process.alphas_cumprod[chosen]
     return _from_betas(1.0 - abar / np.append(1.0, abar[:-1]), process.timestep_map[chosen])
 
@@ -115,16 +115,16 @@ def _visit(process: Process, chosen: Sequence[int]) -> Process:
 
 FIRST_HALF_LOG_SNR = -4.0
 """Where `dpm++` starts: the signal's amplitude is 1/55 of the noise's there, so that pure noise can stand for it. At
-the last step of the process it is 1/20,000: the clean vector found there is the error of the network times 20,000,
-cut off at the clip."""
+the last step of the process it is 1/20,000: there the predicted clean vector is the network's error times 20,000,
+limited by the clip."""
 
 
 @functools.cache
 def respace_by_half_log_snr(process: Process, count: int) -> Process:
     """The process that visits `count` steps of `process`, evenly spaced in half the log signal-to-noise ratio.
 
-    From FIRST_HALF_LOG_SNR to the cleanest step. Of a short process neighbouring steps are taken where the spacing
-    asks for the same one twice.
+    From FIRST_HALF_LOG_SNR to the cleanest step. In a short process, where the spacing asks for the same step twice,
+    neighbouring steps are taken.
     """
     _require_count(process, count)
     wanted = np.linspace(process.half_log_snr[0], FIRST_HALF_LOG_SNR, count)
@@ -135,7 +135,7 @@ def respace_by_half_log_snr(process: Process, count: int) -> Process:
 
 
 def sampling_process(process: Process, sampler: SamplerConfig) -> Process:
-    """The process with the steps of `process` that `sampler` visits: one evaluation of the network each."""
+    """The process with the steps of `process` that `sampler` visits. Each costs one evaluation of the network."""
     if sampler.kind == "dpm++":
         return respace_by_half_log_snr(process, sampler.steps)
     return respace(process, sampler.steps)
@@ -155,11 +155,11 @@ class Multistep(NamedTuple):
 
 @functools.cache
 def multistep(process: Process, eta: float) -> Multistep:
-    """The coefficients of second order, with the clean vector as what is predicted (Lu et al. 2022).
+    """The second-order coefficients for prediction of the clean vector (Lu et al. 2022).
 
-    `eta` 0 solves the ordinary differential equation, 1 the stochastic one of ancestral sampling; between them that
-    with `eta` times its diffusion rate. The first step has no step before it, and the last goes to a noise of zero,
-    which the logarithm cannot reach: these two are of first order, and the last one returns its clean vector.
+    `eta` 0 solves the ordinary differential equation, 1 the stochastic one of ancestral sampling; values between solve
+    that with `eta` times its diffusion rate. The first step has no earlier one, and the last goes to zero noise, which
+    has no finite logarithm: both are of first order, and the last returns its clean vector.
     """
     cleaner = process.alphas_cumprod_prev
     stride = process.half_log_snr[:-1] - process.half_log_snr[1:]  # from index i + 1 to i
