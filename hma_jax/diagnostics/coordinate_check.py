@@ -1,8 +1,8 @@
 """Whether activations keep their size as the model widens: the coordinate check of muP.
 
 Models of several widths take the same few training steps on one fixed batch. Before every step the sizes (root mean
-square) of activations are recorded. Under muP no size grows with width, and no change that training makes grows or
-fades (Tensor Programs V, appendix D.1). It takes a large learning rate: a small one hides what is wrong.
+square) of activations are recorded. Under muP no size grows with width, and no change by training grows or fades with
+it (Tensor Programs V, appendix D.1). The check needs a large learning rate: a small one hides errors.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hma_jax.training.step import Batch, make_train_step
 
 
 class Size(NamedTuple):
-    """How large `quantity` is after `step` training steps, and how large its change since step 0."""
+    """The size of `quantity` after `step` training steps, and of its change since step 0, as root mean squares."""
 
     quantity: str
     width: int
@@ -39,7 +39,7 @@ class Size(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """The power of the width with which a quantity, and its change since step 0, grow."""
+    """The powers of the width with which the size of a quantity and of its change since step 0 grow."""
 
     size: float
     change: float
@@ -86,9 +86,9 @@ def _record_outputs(module: Any, name: str, record: Callable[[Any], None]) -> No
 def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     """Activations of one pass over a batch masked as in training, by name.
 
-    "attention logits" (all of them, also to what is not visible), "residual stream" after the last
-    block, "logits" or "conditions" of the frames, then "denoiser condition" and "denoiser" (fixed
-    noise and times) in the continuous variant, and "actions" where there is an action head.
+    "attention logits" (all of them, also those of invisible keys), "residual stream" after the last block, "logits" or
+    "conditions" of the frames, then "denoiser condition" and "denoiser" (fixed noise and times) in the continuous
+    variant, and "actions" where there is an action head.
     """
     activations: dict[str, jax.Array] = {}
     record = activations.__setitem__
@@ -122,9 +122,8 @@ def measure(
 ) -> list[Size]:
     """The table of sizes for `model` at each of `widths`, over `train.steps` steps from 0.
 
-    `seeds` draw parameters only; masks, noise and the batch are the same for all. Rows are in
-    the order width, seed, step. `compiler_options` are `jax.jit`'s: for tiny models compiling takes
-    nearly all the time.
+    `seeds` draw only the parameters; masks, noise and the batch are the same for all. Rows are in the order width,
+    seed, step. `compiler_options` are passed to `jax.jit`: for tiny models compiling takes nearly all the time.
     """
     mask = jax.jit(lambda key: mask_batch(key, batch["tokens"], batch["embodiment"], model, train.masking, table))
     masked = mask(key_of(train.seed))
@@ -161,8 +160,8 @@ def _rms(x: np.ndarray) -> float:
 def slopes(rows: Sequence[Size]) -> dict[str, Slope]:
     """Every quantity's slopes of log size over log width, fitted to the second half of the steps.
 
-    Before that, what training adds is small beside the random start, which may fade with width.
-    Not a number where a size is zero or not finite.
+    In the first half, what training adds is small beside the random start, which may fade with width. A slope is not a
+    number where a size is zero or not finite.
     """
     widths = {row.width for row in rows}
     require(len(widths) > 1, f"a coordinate check needs at least two widths, got {sorted(widths)}")
@@ -180,16 +179,16 @@ def slopes(rows: Sequence[Size]) -> dict[str, Slope]:
 
 
 GROW, FADE = 0.2, 0.4
-"""Exponents of the width that sizes may grow, and changes by training may fade with (`check_coordinates`)."""
+"""The largest exponents of the width with which sizes may grow, and with which changes by training may fade
+(`check_coordinates`)."""
 
 
 def check_coordinates(rows: Sequence[Size]) -> list[str]:
-    """What is wrong, a line for each finding; empty where width transfer can be expected.
+    """What is wrong, one line per finding; empty where width transfer can be expected.
 
     Neither a size nor its change by training may grow faster than width^GROW, nor the change fade
-    faster than width^-FADE. Fading has more room: while learning has not outgrown it, what the
-    random start does fades as width^-0.5 also where all is well. Passing is necessary for transfer,
-    not sufficient.
+    faster than width^-FADE. Fading has more room: until learning has outgrown it, the contribution of the random start
+    fades as width^-0.5 even in a correct model. Passing is necessary for transfer, not sufficient.
     """
     findings = []
     for quantity, slope in slopes(rows).items():

@@ -1,7 +1,7 @@
-"""Which matrix products a program consists of, and how often each is computed.
+"""Which matrix products a program contains, and how often each is computed.
 
-The rest of a program (softmax, norms, copies, the optimiser) takes time on top: the time of its products, each measured
-alone, is a lower bound.
+The rest of a program (softmax, norms, copies, the optimiser) takes additional time, so the time of its products, each
+measured alone, is a lower bound.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ class Product:
 
 
 def count_products(function: Callable[..., Any], *args: Any) -> Counter[Product]:
-    """How often `function` of arguments like `args` computes each product.
+    """How often `function`, called with arguments like `args`, computes each product.
 
-    Dead code is not counted. Of a `cond` the branch with most operations counts; the body of a `while` loop counts
-    once.
+    Dead code is not counted. For a `cond`, the branch with the most operations counts; the body of a `while` loop
+    counts once.
     """
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     needed, _ = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
