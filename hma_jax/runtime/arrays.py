@@ -20,12 +20,13 @@ UNREADABLE = (
     OSError, ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError,
     zipfile.BadZipFile, zlib.error, tokenize.TokenError,
 )  # fmt: skip
-"""What numpy raises for a file that is missing or damaged, or lacks an array: RuntimeError where a flipped bit claims
-encryption or an unknown compression, EOFError for an empty file, TokenError for a damaged header of an array."""
+"""What numpy raises for a file that is missing or damaged, or lacks an array: RuntimeError where a flipped bit
+indicates encryption or an unknown compression, EOFError for an empty file, TokenError for a damaged header of an
+array."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = True) -> None:
-    """Replaces the file. Raises OSError; the old content stays then."""
+    """Replaces the file. Raises OSError, in which case the old content stays."""
     content = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(content, **arrays)
     write_file(path, content.getvalue())

@@ -1,4 +1,5 @@
-"""The layout of every parameter on a mesh, to print and to test, and an audit of large ones that are not split."""
+"""The layout of every parameter on a mesh, for printing and testing, and an audit of large parameters that are not
+split."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from hma_jax.runtime.sharding import mesh_axes, partition, storage_partition
 
 
 class Spec(Protocol):
-    """What a layout depends on, of one array (`model.params.ParamSpec`)."""
+    """The properties of an array on which its layout depends (`model.params.ParamSpec`)."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...
@@ -42,7 +43,7 @@ class Decision:
     storage: PartitionSpec
     compute: PartitionSpec
     device_size: int  # elements that each device stores
-    whole: bool  # not split along `fsdp`, or along `tensor` where that is the only one that splits parameters
+    whole: bool  # not split along `fsdp`, or along `tensor` where only that axis splits parameters
     reason: str  # why it is whole; "" if it is not
 
     @property
@@ -54,11 +55,11 @@ class Decision:
 SMALL = "small"
 
 MAX_WHOLE = 0.02
-"""Largest share of all parameters that may be whole on every device without being small."""
+"""The largest share of all parameters that may be whole on every device, not counting small ones."""
 
 
 def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list[Decision]:
-    """One decision per parameter, in the order of `declared.leaves()`. Of `mesh` only the shape is read."""
+    """One decision per parameter, in the order of `declared.leaves()`. Only the shape of `mesh` is read."""
     splitting = "fsdp" if mesh.shape["fsdp"] > 1 else "tensor"
     decisions = []
     for name, spec in declared.leaves().items():
@@ -74,7 +75,7 @@ def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list
 
 
 def audit_sharding(decisions: list[Decision], mesh: Any) -> None:
-    """Raises ConfigError when more than MAX_WHOLE of all parameters is whole, naming them.
+    """Raises ConfigError, which names the parameters, when more than MAX_WHOLE of them is whole.
 
     Only a mesh that splits parameters (fsdp or tensor above 1) is audited. Parameters that are whole because
     they are small (`MeshConfig.min_shard_size`) do not count.
@@ -94,7 +95,7 @@ def audit_sharding(decisions: list[Decision], mesh: Any) -> None:
 
 
 def describe_sharding(decisions: Iterable[Decision]) -> str:
-    """One line per parameter: where it lies, and what one device stores of it in float32."""
+    """One line per parameter: its layouts, and how much of it one device stores, in float32."""
     return "\n".join(
         f"{d.name} [{d.shape}]: stored {_words(d.storage)}, computed with {_words(d.compute)}, "
         f"{size_of(4 * d.device_size)}{f', {d.reason}' if d.whole else ''}"
@@ -103,7 +104,7 @@ def describe_sharding(decisions: Iterable[Decision]) -> str:
 
 
 def size_of(count: int) -> str:
-    """'1.83 GiB' of a number of bytes."""
+    """A number of bytes in words, such as '1.83 GiB'."""
     power = 0 if count < 2**10 else 1 if count < 2**20 else 2 if count < 2**30 else 3
     return f"{count / 2 ** (10 * power):,.{2 if power else 0}f} {('B', 'KiB', 'MiB', 'GiB')[power]}"
 

@@ -1,4 +1,4 @@
-"""The processor's cores, counted without JAX: children of the runner ask before they import it."""
+"""The processor's cores, counted without JAX: child processes of the runner ask for them before they import JAX."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ import os
 
 
 def usable_cores() -> int:
-    """Cores of the processor that this process may use. On CPUs XLA shares sums out among them: the last digits of
-    results depend on how many they are."""
+    """The number of processor cores that this process may use. On CPUs XLA divides sums among them, so the last digits
+    of results depend on their number."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Devices: which one a process uses by itself, and what known ones can do at most."""
+"""Devices: which one a process uses by default, and the peak speed of known ones."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from dataclasses import dataclass
 import jax
 
 FULL_PRECISION = ("highest", "float32")
-"""Values of `jax_default_matmul_precision` under which products of float32 are float32 all through."""
+"""Values of `jax_default_matmul_precision` under which products of float32 are computed wholly in float32."""
 
 
 @dataclass(frozen=True)
 class Peak:
-    """FLOP/s of matrix products, by the type of what is multiplied.
+    """FLOP/s of matrix products, by the type of the factors.
 
-    `float32` is what JAX makes of it by default: TF32 on tensor cores, one pass of bfloat16 on a TPU.
-    `full_float32` is what is left under `jax_default_matmul_precision` "highest": the ordinary cores of a
-    GPU, six passes of a TPU.
+    `float32` is for JAX's default precision: TF32 on tensor cores, one pass in bfloat16 on a TPU. `full_float32` is for
+    `jax_default_matmul_precision` "highest": the ordinary cores of a GPU, six passes on a TPU.
     """
 
     bfloat16: float
@@ -42,17 +41,18 @@ PEAKS = {
     "TPU v4": _tpu(275e12),
     "TPU v5 lite": _tpu(197e12),
     "TPU v5e": _tpu(197e12),
-    "TPU v5": _tpu(459e12),  # so JAX calls a v5p
+    "TPU v5": _tpu(459e12),  # JAX's name for a v5p
     "TPU v5p": _tpu(459e12),
     "TPU v6 lite": _tpu(918e12),
     "TPU v6e": _tpu(918e12),
 }
-"""From the makers' data sheets, without sparsity, by the start of a device's kind; the longest that fits
+"""From the makers' data sheets, without sparsity, by the beginning of JAX's device kind; the longest that matches
 counts."""
 
 
 def find_peak(kind: str) -> Peak | None:
-    """Peak of one device; None where it is not known: CPUs, slices of a GPU (MIG), variants not in the table."""
+    """Peak of one device; None where it is not known: for CPUs, slices of a GPU (MIG), and variants that are not in the
+    table."""
     fitting = [prefix for prefix in PEAKS if kind.startswith(prefix) and "MIG" not in kind]
     return PEAKS[max(fitting, key=len)] if fitting else None
 

@@ -1,4 +1,4 @@
-"""Exit codes of every program of this project, listed in docs/reliability.md, and how signals stop it."""
+"""The exit codes of all programs of this project, listed in docs/reliability.md, and how signals stop a program."""
 
 from __future__ import annotations
 
@@ -17,31 +17,32 @@ COMPILER = "compile_or_get_cached"
 """JAX's function around the compiler, in its file compiler.py."""
 
 RETRY_EVERY = 0.05
-"""Seconds after which a signal that came during an import or a compilation is delivered again."""
+"""Seconds after which a signal that arrived during an import or a compilation is delivered again."""
 
 
 class Exit(IntEnum):
-    """What a scheduler is told. Codes of signals are those that shells give them."""
+    """What a scheduler is told. Signals have the codes that shells give them."""
 
     DONE = 0
     FAILED = 1  # the work could not be done: data, disk, a trial
     REFUSED = 2  # wrong arguments or configuration, or a directory that another process holds
-    DIVERGED = 3  # a number was not finite: the same command would end so again
-    # EX_TEMPFAIL. Another process of the same program is lost or failed: start all of them again. Or the disk of a run
-    # did not answer for minutes. Of the process of a trial: its files could not be written, its data not be read, or
-    # its accelerator failed.
+    DIVERGED = 3  # a number was not finite: the same command would end in the same way
+    # EX_TEMPFAIL. Another process of the same program was lost or failed: start all of them again. Or the disk of a run
+    # did not answer for minutes. For the process of a trial: its files could not be written, its data could not be
+    # read, or its accelerator failed.
     LOST = 75
-    UNREAD = 128 + signal.SIGPIPE  # whoever read the output does so no more, as `| head`
-    INTERRUPTED = 128 + signal.SIGINT  # Ctrl-C; what could be saved is, and the same command goes on
-    STOPPED = 128 + signal.SIGTERM  # the same, asked for by SIGTERM or SIGHUP
+    UNREAD = 128 + signal.SIGPIPE  # the reader of the output has closed it, such as `| head`
+    INTERRUPTED = 128 + signal.SIGINT  # Ctrl-C; what could be saved is saved, and the same command continues
+    STOPPED = 128 + signal.SIGTERM  # the same, requested by SIGTERM or SIGHUP
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as schedulers send it, or SIGHUP of a terminal that is closed: a program ends as it does on Ctrl-C."""
+    """SIGTERM, which schedulers send, or SIGHUP, from a terminal that was closed: the program ends as it does on
+    Ctrl-C."""
 
 
 _pending: list[Exit] = []
-"""Stop requests of the running blocks whose exceptions may have been swallowed, or that `leave_stop_pending` kept."""
+"""Stop requests to the running blocks: their exceptions may have been swallowed, or `leave_stop_pending` kept them."""
 
 _active_blocks = 0
 """How many blocks of `sigterm_as_interrupt` are running."""
@@ -50,12 +51,12 @@ _active_blocks = 0
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
     """SIGTERM and SIGHUP raise Terminated in the main thread while the block runs; by default they would end the
-    process at once. SIGHUP that is ignored, as under nohup, stays so.
+    process at once. A SIGHUP that is ignored, as under nohup, stays ignored.
 
-    They and SIGINT are held back during imports: an exception in the middle of one is swallowed where a library tries
-    whether a module exists, leaves a module half initialised, or crashes a library's C code. They are held back during
-    compilation too, which cannot be interrupted: an exception raised before the compiled program is used ends the
-    process by a segmentation fault.
+    These signals and SIGINT are held back during imports. An exception in the middle of an import may be swallowed by a
+    library that tests whether a module exists, leave a module half initialised, or crash a library's C code. They are
+    also held back during compilation, which cannot be interrupted: an exception raised before the compiled program is
+    used ends the process with a segmentation fault.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -86,17 +87,17 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 
 def leave_stop_pending(request: Exit) -> None:
-    """Keeps a stop request that came too late for code with signal handlers of its own (the training loop in its last
-    step): `take_pending_stop` returns it. Outside of `sigterm_as_interrupt` it is dropped."""
+    """Keeps a stop request that came too late for code with its own signal handlers (the training loop in its last
+    step): `take_pending_stop` returns it. Outside `sigterm_as_interrupt` it is dropped."""
     if _active_blocks:
         _pending.append(request)
 
 
 def take_pending_stop() -> Exit | None:
-    """The stop request that is pending, once: its exception was swallowed, as in a callback of a library, or it was
-    left pending. None if there is none.
+    """The pending stop request, which is then no longer pending; None if there is none. Its exception was swallowed,
+    for example in a library's callback, or it was left pending.
 
-    Long computations inside a block of `sigterm_as_interrupt` should ask from time to time.
+    Long computations inside a block of `sigterm_as_interrupt` should call this from time to time.
     """
     request = _pending[-1] if _pending else None
     _pending.clear()
@@ -104,8 +105,8 @@ def take_pending_stop() -> Exit | None:
 
 
 def raise_pending_stop() -> None:
-    """Raises the pending stop request, if there is one. Does nothing outside the main thread, which alone gets
-    signals."""
+    """Raises the pending stop request, if there is one. Does nothing outside the main thread, the only one that
+    receives signals."""
     if threading.current_thread() is not threading.main_thread():
         return
     if (request := take_pending_stop()) is not None:
@@ -123,10 +124,10 @@ def _in_import_or_compiler(frame: FrameType | None) -> bool:
 
 
 def take_signal(number: int) -> Exit:
-    """The code after a stop request by SIGINT, SIGTERM or SIGHUP; called by the handlers of these signals.
+    """The exit code for a stop request by SIGINT, SIGTERM or SIGHUP; called by the handlers of these signals.
 
-    Printing on a terminal that is closed would raise OSError, before anything is saved: from now on it goes nowhere.
-    A terminal that is closed sends SIGHUP by its shell and again when the shell ends: further ones are ignored.
+    Printing to a closed terminal would raise OSError before anything is saved, so output to it is discarded from now
+    on. A closed terminal sends SIGHUP through its shell, and again when the shell ends, so further ones are ignored.
     """
     if number == signal.SIGHUP:
         signal.signal(number, signal.SIG_IGN)

@@ -26,8 +26,8 @@ CACHE_VARIABLE = "HMA_CACHE_DIR"
 
 
 def cache_directory() -> Path:
-    """What is kept for later processes of this user: `$HMA_CACHE_DIR`, by default `~/.cache/hma-jax`. Raises
-    ConfigError for a user without a home directory, as in some containers."""
+    """The directory of what is kept for later processes of this user: `$HMA_CACHE_DIR`, by default `~/.cache/hma-jax`.
+    Raises ConfigError for a user without a home directory, as in some containers."""
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen)
     try:
@@ -57,7 +57,7 @@ def sync_tree(directory: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Adds `path` to an OSError of the block that names no file, such as that of a full disk."""
+    """Adds `path` to an OSError from the block that names no file, such as that of a full disk."""
     try:
         yield
     except OSError as error:
@@ -67,8 +67,8 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, data: bytes | str) -> None:
-    """Replaces the file: readers see the old content or the new one, also after a crash. Raises OSError, which keeps
-    the old content."""
+    """Replaces the file: readers see either the old content or the new, even after a crash. Raises OSError, in which
+    case the old content stays."""
     content = data.encode() if isinstance(data, str) else data
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:

@@ -1,14 +1,13 @@
-"""How a process holds host memory: in huge pages, without returning freed memory to the kernel, and with few searches
-for garbage.
+"""How a process holds host memory: in huge pages, without returning freed memory to the kernel, and with infrequent
+garbage collection.
 
-XLA's CPU backend takes its temporary buffers anew for every call. glibc gives blocks of that
-size back to the kernel and asks for them again, and the page faults are then a third of a
-training step. Pages of 2 MiB make them few, and a heap that keeps what is freed needs none.
-All threads share one heap: a block that is larger than a thread's own heap may be, 64 MiB, would be
-mapped anew in every call, whatever the other settings say, and a virtual machine whose host takes back
-pages as soon as they are free has to ask for each of them. On two cores a step of the base model, 3.7 s,
-took 0.2 s more with several heaps, and 2 to 3.5 s more after a pause of seven seconds. docs/performance.md
-says what huge pages gain.
+XLA's CPU backend allocates its temporary buffers anew in every call. glibc returns blocks of that size to the kernel
+and asks for them again, and page faults then take a third of a training step. With pages of 2 MiB there are few, and
+with a heap that keeps freed memory there are none. All threads share one heap. Otherwise a block above 64 MiB, the
+limit of a thread's own heap, would be mapped anew in every call, whatever the other settings; and a virtual machine
+whose host takes back pages as soon as they are free would have to ask for each of them again. On two cores a step of
+the base model, 3.7 s, took 0.2 s more with several heaps, and 2 to 3.5 s more after a pause of seven seconds.
+docs/performance.md says what huge pages gain.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ import sys
 TUNABLES = (
     "glibc.malloc.hugetlb=1",  # transparent huge pages
     "glibc.malloc.mmap_max=0",  # large blocks come from the heap too
-    f"glibc.malloc.trim_threshold={2**36}",  # which does not shrink
-    f"glibc.malloc.top_pad={2**28}",  # and grows by so much
-    "glibc.malloc.arena_max=1",  # for the blocks of all threads
+    f"glibc.malloc.trim_threshold={2**36}",  # the heap does not shrink
+    f"glibc.malloc.top_pad={2**28}",  # it grows in steps of this size
+    "glibc.malloc.arena_max=1",  # one heap for all threads
 )
 
 KEPT_PAGES = {"GLIBC_TUNABLES": ":".join(TUNABLES)}
-"""Environment that a process starts with to hold memory so; glibc reads it before anything of ours runs."""
+"""The environment with which a process starts to hold memory in this way; glibc reads it before our code runs."""
 
 NEW_OBJECTS = 10_000
-"""Python looks for garbage when so many objects were made since, less those that were freed. At 700, its default, it
-took a tenth of the time of importing and tracing, which make millions of objects that stay."""
+"""Python collects garbage when this many more objects were made than freed since the last time. At the default of 700,
+collection took a tenth of the time of importing and tracing, which make millions of objects that stay."""
 
 # Names and numbers of malloc.h.
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
@@ -41,19 +40,18 @@ _keeps_freed_memory = False
 
 
 def restart_keeping_pages() -> None:
-    """Starts the program of this process again, in this process, with `KEPT_PAGES`. Call it first of all, and
-    only where the process is the program's own.
+    """Starts the program of this process again, in this process, with `KEPT_PAGES`. Call it before anything else, and
+    only where the program owns the process.
 
-    Returns where it is so already: the tunables are set, as the user wants them or by an earlier
-    call. Does nothing where the C library is not glibc.
+    Does nothing if the tunables are already set, by the user or by an earlier call, or if the C library is not glibc.
     """
     if "GLIBC_TUNABLES" not in os.environ and is_glibc():
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | KEPT_PAGES)
 
 
 def keep_freed_memory() -> None:
-    """For a process of one core; call before the first computation. Does nothing where the C library is
-    not glibc."""
+    """Keeps freed memory in this process, without a restart; for a process of one core. Call it before the first
+    computation. Does nothing if the C library is not glibc."""
     global _keeps_freed_memory
     if not is_glibc():
         return
@@ -71,7 +69,7 @@ def shares_one_heap() -> bool:
 
 
 def collect_rarely() -> None:
-    """Has Python look for garbage at `NEW_OBJECTS` only. Leaves a higher number alone, and 0, which is never."""
+    """Makes Python collect garbage only at `NEW_OBJECTS`. Keeps a higher threshold, and 0, which means never."""
     if 0 < gc.get_threshold()[0] < NEW_OBJECTS:
         gc.set_threshold(NEW_OBJECTS)
 

@@ -1,21 +1,21 @@
-"""Exclusive locks on files, which end with their process however it ends.
+"""Exclusive locks on files, which are released when their process ends, however it ends.
 
 One primitive for everything that only one process may do: training in a run directory, working in a study's
 directory, making one dataset or one part of it (`data_pipelines.publishing`).
 
-What is promised depends on the file system, which carries flock or does not:
+What is guaranteed depends on how far the file system supports flock:
 
-* A local disk, or a shared one that carries flock between hosts (NFS 4, NFS 3 with its lock service, Lustre
-  mounted with the option flock): one holder at a time; a process that dies by SIGKILL or power loss holds nothing.
-* A shared disk that carries it within a host only (NFS with the options nolock or local_lock, Lustre with the
-  option localflock): one holder on each host. With a *lease*, one holder on all hosts, except that two which ask
-  within the same moment may both get it, and that a lock of a host that died is free after EXPIRES seconds.
-* One that does not take flock at all: a warning; with a lease, as between hosts.
+* A local disk, or a shared one that supports flock between hosts (NFS 4, NFS 3 with its lock service, Lustre mounted
+  with the option flock): one holder at a time. A process that dies by SIGKILL or power loss holds nothing.
+* A shared disk that supports flock only within a host (NFS with the options nolock or local_lock, Lustre with the
+  option localflock): one holder on each host. With a *lease*, one holder on all hosts, except that two processes that
+  ask at the same moment may both get it, and that the lock of a host that died is free only after EXPIRES seconds.
+* A disk that does not support flock at all: a warning is logged; with a lease, it is as between hosts.
 
-A lease is the lock file's time of change, which its holder renews. It is compared with the file system's own
-clock, so the hosts' clocks need not agree; where a directory may only be read, with this host's. A holder that
-was stopped for longer than EXPIRES may lose its lease to another host and finds out by `Lock.lost`: what a lease
-protects must be harmless when done twice.
+A lease is the lock file's modification time, which its holder renews. It is compared with the file system's own clock,
+so the hosts' clocks need not agree; where a directory is read-only, it is compared with this host's clock. A holder
+that was suspended for longer than EXPIRES may lose its lease to another host, and learns this from `Lock.lost`. So what
+a lease protects must be harmless if it is done twice.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ RENEWED_EVERY = 30.0
 """Seconds between two renewals of a lease."""
 
 EXPIRES = 300.0
-"""Seconds without renewal after which a lease of another machine is over."""
+"""Seconds without renewal after which another machine's lease has expired."""
 
 TAKEN = (errno.EAGAIN, errno.EACCES)
 
@@ -56,9 +56,9 @@ class Holder:
     process: int
     host: str
     since: str
-    machine: str = ""  # whose locks this process's are: equal for all containers of a host
-    token: str = ""  # of this one holding
-    locked: bool = True  # whether the file system took the lock
+    machine: str = ""  # the kernel that keeps the locks (`machine`): the same for all containers of a host
+    token: str = ""  # distinguishes this holding of the lock from all others
+    locked: bool = True  # whether the file system supports the lock
 
     def __str__(self) -> str:
         return f"process {self.process} on {self.host}, since {self.since}"
@@ -84,9 +84,10 @@ class Lock:
     holder: Holder
 
     def lost(self) -> bool:
-        """Whether it is another's by now, or gone: possible with a lease only, or if files are removed.
+        """Whether another process holds the lock by now, or its file is gone: possible only with a lease, or if files
+        are removed.
 
-        A lock file that cannot be read now, as on a shared disk that does not answer for a while, counts as held.
+        A lock file that cannot be read at the moment, as on a shared disk that does not answer, counts as held.
         """
         try:
             return read_holder(self.path) != self.holder
@@ -96,11 +97,11 @@ class Lock:
 
 @contextmanager
 def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Iterator[Lock]:
-    """Holds the lock file `path`, which is made if it is missing.
+    """Holds the lock file `path`, which is created if it is missing.
 
-    `lease`: holds it against other machines too where the file system does not (see above). `remove`: the file
-    goes when the lock is given back. Raises Held at once if another process, or another thread, has it, and
-    OSError if the file cannot be read, written and locked now.
+    `lease`: also holds it against other machines where the file system does not (see above). `remove`: deletes the file
+    when the lock is released. Raises Held at once if another process, or another thread, holds it, and OSError if the
+    file cannot be read, written and locked at the moment.
     """
     fd, locked = _open(path, lease)
     try:
@@ -131,7 +132,7 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
 
 @cache
 def machine() -> str:
-    """Names the kernel that keeps this process's locks, since it was booted."""
+    """The name of the running kernel, which keeps this process's locks; it changes with every boot."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:  # not Linux
@@ -139,7 +140,7 @@ def machine() -> str:
 
 
 def _open(path: Path, lease: bool) -> tuple[int, bool]:
-    """The open and locked file, and whether the file system took the lock. Raises Held, OSError."""
+    """The open and locked file, and whether the file system supports the lock. Raises Held, OSError."""
     while True:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
@@ -154,13 +155,13 @@ def _open(path: Path, lease: bool) -> tuple[int, bool]:
 
 
 def find_held(path: Path) -> Held | None:
-    """Returns (does not raise) the error that names the running process which holds the lease `path`; None if nobody
-    holds it. Nothing is written to the lock file. Raises OSError if it cannot be read now."""
+    """Returns (does not raise) the error that names the running process which holds the lease `path`; None if no
+    process holds it. Nothing is written to the lock file. Raises OSError if it cannot be read at the moment."""
     try:
         while True:
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
-                _lock(fd, path, lease=True, kind=fcntl.LOCK_SH)  # NFS gives no other for a file open for reading
+                _lock(fd, path, lease=True, kind=fcntl.LOCK_SH)  # all that NFS allows for a file opened for reading
                 if _same_file(fd, path):  # as in `_open`
                     return None
             finally:
@@ -172,7 +173,7 @@ def find_held(path: Path) -> Held | None:
 
 
 def _lock(fd: int, path: Path, lease: bool, kind: int = fcntl.LOCK_EX) -> bool:
-    """Locks the open file: whether the file system took the lock. Raises Held, OSError."""
+    """Locks the open file. Returns whether the file system supports the lock. Raises Held, OSError."""
     with naming(path):
         locked = _flock(fd, kind)
     if locked is None or lease:
@@ -183,31 +184,33 @@ def _lock(fd: int, path: Path, lease: bool, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def _flock(fd: int, kind: int) -> bool | None:
-    """True: locked; None: another holds it; False: the file system takes no locks. Raises OSError if it fails."""
+    """True: locked; None: another process holds it; False: the file system supports no locks. Raises OSError if it
+    fails."""
     try:
         fcntl.flock(fd, kind | fcntl.LOCK_NB)
         return True
     except OSError as error:
         if error.errno in TAKEN:
             return None
-        if error.errno in IO_ERRNOS:  # nobody knows now whether another holds it
+        if error.errno in IO_ERRNOS:  # unknown whether another process holds it
             raise
         return False
 
 
 def _leased(path: Path, holder: Holder | None, locked: bool) -> bool:
-    """Whether a lock that this kernel gave belongs to a machine whose locks it may not know of."""
+    """Whether the lock, which this kernel granted, is leased by another machine, whose locks it may not know of."""
     if holder is None or (locked and holder.locked and holder.machine == machine()):
         return False
     try:
-        # Either way: a time far ahead is of a clock that was set right since, and nobody renewed the lease after that.
+        # In both directions: a time far ahead comes from a clock that was corrected since, and the lease was not
+        # renewed after that.
         return abs(_now(path) - path.stat().st_mtime) < EXPIRES
-    except FileNotFoundError:  # given back meanwhile, or all of it is removed
+    except FileNotFoundError:  # released in the meantime, or the directory was removed
         return False
 
 
 def _now(path: Path) -> float:
-    """The file system's time, as of a new file beside `path`; where none may be made, this host's."""
+    """The file system's time, read from a new file beside `path`; where none can be created, this host's time."""
     now = path.with_name(f"{path.name}.{secrets.token_hex(4)}.now")
     try:
         now.touch(exist_ok=False)
@@ -229,8 +232,8 @@ def _same_file(fd: int, path: Path) -> bool:
 
 
 def read_holder(path: Path) -> Holder | None:
-    """None if it is gone, given back, or its holder has not written its name yet. Raises OSError if it cannot be
-    read."""
+    """The holder that the lock file names; None if the file is gone, the lock was released, or its holder has not
+    written its name yet. Raises OSError if the file cannot be read."""
     try:
         return Holder(**json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError, ValueError, TypeError):

@@ -1,7 +1,7 @@
-"""The mesh: which device stands where on the axes `data`, `fsdp` and `tensor`.
+"""The mesh: the place of each device on the axes `data`, `fsdp` and `tensor`.
 
-`data` splits the batch, `fsdp` the batch and the storage of parameters, `tensor` what is computed of one
-example. `tensor` communicates most and takes neighbours, `data` least and goes across slices of a machine.
+`data` splits the batch, `fsdp` the batch and the storage of parameters, `tensor` the computation of one example.
+`tensor` communicates most and gets neighbouring devices; `data` communicates least and goes across slices of a machine.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from hma_jax.runtime.sharding import MESH_AXES
 def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -> Mesh:
     """The mesh of `config` over `devices` (default: those of all processes). Raises ConfigError if they do not fit.
 
-    For CPUs, what is compiled from now on leaves no holes in the heap that they compute in
-    (`hma_jax.runtime.heap_holes`).
+    On CPUs, programs compiled from now on leave no holes in the heap (`hma_jax.runtime.heap_holes`).
     """
     devices = jax.devices() if devices is None else devices
     sizes = mesh_sizes(config, len(devices))
@@ -32,7 +31,7 @@ def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -
 
 
 def mesh_sizes(config: MeshConfig, devices: int) -> list[int]:
-    """The mesh's axes over so many devices, -1 filled in. Raises ConfigError if they do not fit."""
+    """The sizes of the mesh's axes over `devices` devices, with -1 filled in. Raises ConfigError if they do not fit."""
     sizes = [config.data, config.fsdp, config.tensor]
     if -1 in sizes and devices % config.min_devices == 0:
         sizes[sizes.index(-1)] = devices // config.min_devices
@@ -47,8 +46,8 @@ def mesh_sizes(config: MeshConfig, devices: int) -> list[int]:
 def arrange(sizes: Sequence[int], devices: Sequence[jax.Device]) -> np.ndarray:
     """Devices as an array of `sizes` in which neighbours on an axis are neighbours in the machine.
 
-    Slices (of TPUs, or of GPUs without NVLink between them) are joined along `data` as far as it goes, then
-    along `fsdp`, then along `tensor`. Raises ConfigError for slices of unequal size.
+    Slices (of TPUs, or of GPUs without NVLink between them) are joined along `data` as far as possible, then along
+    `fsdp`, then along `tensor`. Raises ConfigError for slices of unequal size.
     """
     slices = len({getattr(device, "slice_index", 0) for device in devices})
     if slices == 1:
@@ -62,7 +61,7 @@ def arrange(sizes: Sequence[int], devices: Sequence[jax.Device]) -> np.ndarray:
 
 
 def split_over_slices(sizes: Sequence[int], slices: int) -> list[int]:
-    """How many of the slices stand along each axis; their product is `slices`, which divides that of `sizes`."""
+    """The number of slices along each axis. The product of these numbers is `slices`, which divides that of `sizes`."""
     outer = []
     for size in sizes:
         outer.append(math.gcd(size, slices))
@@ -71,12 +70,12 @@ def split_over_slices(sizes: Sequence[int], slices: int) -> list[int]:
 
 
 def check_mesh(mesh: Mesh, model: ModelConfig, batch: int, accumulate: int = 1) -> None:
-    """Raises ConfigError if a batch, or what `tensor` splits of the model, does not divide over the mesh."""
+    """Raises ConfigError if a batch, or a size of the model that `tensor` splits, does not divide over the mesh."""
     check_sizes([mesh.shape[axis] for axis in MESH_AXES], model, batch, accumulate)
 
 
 def check_sizes(sizes: Sequence[int], model: ModelConfig, batch: int, accumulate: int = 1) -> None:
-    """`check_mesh` by the sizes of the mesh's axes, for devices that are elsewhere."""
+    """`check_mesh` by the sizes of the mesh's axes, for devices that this process does not have."""
     data, fsdp, tensor = sizes
     parts = f" in {accumulate} micro-batches" if accumulate > 1 else ""
     require(

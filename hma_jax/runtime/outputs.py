@@ -1,4 +1,5 @@
-"""Directories that commands write into: made before any work, or refused in words that say what to do."""
+"""Directories that commands write into: they are made before any work, or refused with a message that says what to
+do."""
 
 from __future__ import annotations
 
@@ -14,9 +15,10 @@ from hma_jax.runtime.files import IO_ERRNOS
 
 
 def make_directory(directory: Path, option: str | None = "--out") -> None:
-    """Makes `directory`, if it is not there, and sees that files can be written in it.
+    """Makes `directory` if it does not exist, and checks that files can be written in it.
 
-    Raises ConfigError otherwise; `option` is what the user chose it with, None where it is what the command is about.
+    Raises ConfigError otherwise; `option` is the option with which the user chose it, None where the directory is the
+    command's subject.
     """
     with writing_to(directory, option):
         directory.mkdir(parents=True, exist_ok=True)
@@ -26,8 +28,9 @@ def make_directory(directory: Path, option: str | None = "--out") -> None:
 
 @contextmanager
 def writing_to(directory: Path, option: str | None = "--out") -> Iterator[None]:
-    """An OSError of the block becomes a ConfigError that `directory` cannot be made or written in: which directory
-    above it, or which file, is in the way. That of a disk that fails stays: another choice is no help against it."""
+    """Turns an OSError from the block into a ConfigError that says why `directory` cannot be made or written in: which
+    directory above it, or which file, is in the way. Errors of a failing disk stay as they are: another directory would
+    not help."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The end of a process with its parent, however that ends."""
+"""A process that ends with its parent, however the parent ends."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with(parent: int) -> None:
-    """From now on this process is killed when `parent`, the process that started it, ends: one killed with -9 cannot
-    stop its children. On Linux also when the thread that started it ends."""
+    """From now on this process is killed when `parent`, the process that started it, ends: a parent killed with -9
+    cannot stop its children itself. On Linux this process also ends with the thread that started it."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it died before the line above

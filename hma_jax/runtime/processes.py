@@ -1,7 +1,8 @@
-"""Several processes as one program, on one host or on many: start, collectives of text and numbers, the one writer.
+"""Several processes as one program, on one host or on many: how they start, collectives of text and numbers, and the
+single writer.
 
-A single process needs nothing of it: `start` is not called then, and every other function returns at once. How a lost
-process is noticed, and how the others end, is in `runtime.watchdog`; docs/hosts.md is for users.
+A single process does not need this module: it does not call `start`, and every other function returns at once. How a
+lost process is noticed, and how the others end, is in `runtime.watchdog`; the page for users is docs/hosts.md.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from hma_jax.runtime.sharding import replicated
 
 T = TypeVar("T")
 COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCESS"
-"""Environment variables for what is not given otherwise."""
+"""Environment variables for values that are not given as options."""
 
 MARGIN = 20.0
-"""Seconds by which JAX's own heartbeat timeout exceeds twice `lost_after`: it ends a process without naming the lost
-one, and is the fallback if this process's watchdog is stuck. Twice, because JAX sends its own heartbeat after half its
-timeout only, and counts from the last one."""
+"""Seconds by which JAX's own heartbeat timeout exceeds twice `lost_after`. At that timeout JAX ends a process without
+naming the lost one, so it is only the fallback if this process's watchdog is stuck. The factor is two because JAX sends
+its heartbeat only after half its timeout, and counts from the last one."""
 
 FOR_EVER = 10**12
 """Milliseconds: thirty years."""
@@ -49,14 +50,14 @@ STATUSES = ("ABORTED:", "CANCELLED:", "DEADLINE_EXCEEDED:", "INTERNAL:", "UNAVAI
 class Processes:
     """Which processes make up the program, and how long they wait for each other.
 
-    With `detect`, JAX finds out from Slurm, Kubernetes, a TPU pod or MPI what is not given.
+    With `detect`, JAX finds what is not given from Slurm, Kubernetes, a TPU pod or MPI.
     """
 
     coordinator: str | None = None  # HOST:PORT of process 0, as the others reach it
     processes: int | None = None
     process: int | None = None  # this one's number, from 0
     detect: bool = False
-    start_timeout: float = 300.0  # seconds until all must have come
+    start_timeout: float = 300.0  # seconds within which all must have joined
     lost_after: float = 90.0  # seconds without a heartbeat after which a process is lost
 
     def __post_init__(self):
@@ -103,28 +104,28 @@ class Processes:
 
 
 ALL_DEVICES: list[int] = []
-"""As `local_device_ids` of JAX: all that the process sees."""
+"""The value of JAX's `local_device_ids` that means all devices the process sees."""
 
 
 def own_devices(environment: Mapping[str, str]) -> list[int] | None:
-    """The `local_device_ids` of a process that JAX detects. None leaves the choice to JAX: under Slurm and Open MPI the
-    one GPU whose number is that of the process on its node, elsewhere all.
+    """The `local_device_ids` of a process that JAX detects. None leaves the choice to JAX, which takes, under Slurm and
+    Open MPI, the one GPU with the process's number on its node, and elsewhere all.
 
-    A process that is alone on its node takes all that it sees, and so does one that sees fewer GPUs than there are
-    processes on the node, or as many as Slurm was asked for each (`--gpus-per-task`): they were shared out already, and
-    count from 0 in each.
+    A process that is alone on its node takes all the GPUs that it sees. So does a process that sees fewer GPUs than
+    there are processes on the node, or as many as Slurm was asked for per task (`--gpus-per-task`): the GPUs were
+    already assigned, and are numbered from 0 in each process.
     """
     if "JAX_LOCAL_DEVICE_IDS" in environment:  # the user's choice
         return None
     neighbours, visible = _processes_on_node(environment), environment.get("CUDA_VISIBLE_DEVICES")
     seen = math.inf if visible is None else len(visible.split(","))
     each = environment.get("SLURM_GPUS_PER_TASK", "").rpartition(":")[2]  # such as 2 or h100:2
-    shared_out = seen < neighbours or each == str(seen)  # with --gpu-bind=none each sees all
+    shared_out = seen < neighbours or each == str(seen)  # with --gpu-bind=none each process sees all
     return ALL_DEVICES if neighbours == 1 or shared_out else None
 
 
 def _processes_on_node(environment: Mapping[str, str]) -> int:
-    """How many processes of this program are on this node; 0 if Open MPI and Slurm do not tell."""
+    """How many processes of this program are on this node; 0 if neither Open MPI nor Slurm says."""
     if "OMPI_COMM_WORLD_LOCAL_SIZE" in environment:
         return int(environment["OMPI_COMM_WORLD_LOCAL_SIZE"])
     counts: list[int] = []
@@ -136,12 +137,13 @@ def _processes_on_node(environment: Mapping[str, str]) -> int:
 
 
 def start(asked: Processes) -> None:
-    """Joins the other processes (`jax.distributed`); must be called before anything else of JAX. Does nothing for a
-    single process. Raises ConfigError if joining fails. If not all processes come in time, or this one is asked to stop
+    """Joins the other processes (`jax.distributed`); must be called before JAX is used. Does nothing for a single
+    process. Raises ConfigError if joining fails. If not all processes join in time, or if this one is asked to stop
     while it waits, it prints a message and exits."""
     if not asked.several:
         return
-    # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `AgreedMaximum` sees both.
+    # JAX's own pre-emption service takes SIGTERM away from Python and does not handle Ctrl-C; `AgreedMaximum` handles
+    # both.
     jax.config.update("jax_enable_preemption_service", False)
 
     def join() -> None:
@@ -171,7 +173,8 @@ def start(asked: Processes) -> None:
 
 def _interruptible(call: Callable[[], T], timeout: float | None = None) -> T:
     """What `call` returns or raises. It is called in a thread of its own: JAX waits in calls that no signal interrupts,
-    and here they are handled at once. Raises TimeoutError after `timeout` seconds; the call is then left to itself."""
+    while here signals are handled at once. Raises TimeoutError after `timeout` seconds; the call then goes on in its
+    thread."""
     outcome: Future[T] = Future()
 
     def work() -> None:
@@ -193,7 +196,7 @@ def _join_failure(asked: Processes, reason: str) -> str:
 
 
 def _exit_now(message: str, code: int) -> None:
-    """Ends the process at once: a thread that hangs in a call of JAX would keep a normal exit waiting."""
+    """Ends the process at once: a thread that hangs in a call of JAX would block a normal exit."""
     print(message, file=sys.stderr, flush=True)
     os._exit(code)
 
@@ -213,8 +216,8 @@ def _start_watchdog(lost_after: float) -> None:
 
 
 def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
-    """Called at the end of every process. Without an error all end together; one that failed reports why to the others,
-    and exits here with `code`, since a thread that hangs in a collective would keep a normal exit waiting. `show`:
+    """Called at the end of every process. Without an error all end together. A process that failed reports why to the
+    others and exits here with `code`, because a thread that hangs in a collective would block a normal exit. `show`:
     prints the traceback.
     """
     if jax.distributed.is_initialized() and jax.process_count() > 1:
@@ -250,9 +253,11 @@ def is_writer() -> bool:
 
 
 def all_gather(name: str, text: str) -> list[str]:
-    """The `text` of every process, by process index; all must call it in the same order, under the same `name`.
+    """The `text` of every process, by process index. All processes must call this in the same order, with the same
+    `name`.
 
-    Waits for the slowest without a limit: one that is lost ends the others (`runtime.watchdog`).
+    Waits for the slowest process without a time limit: if one is lost, the watchdog ends the others
+    (`runtime.watchdog`).
     """
     if jax.process_count() == 1:
         return [text]
@@ -260,20 +265,20 @@ def all_gather(name: str, text: str) -> list[str]:
     call = _call_counts[name] = _call_counts.get(name, 0) + 1
     key = f"hma/all_gather/{name}/{call}"
     client.key_value_set(f"{key}/{jax.process_index()}", f"={text}")
-    # Asked for once: JAX keeps a request that timed out, here and in process 0, until the key is set.
+    # Requested only once: JAX keeps a request that timed out, here and in process 0, until the key is set.
     get = lambda p: client.blocking_key_value_get(f"{key}/{p}", FOR_EVER)[1:]
     return _interruptible(lambda: [get(p) for p in range(jax.process_count())])
 
 
 def barrier(name: str) -> None:
     """Waits until all processes have called it. Needed before a program first runs: its collectives wait for processes
-    that still compile it, on CPUs for 30 seconds only."""
+    that are still compiling it, but on CPUs only for 30 seconds."""
     all_gather(name, "")
 
 
 def compiled_by_all(name: str, function: Callable[..., T], *arguments: Any) -> Callable[..., T]:
-    """A jitted `function` to be called with such `arguments`; of several processes all call this, and none returns
-    before all have compiled it (`barrier`)."""
+    """The jitted `function`, to be called with arguments like `arguments`. All processes call this, and none returns
+    before all have compiled the function (`barrier`)."""
     if jax.process_count() == 1:
         return function
     compiled = function.lower(*arguments).compile()
@@ -282,13 +287,14 @@ def compiled_by_all(name: str, function: Callable[..., T], *arguments: Any) -> C
 
 
 def broadcast_from_writer(name: str, text: str) -> str:
-    """The `text` of process 0, in every process; that of the others is ignored. Called by all, as `all_gather`."""
+    """The `text` of process 0, in every process; the text of the others is ignored. All processes call this, as
+    `all_gather`."""
     return all_gather(name, text if is_writer() else "")[0]
 
 
 @contextmanager
 def writer_first(name: str) -> Iterator[None]:
-    """Process 0 goes through the block before the others do: `with writer_first("data"): prepare()`."""
+    """Process 0 runs the block before the others do: `with writer_first("data"): prepare()`."""
     if not is_writer():
         barrier(f"first/{name}")
     yield
@@ -299,8 +305,8 @@ def writer_first(name: str) -> Iterator[None]:
 class AgreedMaximum:
     """The largest number that any process requests in a step, known to all processes at the same step.
 
-    With several processes the maximum over one step is read after the next one was dispatched: no process waits for
-    another more than the steps themselves do.
+    With several processes the maximum of one step is read after the next step was dispatched, so that no process waits
+    for another longer than the steps themselves make it wait.
     """
 
     def __init__(self):
@@ -323,7 +329,7 @@ class AgreedMaximum:
 
     def result(self, request: Callable[[], int]) -> int:
         """The largest of the requests that were submitted last, 0 before the first; a single process gets its own
-        present one."""
+        current request."""
         if self._maximum is None:
             return request()
         return 0 if self._submitted is None else int(self._submitted)
@@ -333,7 +339,7 @@ _call_counts: dict[str, int] = {}
 
 
 def _state() -> Any:
-    """What JAX keeps of its coordination service; it has no public way to it, and Orbax takes this one too."""
+    """JAX's state of its coordination service. There is no public access to it, and Orbax uses this one too."""
     from jax._src import distributed
 
     return distributed.global_state

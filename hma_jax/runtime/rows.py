@@ -1,5 +1,5 @@
-"""Which rows of a global batch a process holds, how rows are split, and host arrays laid out over devices of many
-processes."""
+"""Which rows of a global batch a process holds, how rows are split, and how host arrays are laid out over the devices
+of many processes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from hma_jax.runtime.sharding import batch_sharding, batch_ways, place
 def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:
     """int64, ascending: the rows of a batch of `batch` that this process's devices compute.
 
-    Processes that compute the same rows, as those that share them along `tensor`, get the same ones: one global
-    batch whatever the number of processes. Raises ConfigError for a batch that does not split.
+    Processes that compute the same rows, such as those that share them along `tensor`, get the same ones: there is one
+    global batch, whatever the number of processes. Raises ConfigError for a batch that does not split.
     """
     mesh = make_mesh(mesh) if isinstance(mesh, MeshConfig) else mesh
     if jax.process_count() == 1:
@@ -34,16 +34,16 @@ def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:
 
 
 def split_rows(batch: Any, parts: int) -> Any:
-    """Rows [B, ...] of each array as [n, B / n, ...]: part i takes rows i, i + n, ..., so that every device keeps the
-    rows it has."""
+    """Rows [B, ...] of each array as [n, B / n, ...], where n is `parts`: part i takes rows i, i + n, ..., so that
+    every device keeps its rows."""
     return jax.tree.map(lambda x: rearrange(x, "(b n) ... -> n b ...", n=parts), batch)
 
 
 def lay_out(tree: Any, shardings: Any) -> Any:
-    """Arrays, of the host or on devices, laid out anew.
+    """Arrays, on the host or on devices, laid out as `shardings` say.
 
-    What every process holds by itself is placed shard by shard: `device_put` would gather it from all of them to
-    compare.
+    Arrays that every process holds itself are placed shard by shard: `device_put` would gather them from all processes
+    to compare them.
     """
     if jax.process_count() == 1:
         return jax.device_put(tree, shardings)

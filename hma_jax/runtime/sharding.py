@@ -1,9 +1,9 @@
 """Two tables from logical axes to mesh axes: layouts of stored arrays, and layouts for computing.
 
 `STORAGE` is for parameters, their moments and gradients, `COMPUTE` for activations and for parameters in use. A
-parameter is moved from one layout to the other where it is used (`for_compute`; for those of layers, inside the loop
-over layers), and its gradient is moved back. `hma_jax.kernels.dense` does so for per-robot parameters. Model code names
-logical axes only; the mesh is made in `mesh`, decisions are printed and audited in `audit`.
+parameter is moved from one layout to the other where it is used (`for_compute`; for parameters of layers, inside the
+loop over layers), and its gradient is moved back. `hma_jax.kernels.dense` does this for per-robot parameters. Model
+code names only logical axes. The mesh is made in `mesh`; decisions are printed and audited in `audit`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 
 Axes = tuple[str | None, ...]
-"""A name in the dimension letters for each dimension of an array; None: it has none."""
+"""A dimension letter for each dimension of an array; None: no name."""
 
 Rules = tuple[tuple[str, tuple[str, ...]], ...]
-"""(logical axis, mesh axes), in order: mesh axes split the first dimension so named that they divide, once."""
+"""(logical axis, mesh axes), in order of priority. The mesh axes split the first dimension of that name that they
+divide; each mesh axis is used once."""
 
 MESH_AXES = ("data", "fsdp", "tensor")
 """The axes of every mesh that this package makes (`mesh`)."""
@@ -33,8 +34,8 @@ STORAGE: Rules = (
     ("F", ("tensor",)),
     ("V", ("tensor",)),
     ("D_out", ("tensor",)),
-    # Widths first. A step takes its robots' slices out of arrays that hold all robots: where these are split
-    # by width, every device takes its part and nothing is sent. E comes last, for what has no width that divides.
+    # Widths come first. A step takes its robots' slices out of arrays that hold all robots: where these are split by
+    # width, every device takes its own part and nothing is sent. E comes last, for arrays without a width that divides.
     ("D", ("fsdp",)),
     ("W", ("fsdp",)),
     ("F", ("fsdp",)),
@@ -57,7 +58,7 @@ COMPUTE: Rules = (
 
 
 def partition(axes: Axes, shape: tuple[int, ...], mesh: Any, rules: Rules = COMPUTE) -> PartitionSpec:
-    """Mesh axes for each dimension of an array. What divides nothing is not used: the array is whole along it."""
+    """Mesh axes for each dimension of an array. A mesh axis that divides no dimension is not used."""
     split: list[tuple[str, ...]] = [()] * len(shape)
     for axis, names in rules:
         ways = math.prod(mesh.shape[name] for name in names)
@@ -90,7 +91,7 @@ def storage_partition(axes: Axes, shape: tuple[int, ...], mesh: Any, smallest: i
 
 
 def constrain(x: jax.Array, axes: Axes) -> jax.Array:
-    """Pins an activation's layout under the current mesh (`jax.set_mesh`); without one, x."""
+    """Fixes an activation's layout under the current mesh (`jax.set_mesh`); without a mesh, returns x."""
     if not is_split():
         return x
     return pinned(x, *partition(axes, x.shape, jax.sharding.get_abstract_mesh()))
@@ -105,20 +106,21 @@ def pinned(x: jax.Array, *split: str | tuple[str, ...] | None) -> jax.Array:
 
 
 def mesh_axes(part: str | tuple[str, ...] | None) -> tuple[str, ...]:
-    """The mesh axes that split one dimension, of its entry in a PartitionSpec."""
+    """The mesh axes in `part`, the entry of one dimension in a PartitionSpec."""
     return (part,) if isinstance(part, str) else part or ()
 
 
 def is_split() -> bool:
-    """Whether what is traced runs under a mesh of several devices; what `shard_map` runs on each does not. Under a
-    mesh of the caller's own, with other axes, no layout is set here: shardings are the caller's and the compiler's."""
+    """Whether the traced code runs under a mesh of several devices; code that `shard_map` runs on each device does not.
+    Under a caller's own mesh, with other axes, no layout is set here: the caller and the compiler decide the
+    shardings."""
     mesh = jax.sharding.get_abstract_mesh()
     ours = set(MESH_AXES) <= set(mesh.axis_names)
     return ours and math.prod(mesh.shape[axis] for axis in mesh.auto_axes) > 1
 
 
 def batch_ways(mesh: Any) -> int:
-    """How many parts a batch is split into. Of `mesh` only the shape is read."""
+    """The number of parts that a batch is split into. Only the shape of `mesh` is read."""
     return math.prod(mesh.shape[name] for name in BATCH)
 
 
@@ -151,8 +153,8 @@ _for_compute.defvjp(lambda *args: (_for_compute(*args), None), _for_compute_back
 
 
 def place(array: np.ndarray, sharding: Sharding | None) -> jax.Array:
-    """A host array on devices, shard by shard: each gets its own part and never more. Without a
-    sharding, on the default device."""
+    """A host array placed on devices shard by shard: each device gets only its own part. Without a sharding, on the
+    default device."""
     if sharding is None:
         return jax.device_put(array)
     return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
@@ -164,7 +166,7 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Every device has all of an array."""
+    """The sharding in which every device has the whole array."""
     return NamedSharding(mesh, PartitionSpec())
 
 

@@ -1,4 +1,4 @@
-"""Python code of the user: which is run at all, and errors that name its line, also from within compiled programs."""
+"""Python code of the user: which code may be run, and errors that name its line, even from inside compiled programs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _raised: list[BaseException] = []
 
 @contextmanager
 def naming_line(path: Path, page: str, *others: type[Exception]) -> Iterator[None]:
-    """What the file at `path`, or what it calls, raises becomes a ConfigError in the exception's own words that names
-    the line of the file. Errors of the system, and `others`, have a message of their own."""
+    """Turns an exception raised by the file at `path`, or by what it calls, into a ConfigError with the exception's own
+    text and the line of the file. Errors of the system, and `others`, keep their own message."""
     try:
         yield
     except (OSError, *others):
@@ -37,8 +37,8 @@ def naming_line(path: Path, page: str, *others: type[Exception]) -> Iterator[Non
 
 @contextmanager
 def called_from_program() -> Iterator[None]:
-    """Around what a compiled program calls on the host: keeps the exception that it raises, of which JAX tells no more
-    than the text."""
+    """Used around code that a compiled program calls on the host: keeps its exception, of which JAX passes on only the
+    text."""
     try:
         yield
     except BaseException as error:  # an interrupt by the user too
@@ -48,8 +48,8 @@ def called_from_program() -> Iterator[None]:
 
 @contextmanager
 def raising_as_called() -> Iterator[None]:
-    """Around compiled programs: raises the exception of a call on the host, in place of JAX's, which has its traceback
-    for a text."""
+    """Used around compiled programs: raises the exception of a call on the host instead of JAX's, whose text is the
+    traceback."""
     try:
         yield
     except Exception as error:
@@ -61,13 +61,14 @@ def raising_as_called() -> Iterator[None]:
 
 
 def trust(identity: str) -> None:
-    """Lets code that has this hash run for this user, in every process. Raises OSError."""
+    """Allows code with this hash to run for this user, in every process. Raises OSError."""
     _trusted(identity).parent.mkdir(parents=True, exist_ok=True)
     _trusted(identity).touch()
 
 
 def require_trusted(identity: str, code: Path, how: str) -> None:
-    """Raises ConfigError, which ends with `how` to trust it, for code that this user has neither made nor trusted."""
+    """Raises ConfigError, which ends with `how` (how to trust it), for code that this user has neither made nor
+    trusted."""
     require(
         _trusted(identity).exists(),
         f"{code} is Python code that would be run, and it was not made a tokenizer here; if you trust it: {how}",

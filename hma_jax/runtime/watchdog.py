@@ -1,15 +1,15 @@
 """Heartbeats between processes: when one is lost or fails, all of them end, with an error that names it.
 
 A collective waits for ever for a process that is gone, on most platforms without a message. So every process sends a
-heartbeat to the coordinator (process 0) once a second, over a connection of its own, and receives the latest heartbeats
-of the others. A process whose heartbeat has not changed for `lost_after` seconds is lost; so is the coordinator if it
-has not answered for as long, or refuses connections, which only one that has ended does. A process that finds another
-one lost prints which and exits with Exit.LOST: nothing computed since the last checkpoint could be saved without it.
-One that failed in a way in which it would fail again (REPEATED) is followed by the others with its own code.
+heartbeat to the coordinator (process 0) once a second, each over a new connection, and receives the latest heartbeats
+of the others. A process whose heartbeat has not changed for `lost_after` seconds is lost. So is the coordinator if it
+has not answered for as long, or if it refuses connections, which means that it has ended. A process that finds another
+one lost prints which one and exits with Exit.LOST: without the lost process nothing computed since the last checkpoint
+could be saved. If a process failed in a way in which it would fail again (REPEATED), the others exit with its code.
 
-A cut of the network that is shorter than `lost_after` does nothing: connections go on when it is over. (JAX's own
-heartbeats name nobody, and its service closes connections that are silent in the middle of an answer for 20
-seconds: the less is said there, the longer a cut may last.)
+A network outage that is shorter than `lost_after` has no effect: connections continue when it is over. (JAX's own
+heartbeats name no process, and its service closes connections that are silent for 20 seconds in the middle of an
+answer. The less is sent over it, the longer an outage may last.)
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from typing import Any
 from hma_jax.runtime.exits import Exit
 
 INTERVAL = 1.0  # seconds between two heartbeats
-GRACE = 2.0  # seconds: all may fail in the same way, and then each reports its own error
+GRACE = 2.0  # seconds: if all fail in the same way, each has this time to report its own error
 EXCHANGE_TIMEOUT = 3.0  # seconds for one exchange of heartbeats
 MAX_BYTES = 2**12  # of a heartbeat
 DONE, FAILED = "done", "failed"
-REPEATED = (Exit.REFUSED, Exit.DIVERGED)  # what must not be started again, whichever process a scheduler asks
+REPEATED = (Exit.REFUSED, Exit.DIVERGED)  # not to be started again, whichever process's exit code a scheduler reads
 
 Heartbeat = list[Any]
-"""[count], [DONE] or [FAILED, message, exit code]."""
+"""[count] while the process runs, then [DONE] or [FAILED, message, exit code]."""
 
 
 @dataclass
 class Heartbeats:
-    """The latest heartbeat of every process, as one process knows them, timed by its own clock: clocks are not
+    """The latest heartbeat of every process, as one process knows them. Times are by its own clock: clocks are not
     compared."""
 
     process: int
@@ -50,9 +50,9 @@ class Heartbeats:
     address: str  # of the coordinator
     lost_after: float  # seconds
     clock: Callable[[], float] = time.monotonic
-    last: dict[int, tuple[Heartbeat, float]] = field(default_factory=dict)  # of each process, and when it changed
+    last: dict[int, tuple[Heartbeat, float]] = field(default_factory=dict)  # of each process, and when it last changed
     answered: float = 0.0  # when the coordinator answered last
-    refused: bool = False  # the coordinator takes no connections any more
+    refused: bool = False  # whether the coordinator refuses connections
 
     def __post_init__(self):
         self.answered = self.clock()
@@ -67,12 +67,12 @@ class Heartbeats:
                 self.last[p] = (heartbeat, now)
 
     def extend_deadlines(self, seconds: float) -> None:
-        """For `seconds` in which this process itself was suspended and could not receive any heartbeat."""
+        """Discounts `seconds` in which this process itself was suspended and could not receive any heartbeat."""
         self.answered += seconds
         self.last = {p: (heartbeat, when + seconds) for p, (heartbeat, when) in self.last.items()}
 
     def failure(self) -> tuple[str, int] | None:
-        """Why this process must end, and with which exit code; None: it need not."""
+        """Why this process must end, and with which exit code; None if it need not."""
         for p, (heartbeat, when) in self.last.items():
             if p != self.process and heartbeat[:1] == [FAILED] and self.clock() - when > GRACE:
                 _, message, code = heartbeat
@@ -100,13 +100,13 @@ class Heartbeats:
 
 
 class HeartbeatServer(socketserver.ThreadingTCPServer):
-    """In process 0: keeps the latest heartbeat of every process. A client that sends one, with the program's `token`,
-    gets all of them back."""
+    """Runs in process 0 and keeps the latest heartbeat of every process. A client that sends its heartbeat, with the
+    program's `token`, gets all of them back."""
 
     daemon_threads, allow_reuse_address, request_queue_size = True, True, 1024
 
     def __init__(self, token: str):
-        # The coordinator's address may be of either kind, and JAX's own service listens to both too.
+        # The coordinator's address may be IPv4 or IPv6; JAX's own service listens on both too.
         self.address_family = socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET
         super().__init__(("", 0), _HeartbeatHandler)
         self.token, self.heartbeats = token, dict[int, Heartbeat]()
@@ -114,7 +114,7 @@ class HeartbeatServer(socketserver.ThreadingTCPServer):
 
     def server_bind(self) -> None:
         if self.address_family == socket.AF_INET6:
-            self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, False)  # of IPv4 too
+            self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, False)  # accepts IPv4 too
         super().server_bind()
 
     @property
@@ -184,7 +184,7 @@ class Watchdog:
                 self.heartbeats.receive(self._exchange(self.heartbeats.process, [count]))
             except ConnectionRefusedError:
                 self.heartbeats.refused = True
-            except (OSError, ValueError):  # for now; `_check` counts for how long
+            except (OSError, ValueError):  # may pass; `_check` measures how long it lasts
                 pass
             self._ended.wait(INTERVAL)
 
@@ -192,7 +192,7 @@ class Watchdog:
         checked = self.heartbeats.clock()
         while not self._ended.wait(INTERVAL / 2):
             slept, checked = self.heartbeats.clock() - checked, self.heartbeats.clock()
-            if slept > 5 * INTERVAL:  # stopped, or a machine that was
+            if slept > 5 * INTERVAL:  # this process, or its machine, was suspended
                 self.heartbeats.extend_deadlines(slept)
             failure = self.heartbeats.failure()
             if failure is not None and not self._ended.is_set():
@@ -209,7 +209,7 @@ def start(heartbeats: Heartbeats, exchange: Callable[[int, Heartbeat], dict[int,
 def stop(error: str | None = None, code: int = Exit.DONE, *, perhaps_lost: bool = False) -> None:
     """At the end of this process: tells the others that it is done, or why it failed and with which exit code.
 
-    `perhaps_lost`: the error may be due to the loss of another process; the watchdog then gets the time to find which.
+    `perhaps_lost`: the error may be due to the loss of another process; the watchdog then gets time to find out which.
     """
     global _watchdog
     watchdog, _watchdog = _watchdog, None
@@ -229,15 +229,15 @@ _watchdog: Watchdog | None = None
 
 def _exit_now(failure: str, code: int) -> None:
     print(f"error: {failure} (exit code {int(code)})", file=sys.stderr, flush=True)
-    os._exit(code)  # threads that wait in collectives would keep a normal exit waiting
+    os._exit(code)  # threads that wait in collectives would block a normal exit
 
 
 def _delay_aborts() -> None:
-    """Delays JAX's abort of a process whose connection to the coordinator broke, which names no process.
+    """Delays JAX's abort of a process whose connection to the coordinator broke, because its message names no process.
 
-    The C function `sleep` is installed as the handler of SIGABRT: the aborting thread sleeps for six seconds, the
-    number of the signal, in which the watchdog reports the lost process. It is C because the thread may have stopped
-    anywhere, where Python cannot run.
+    The C function `sleep` is installed as the handler of SIGABRT: the aborting thread sleeps for six seconds (the
+    signal's number), in which the watchdog reports the lost process. It is a C function because the thread may have
+    stopped anywhere, where Python code cannot run.
     """
     libc = ctypes.CDLL(None)
     libc.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
