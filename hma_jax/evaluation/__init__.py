@@ -1,1 +1,1 @@
-"""Evaluation: what a model is asked to predict, every window's numbers, their means and errors."""
+"""Evaluation: what a model is asked to predict, the numbers of every window, and their means with errors."""

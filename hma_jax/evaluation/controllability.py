@@ -1,14 +1,14 @@
-"""Whether a model's frames are those of the actions it is given, and not of any others.
+"""Whether a model's frames follow the actions that it is given, and no others.
 
-* action-nats: what the likelihood of the recorded frames loses when the actions are those of another episode of
-  the same robot, in nats per token (continuous: in units of the diffusion loss, at common noise). Paired, over all
-  tokens, and in distribution, where random actions of delta PSNR are none that the robot was ever given.
-* retrieval: how often the true actions give the recorded frames the highest likelihood among them and those of the
-  other episodes. Of sequences that are equally likely each is taken with equal chance: a model that
-  ignores actions finds the true ones one time in sixteen, exactly.
-* counterfactual PSNR: a rollout under another episode's actions against the true frames under those actions, where a
-  simulator made them. Its gain is over the rollout under the recorded actions, compared with the same frames: more
-  than zero only if the model goes where the other actions lead.
+* action-nats: how much less likely the recorded frames become when the actions are those of another episode of the same
+  robot, in nats per token (continuous: in units of the diffusion loss, with the same noise). The comparison is paired,
+  over all tokens, and in distribution; the random actions of delta PSNR are unlike any that the robot was given.
+* retrieval: how often, of the true actions and those of the other episodes, the true ones give the recorded frames the
+  highest likelihood. Among equally likely sequences each is chosen with equal chance, so a model that ignores actions
+  finds the true ones exactly one time in sixteen (with fifteen other sequences).
+* counterfactual PSNR: a rollout under another episode's actions, compared with the true frames under those actions,
+  where a simulator made them. The counterfactual gain is its difference from the PSNR of the rollout under the recorded
+  actions, compared with the same frames: it is above zero only if the model goes where the other actions lead.
 
 Every sequence is evaluated by the same program, one after the other, so that equal likelihoods are equal to the last
 bit.
@@ -27,8 +27,8 @@ from hma_jax.evaluation.metrics import difference, mean_over_frames, psnr
 def for_each_sequence(
     evaluate: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BOTU: jax.Array
 ) -> dict[str, jax.Array]:
-    """`evaluate`, which maps actions [B, T, U] to metrics of each window [B], applied to the true sequence and to each
-    of the others, in turn: [1 + O, B]."""
+    """`evaluate`, which maps actions [B, T, U] to metrics of each window [B], applied to the true sequence and then to
+    each of the others: [1 + O, B]."""
     sequences = jnp.concatenate([actions_BTU[:, None], others_BOTU], axis=1)
     return jax.lax.map(evaluate, jnp.moveaxis(sequences, 1, 0))
 
@@ -36,7 +36,8 @@ def for_each_sequence(
 def action_metrics(loss_OB: jax.Array, valid_BO: jax.Array) -> dict[str, jax.Array]:
     """Action-nats and retrieval, [B] each, nan where no other sequence is valid.
 
-    `loss_OB` [1 + O, B]: under the true actions, then under the others, of which those marked in `valid_BO` count.
+    `loss_OB` [1 + O, B]: the loss under the true actions, then under the others. Only the others marked in `valid_BO`
+    count.
     """
     truth, others, valid = loss_OB[0], loss_OB[1:], valid_BO.T
     count = jnp.sum(valid, axis=0)
@@ -61,10 +62,11 @@ def counterfactual(
     seen_B: jax.Array,
     real_BT: jax.Array | None,
 ) -> dict[str, jax.Array]:
-    """Counterfactual PSNR, that of copying, and the gain, [B] each, nan where not `seen_B`.
+    """Counterfactual PSNR, the PSNR of copying, and the gain, [B] each, nan where `seen_B` is False.
 
-    Images uint8 [B, n, H, W, 3] after the prompt: made under the recorded actions (`shown`), under the `other` ones,
-    and the `truth` under those; `before` [B, 1, H, W, 3] is the last of the prompt. Over frames that are `real_BT`.
+    Images uint8 [B, n, H, W, 3] after the prompt: made under the recorded actions (`shown`) and under the `other`
+    actions, and the `truth` under the other actions. `before` [B, 1, H, W, 3] is the last image of the prompt. Means
+    are over the frames that are `real_BT`.
     """
     made = jnp.stack([other, shown], axis=1)  # in one array: equal images get equal numbers, to the last bit
     of_frames = jax.lax.optimization_barrier(psnr(made, jnp.broadcast_to(truth[:, None], made.shape)))

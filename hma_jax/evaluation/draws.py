@@ -1,8 +1,8 @@
-"""Every random number of an evaluation, as a function of the seed and of what it is drawn for.
+"""Every random number of an evaluation, as a function of the seed and of its purpose.
 
-A window is known by its robot's name, its episode and its start. No number depends on which other
-robots the table has, how wide the widest robot's chunks are, the batch, the row in it or the devices:
-every trial, and every model that robots were added to, is judged with the same ones.
+A window is identified by its robot's name, its episode and its start. No number depends on the other robots in the
+table, the width of the widest robot's chunks, the batch, the row in it or the devices. So every trial, and every model
+to which robots were added, is judged with the same numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hma_jax.kernels.random import draw_flat, key_of
 from hma_jax.model.embodiments import EmbodimentTable
 
 Purpose = Literal["actions", "decoding", "likelihood", "policy"]
-"""What random numbers are for; each purpose has its own."""
+"""What random numbers are for; each purpose has its own numbers."""
 
 
 def window_keys(
@@ -47,16 +47,16 @@ def window_keys(
 def random_actions(key_B: jax.Array, statistics: tuple[jax.Array, jax.Array], draws: int, frames: int) -> jax.Array:
     """[B, draws, T = frames, U]: N(mean, std) by `statistics` (mean, std), float32 [B, U] each, both 0 in the padding.
 
-    They should be of all recorded actions: a table's may be of the training subset only.
+    The statistics should be those of all recorded actions: a table's may be those of the training subset only.
 
-    Every value of a chunk has a key of its own: a wider robot in the table adds keys and changes none.
-    Bit for bit the same in batches of any shape.
+    Every value of a chunk has a key of its own: a wider robot in the table adds keys and changes none. The result is
+    the same, bit for bit, in batches of any shape.
     """
     mean_BU, std_BU = statistics
     of_window = jax.vmap(jax.random.fold_in, (None, 0))
     key_BU = jax.vmap(of_window, (0, None))(key_B, jnp.arange(mean_BU.shape[1]))
     noise = jnp.moveaxis(draw_flat(_normal, key_BU, (draws, frames)), 1, -1)
-    # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
+    # Without the barrier, compilers fuse product and sum for some shapes, and round once less.
     from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)
     return mean_BU[:, None, None] + from_mean
 
@@ -78,8 +78,8 @@ def _quantiles() -> np.ndarray:
 
 
 def _normal(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """N(0, 1) to 16 bits, by a table: `jax.random.normal` computes a logarithm, whose last bit depends on
-    the shape of the array and on the processor."""
+    """N(0, 1) to 16 bits, from a table: `jax.random.normal` computes a logarithm, whose last bit depends on the shape
+    of the array and on the processor."""
     return jnp.asarray(_quantiles(), dtype)[jax.random.bits(key, shape, jnp.uint32) >> 16]
 
 

@@ -1,12 +1,12 @@
-"""What each action dimension does to a model's frames, and whether that is what it did when they were recorded.
+"""What each action dimension does to a model's frames, and whether it did the same when they were recorded.
 
-The loss of recorded frames is compared under the recorded actions and under changed ones: one dimension held still,
-negated, scaled, or exchanged with another. If the model uses a dimension, holding it still makes the recorded frames
-less likely; if a dimension's sign, scale or position differs from the training data, changing it back makes them *more*
+The loss of recorded frames is compared under the recorded actions and under changed ones: one dimension is held still,
+negated, scaled, or swapped with another. If the model uses a dimension, holding it still makes the recorded frames less
+likely; if a dimension's sign, scale or position differs from the training data, changing it back makes them *more*
 likely. No simulator and no other recording is needed: the frames show what the action did.
 
-Changes are of raw values, as a robot's driver would get them wrong. Differences are paired by window and their errors
-clustered by episode.
+Changes are made to raw values, as a wrong driver of a robot would make them. Differences are paired by window and their
+errors clustered by episode.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from hma_jax.objective.masking import hidden_at_inference
 Kind = Literal["still", "negated", "scaled", "swapped"]
 
 FACTORS = (1 / 50, 1 / 10, 1 / 3, 3.0, 10.0, 50.0)
-"""By which a dimension is scaled to see whether the frames fit better then."""
+"""Factors by which a dimension is scaled, to see whether the frames then fit better."""
 
 MAX_SWAPS = 45
-"""Exchanges of two dimensions that are tried at most: all of up to ten; of more dimensions, those between the ones that
-make the frames no likelier as they are."""
+"""The most swaps of two dimensions that are tried: all of them for up to ten dimensions; for more, only those between
+dimensions that, as recorded, do not make the frames likelier."""
 
 MIN_LOSS_ERRORS, MIN_GAIN_ERRORS = 2.0, 3.0
-"""Standard errors from which on a difference counts: of the loss from holding a dimension still, and of the gain from
-the best of many changes."""
+"""The number of standard errors from which on a difference counts: for the loss from holding a dimension still, and for
+the gain from the best of many changes."""
 
 
 MIN_EPISODES = 4
-"""Episodes that a standard error needs at least."""
+"""The fewest episodes from which a standard error is computed."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ class Change:
 
     @property
     def dimensions(self) -> tuple[int, ...]:
-        """The dimensions whose values it changes."""
+        """The dimensions whose values this changes."""
         return (self.dimension, self.other) if self.kind == "swapped" else (self.dimension,)
 
     def __call__(self, actions: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Actions [..., A] so changed; held still, a value is its mean [A]."""
+        """Actions [..., A] with this change; a value held still is its mean, from `mean` [A]."""
         changed, d = actions.copy(), self.dimension
         if self.kind == "still":
             changed[..., d] = mean[d]
@@ -77,7 +77,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean loss under a change less the loss as recorded, with its standard error over so many `episodes`."""
+    """Mean loss under a change minus that of the recorded actions, with its standard error over `episodes` episodes."""
 
     mean: float
     sem: float
@@ -85,8 +85,8 @@ class Difference:
 
     @property
     def errors(self) -> float:
-        """The difference in standard errors: those of a normal distribution that is as unlikely as Student's t makes it
-        with few episodes."""
+        """The difference in standard errors of a normal distribution: the value that is as unlikely there as the
+        difference is under Student's t with these few episodes."""
         if self.mean == 0:
             return 0.0
         if not self.sem > 0:
@@ -97,12 +97,12 @@ class Difference:
 
 @dataclass(frozen=True)
 class Effect:
-    """What was found of one dimension. `worth` is what holding it still costs, in nats per token (continuous: in units
-    of the diffusion loss), all that was found wrong being changed back."""
+    """What was found for one dimension. `worth` is what holding it still costs, in nats per token (continuous: in units
+    of the diffusion loss), after all errors that were found have been changed back."""
 
     dimension: int
     worth: Difference
-    better: Change | None  # under which the recorded frames are likelier than as recorded, and by how much
+    better: Change | None  # a change that makes the recorded frames likelier, and by how much
     gain: Difference | None
 
     @property
@@ -116,11 +116,11 @@ LossFn = Callable[[np.ndarray], np.ndarray]
 
 
 def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode: Sequence[int]) -> list[Effect]:
-    """The effect of each dimension of `actions` [n, T, stride, A]; `episode` [n] says which episode each window is of.
+    """The effect of each dimension of `actions` [n, T, stride, A]; `episode` [n] is the episode of each window.
 
-    Greedy: the change that helps most is applied first, then the rest is evaluated again, since a wrong dimension makes
-    others look wrong.
-    Raises ConfigError for fewer than MIN_EPISODES episodes, too few for a standard error.
+    The search is greedy: the change that helps most is applied first, then the others are evaluated again, because one
+    wrong dimension makes others look wrong. Raises ConfigError for fewer than MIN_EPISODES episodes, too few for a
+    standard error.
     """
     there = len(set(episode))
     require(there >= MIN_EPISODES, f"{there} episodes; measuring the effect of actions needs at least {MIN_EPISODES}")
@@ -132,7 +132,7 @@ def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode
         for change in _changes(count, found, still, losses, episode):
             after = loss_of(change(actions, mean))
             helps = _clustered(after - losses, episode).errors < -MIN_GAIN_ERRORS
-            # If holding it still helps as much, the value is merely harmful, not changed in this way.
+            # If holding it still helps as much, the value is only harmful, and was not changed in this way.
             if helps and all(
                 _clustered(after - still[d], episode).errors < -MIN_LOSS_ERRORS for d in change.dimensions
             ):
@@ -150,7 +150,7 @@ def find_effects(loss_of: LossFn, actions: np.ndarray, mean: np.ndarray, episode
 def _changes(
     count: int, found: Container[int], still: Sequence[np.ndarray], losses: np.ndarray, episode: Sequence[int]
 ) -> Iterator[Change]:
-    """The edits still to be tried, of dimensions with which nothing was found wrong yet."""
+    """The changes still to be tried, of dimensions for which no error was found yet."""
     left = [d for d in range(count) if d not in found]
     for d in left:
         yield Change(d, "negated")
@@ -171,8 +171,8 @@ def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
 def make_loss(
     model: ModelConfig, table: EmbodimentTable, setting: MaskingSetting, execution: ExecutionConfig = ExecutionConfig()
 ) -> Callable[[Params, dict[str, jax.Array], jax.Array], jax.Array]:
-    """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted; the
-    batch is as `protocol.Batch` says, `setting` what the model was trained for."""
+    """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted. The
+    batch is a `protocol.Batch`; `setting` is what the model was trained for."""
     declared = declare_model(model, table, execution)
 
     def loss(params: Params, batch: dict[str, jax.Array], actions: jax.Array) -> jax.Array:
@@ -180,7 +180,7 @@ def make_loss(
         real_from_1 = None if real is None else real[:, 1 : model.frames]
         hidden = hidden_at_inference(table, setting, batch["embodiment"], model.frames)
         token_outputs = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
-        # Common noise under all changes.
+        # The same noise under all changes.
         key_B = jax.vmap(key_of)(jnp.arange(len(tokens))) if model.diffusion else None
         return window_loss(hma, token_outputs, tokens[:, 1:], key_B, real_from_1)
 

@@ -1,8 +1,8 @@
 """Applies the protocol to a trained model: batches in, a table of windows out.
 
-One compiled call per batch predicts, decodes and compares. The batch lies over the devices of the
-mesh, some windows at a time (`execution.windows_at_once`), and only numbers per window come back: those
-of one batch are read while the devices work on the next.
+One compiled call per batch predicts, decodes and compares. The batch is split over the devices of the mesh, which
+compute some windows at a time (`execution.windows_at_once`). Only numbers per window are returned; those of one batch
+are read while the devices work on the next.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ REQUIRED_ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "image
 """Arrays of a batch that go to the devices."""
 
 STATISTICS = ("action_mean", "action_std")
-"""Further ones, by default the table's."""
+"""Further arrays, by default made from the table's statistics."""
 
 OPTIONAL_ARRAYS = ("real", "other_actions", "other_valid", "other_images", "other_seen")
-"""Further ones, where a batch has them."""
+"""Further arrays, where a batch has them."""
 
 WHOLE = 1 / 8
 """Parameters that take at most this share of a device's memory are not split along `fsdp` (`evaluation_mesh`)."""
 
 MetricParams = tuple[Params, Params | None]
-"""Parameters that metrics need: of the tokenizer, which decodes tokens to images, and of `lpips` where it is asked
-for."""
+"""Parameters that metrics need: those of the tokenizer, which decodes tokens to images, and those of `lpips`, where it
+is configured."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +81,16 @@ def evaluate(
 ) -> Evaluation:
     """Applies the protocol to `batches`, equal in shape.
 
-    A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's) and valid
-    (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the
-    model was trained for. `progress` is called with the number of windows done so far. Batches that are in `parts`
-    are not measured again, and what others give is added to it. With several processes (`runtime.processes`) all call
-    this with the same batches, and each gets the whole result; they measure every batch. A model that was trained
-    for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for incomplete
+    A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's dataset)
+    and valid (bool [B]: rows that are not padding); all batches have the same optional arrays. `setting` is what the
+    model was trained for. `progress` is called with the number of windows done so far. Batches that are in `parts` are
+    not measured again, and the results of the others are added to it. With several processes (`runtime.processes`) all
+    call this with the same batches, and each gets the whole result; `parts` is then not used. A model that was trained
+    only for actions has no metrics of frames and no samples. Raises ConfigError if there is no window, for incomplete
     batches, unknown ids or robots and parameters of another model, for a model whose predictions are not finite, or as
     `make_predictor` and `lpips.load_lpips`.
     """
-    # The robots' statistics are no constants of the program, so that models trained on other episodes share it.
+    # The robots' statistics are not constants of the program, so that models trained on other episodes share it.
     known, means, stds = table.standardised(), *table.statistics()
     declared = declare_model(model, known, execution)
     require_params(declared, params, "these parameters are not those of the model")
@@ -102,7 +102,7 @@ def evaluate(
     metric_params = (tokenizer.params, load_lpips() if config.lpips else None)
     metric_params, units = lay_out((metric_params, table.scale()), replicated(mesh))
 
-    if jax.process_count() > 1:  # they would have to agree on what each finds on its disk
+    if jax.process_count() > 1:  # processes would have to agree on what each finds on its disk
         parts = None
 
     def dispatched() -> Iterator[tuple[dict[str, Any], Part | tuple[dict[str, jax.Array], Predicted | None]]]:
@@ -147,13 +147,13 @@ def evaluate(
 
 
 def evaluation_mesh(config: MeshConfig, params: Params) -> MeshConfig:
-    """The mesh to evaluate on: that of `config`, with the devices along `fsdp` along `data` instead if each can hold
-    all parameters. Otherwise every layer of every pass over a frame would gather its own again. Both split the
-    windows alike. Called by all processes."""
+    """The mesh to evaluate on: that of `config`, but with the devices of `fsdp` moved to `data` if each device can hold
+    all parameters, because with `fsdp` every layer gathers its parameters again in every pass over a frame. Both meshes
+    split the windows in the same way. All processes call this."""
     data, fsdp, tensor = mesh_sizes(config, jax.device_count())
     size = sum(x.nbytes for x in jax.tree.leaves(params)) / tensor
     device = jax.local_devices()[0]
-    unknown = math.inf if device.platform == "cpu" else 0  # CPUs do not say, nor do GPUs by some of XLA's allocators
+    unknown = math.inf if device.platform == "cpu" else 0  # CPUs do not say, nor do GPUs with some of XLA's allocators
     memory = (device.memory_stats() or {}).get("bytes_limit", unknown)
     whole = broadcast_from_writer("evaluation_mesh", "whole" if size <= WHOLE * memory else "")
     return replace(config, data=data * fsdp, fsdp=1, tensor=tensor) if whole else config
@@ -171,8 +171,8 @@ def make_evaluator(
 ) -> Callable[[Params, MetricParams, ActionUnits, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
     """A jitted f(parameters, MetricParams, ActionUnits, batch with images) -> (metrics {name: [B]}, Predicted).
 
-    Runs under `jax.set_mesh`. Of B windows `plan_groups` says how many are in memory at a time; B is a
-    multiple of that. Raises ConfigError as `make_predictor`.
+    Runs under `jax.set_mesh`. `plan_groups` says how many of the B windows are in memory at a time; B is a multiple of
+    that. Raises ConfigError as `make_predictor`.
     """
     mesh = make_mesh(execution.mesh)
     predict = make_predictor(model, table, config, setting, execution)
@@ -201,10 +201,11 @@ def make_evaluator(
 
 
 def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: MaskingSetting) -> None:
-    """Raises ConfigError for a window without a frame to compare, or, of what predicts none, without an action."""
+    """Raises ConfigError for a window without a frame to compare or, for a model that predicts no frames, without an
+    action."""
     if "real" not in batch:
         return
-    least = config.first_predicted + (setting != "policy")  # whose last chunk follows the last frame
+    least = config.first_predicted + (setting != "policy")  # with "policy" the last chunk follows the last frame
     real = np.where(batch["valid"], np.sum(batch["real"], axis=1), least)
     row = int(np.argmin(real))
     if config.context == "generated":
@@ -222,7 +223,8 @@ def _check_lengths(batch: dict[str, Any], config: EvalConfig, setting: MaskingSe
 def _samples(
     batch: dict[str, Any], predicted: Predicted | None, left: dict[str, int]
 ) -> tuple[tuple[str, Sample], ...]:
-    """The first windows of each dataset, at most as many as are `left` to take; none of a model without frames."""
+    """The first windows of each dataset, at most as many as are `left` to take; none for a model that predicts no
+    frames."""
     found = []
     for row in np.flatnonzero(batch["valid"]).tolist() if predicted is not None else ():
         name = str(batch["dataset"][row])
@@ -233,11 +235,11 @@ def _samples(
 
 
 def _sample(batch: dict[str, Any], predicted: Predicted, row: int) -> Sample:
-    """One window of a batch on the host, its padding frames replaced by its last real one."""
+    """One window of a batch on the host, with its padding frames replaced by its last real frame."""
     real = batch["real"][row] if "real" in batch else np.ones(len(batch["images"][row]), bool)
 
     def held(clips: Any) -> np.ndarray:
-        # Fetched whole: a row that is picked on the devices would wait for the next batch.
+        # The whole array is fetched: a row picked on the devices would wait for the next batch.
         return hold_last_frame(np.asarray(clips)[row], real)
 
     random = None if predicted.random is None else held(predicted.random)
@@ -254,7 +256,8 @@ def hold_last_frame(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 
 def plan_groups(rows: int, at_once: int, ways: int) -> tuple[int, int]:
-    """(groups, rows of each) of at most `at_once` rows per device, to hold `rows` with few left over."""
+    """(groups, rows of each group): groups of at most `at_once` rows per device that hold `rows` rows with few left
+    over."""
     groups = -(-rows // (at_once * ways))
     return groups, -(-rows // (groups * ways)) * ways
 
@@ -289,7 +292,8 @@ def _on_each_device(function: Callable[..., Any], mesh: Mesh) -> Callable[..., A
 
 
 def _put(batch: dict[str, np.ndarray], rows: int, mesh: Mesh) -> dict[str, jax.Array]:
-    """A batch, the same in every process, over the devices; its last row is repeated up to `rows`."""
+    """A batch, which is the same in every process, split over the devices; its last row is repeated up to `rows`
+    rows."""
     sharding = batch_sharding(mesh)
 
     def put(x: np.ndarray) -> jax.Array:

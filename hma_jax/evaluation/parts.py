@@ -1,6 +1,6 @@
-"""Batches of an evaluation that are measured already, on disk until the evaluation ends.
+"""The batches of an evaluation that have been measured, kept on disk until the evaluation ends.
 
-An evaluation of hours that is stopped, by the end of a job's time for example, goes on after them.
+An evaluation of hours that is stopped, for example by a job's time limit, continues after them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.runtime.files import write_file
 
 SAVE_SECONDS = 60.0
-"""After so long at most what was measured is on disk: an evaluation that takes less writes nothing here."""
+"""The longest time until results are on disk. An evaluation that takes less time writes nothing here."""
 
 STAMP = "made_from"
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class Part(NamedTuple):
-    """What one batch gave."""
+    """The results of one batch."""
 
     windows: WindowTable
     samples: tuple[tuple[str, Sample], ...]  # (dataset, window to look at)
@@ -39,8 +39,8 @@ class Part(NamedTuple):
 class Parts:
     """The parts of one evaluation in `directory`. Use `remove` once its result is written.
 
-    `made_from()` says on what its numbers depend, as anything that can be JSON. Parts that were made from something
-    else are removed.
+    `made_from()` returns what its numbers depend on, as JSON types. Parts that were made from something else are
+    removed.
     """
 
     def __init__(self, directory: Path, made_from: Callable[[], Any], every: float = SAVE_SECONDS):
@@ -50,7 +50,7 @@ class Parts:
             self.remove()
 
     def read(self, n: int) -> Part | None:
-        """What batch n gave; None if it was not kept, or its file is damaged, which is logged."""
+        """The results of batch n; None if they were not kept, or if their file is damaged, which is logged."""
         path = self.directory / f"{n}.npz"
         if not path.exists():
             return None
@@ -62,7 +62,7 @@ class Parts:
             return None
 
     def add(self, n: int, part: Part) -> None:
-        """Keeps what batch n gave. Raises OSError if it cannot be written."""
+        """Keeps the results of batch n. Raises OSError if they cannot be written."""
         self._waiting[n] = part
         if time.monotonic() - self._saved >= self._every:
             self.directory.mkdir(parents=True, exist_ok=True)

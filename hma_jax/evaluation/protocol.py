@@ -1,30 +1,29 @@
-"""The evaluation protocol: what a model is asked to predict of a window.
+"""The evaluation protocol: what a model is asked to predict in a window.
 
 Paper section 4 (Metrics), reference section 6. For every window of a frozen manifest:
 
 * likelihood: cross-entropy (continuous: diffusion loss) of each frame, wholly masked, given the
   true frames before it;
 * fidelity: PSNR and SSIM, means over the predicted frames, of an autoregressive rollout from the
-  prompt against the recorded images (not their reconstruction by the tokenizer); windows longer
-  than the model's are continued past it, and their likelihood is that of the first T frames;
+  prompt against the recorded images (not their reconstruction by the tokenizer); for windows longer than the model's,
+  rollouts continue past it, and the likelihood is that of the first T frames;
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
-  under random action sequences, unmasking with the same random numbers;
-* controllability again, where a batch has other episodes' actions: action-nats, retrieval and counterfactual PSNR
+  under random action sequences, with the same random numbers for unmasking;
+* more on controllability, where a batch has other episodes' actions: action-nats, retrieval and counterfactual PSNR
   (`controllability`);
 * policy, where the model was trained to predict actions: squared error of every chunk after the
   prompt, given the true frames and actions before it (inverse dynamics: of every chunk that leads to
   a frame of the window, given all frames and no action), against that of the mean action.
 
-A model trained on passive video is shown no action anywhere. One that was trained for actions alone is not asked for
-frames.
+A model trained on passive video is shown no actions at all. A model trained only for actions is not asked for frames.
 
-With `eval.context` "recorded" every frame is predicted from recorded ones and random actions
-replace all of a window's, as the release does: for comparison with published figures.
-DIFFERS: `psnr` is the mean over all predicted frames, as SSIM is; the release's PSNR is that of the last frame,
-`psnr_last` here. Random and true actions share their random numbers (reference section 6.3). The
-release's own autoregressive mode replaces one context frame only (reference section 6.2); ours is a rollout.
+With `eval.context` "recorded" every frame is predicted from recorded frames, and random actions replace all actions of
+a window, as in the release; this is for comparison with published figures. DIFFERS: `psnr` is the mean over all
+predicted frames, as SSIM is; the release's PSNR is that of the last frame, `psnr_last` here. Random and true actions
+share their random numbers (reference section 6.3). The release's own autoregressive mode replaces only one context
+frame (reference section 6.2); ours is a rollout.
 
-Everything here is pure and works on tokens; how predicted ones compare as images is in `images`.
+Everything here is pure and works on tokens; their comparison as images is in `images`.
 """
 
 from __future__ import annotations
@@ -82,23 +81,23 @@ class Predicted(NamedTuple):
 
     tokens: jax.Array  # under the recorded actions [B, n, S (, C)]
     random_last: jax.Array  # of the last (real) frame, under each random sequence [B, draws, S (, C)]
-    random: jax.Array | None  # under the first random one [B, n, S (, C)]; None where only the last frame was made
-    other: jax.Array | None = None  # under the first of another episode; None without other_images
+    random: jax.Array | None  # under the first random sequence [B, n, S (, C)]; None where only the last frame was made
+    other: jax.Array | None = None  # under the first sequence of another episode; None without other_images
 
 
 def predicts_actions(model: ModelConfig, setting: MaskingSetting) -> bool:
-    """Whether a model so trained has a policy to evaluate."""
+    """Whether a model trained for `setting` has a policy to evaluate."""
     return model.action_heads and setting in PREDICT_ACTIONS
 
 
 def predicts_frames(setting: MaskingSetting) -> bool:
-    """Whether a model so trained has frames to evaluate."""
+    """Whether a model trained for `setting` has frames to evaluate."""
     return setting in PREDICT_FRAMES
 
 
 def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) -> tuple[jax.Array, jax.Array]:
-    """(chunks [B, 1 + draws, T, U], keys of decoding [B]): the recorded actions, then the random ones,
-    which differ from them from the first chunk that leads to a predicted frame."""
+    """(chunks [B, 1 + draws, T, U], keys of decoding [B]). The chunks are the recorded actions, then the random ones,
+    which differ from the recorded ones from the first chunk that leads to a predicted frame on."""
     actions, frames, first_free = batch["actions"], batch["actions"].shape[1], config.first_predicted - 1
     key_B = keys_of(batch, "actions", table, config)
     other = random_actions(key_B, action_statistics(batch, table), config.random_actions, frames)
@@ -114,7 +113,7 @@ def keys_of(batch: Batch, purpose: Purpose, table: EmbodimentTable, config: Eval
 
 def action_statistics(batch: Batch, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
     """(mean, std) of each window's actions, [B, U] each: those in the batch, which are the same for every model, or
-    else the table's."""
+    otherwise the table's."""
     if "action_mean" in batch:
         return batch["action_mean"], batch["action_std"]
     return table_statistics(batch["embodiment"], table)
@@ -127,12 +126,12 @@ def make_predictor(
     setting: MaskingSetting = "forward",
     execution: ExecutionConfig = ExecutionConfig(),
 ) -> Callable[..., tuple[dict[str, jax.Array], Predicted | None]]:
-    """f(params, batch, units) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. Where the model
-    was trained for actions alone, no Predicted. `units`, by default the table's, are the ActionUnits that the model was
-    trained with.
+    """f(params, batch, units) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. For a model
+    trained only for actions, Predicted is None. `units`, by default the table's, are the ActionUnits with which the
+    model was trained.
 
-    `finite`, bool [B], says whether likelihoods and, where there are actions to predict, their error are numbers: ids
-    are whole numbers even where they were chosen by logits that are none.
+    `finite`, bool [B], says whether likelihoods and, where there are actions to predict, their errors are finite. Ids
+    cannot show this: they are integers even where they were chosen by logits that are not finite.
 
     Raises ConfigError for a prompt that leaves nothing to judge.
     """
@@ -182,7 +181,8 @@ def _frame_metrics(
     config: EvalConfig,
     setting: MaskingSetting,
 ) -> tuple[dict[str, jax.Array], Predicted]:
-    """(metrics of tokens, Predicted) of a model that was trained for frames; `window` is what of a batch fits it."""
+    """(metrics of tokens, Predicted) of a model that was trained for frames; `window` is the part of the batch that
+    fits the model's window."""
     model, key_B = hma.config, keys_of(batch, "likelihood", table, config)
     tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
     hidden = hidden_at_inference(table, setting, robots, actions.shape[1])
@@ -232,7 +232,7 @@ def _after_recorded(
     action_hidden_BT: jax.Array | None,
     real_BT: jax.Array | None,
 ) -> tuple[jax.Array, Predicted]:
-    """(outputs, Predicted) where every frame follows recorded ones."""
+    """(outputs, Predicted) where every frame is predicted from recorded frames."""
     tokens, actions, embodiment = window
     out, predicted = next_frames(model, tokens, actions, embodiment, key_B, config.decode, action_hidden_BT)
     draws = sequences.shape[1] - 1
@@ -241,8 +241,8 @@ def _after_recorded(
         """[B, ...] -> [B draws, ...]"""
         return jnp.repeat(x, draws, axis=0)
 
-    # The sequences differ from the first chunk on, so that nothing of the past can be shared.
-    if real_BT is not None:  # windows end at different frames: all are made, and each one's last is taken
+    # The sequences differ from the first chunk on, so they can share nothing of the past.
+    if real_BT is not None:  # windows end at different frames: all are made, and the last of each window is taken
         others = sequences[:, 1:].reshape(-1, *actions.shape[1:])
         hidden = None if action_hidden_BT is None else each(action_hidden_BT)
         _, made = next_frames(model, each(tokens), others, each(embodiment), each(key_B), config.decode, hidden)
@@ -264,7 +264,7 @@ def _likelihood(
     model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array, real_BT: jax.Array | None
 ) -> dict[str, jax.Array]:
     """Per window [B]: how well the predictions `out` fit the true tokens, and whether the loss is `finite`. DIFFERS:
-    accuracy is that of the likeliest ids of the wholly masked frame; the release's is that of the ids after all
+    accuracy is that of the likeliest ids of the wholly masked frame; in the release it is that of the ids after all
     unmasking steps (reference section 6.3)."""
     loss = window_loss(model, out, truth, key_B, real_BT)
     if model.config.diffusion:
@@ -284,9 +284,10 @@ def _policy_errors(
     statistics: tuple[jax.Array, jax.Array],
     real_BT: jax.Array | None,
 ) -> dict[str, jax.Array]:
-    """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live action value, of the
-    model and of always giving the mean; nan where no value is live, as of a robot without actions, and where the window
-    ends before the prompt does. `finite` says whether the error is a number wherever there is one."""
+    """Per window [B]: mean squared error of the chunks after the prompt, in variances of each action value that is
+    alive, for the model and for always giving the mean action. It is nan where no value is alive, as for a robot
+    without actions, and where the window ends before the prompt does. `finite` says whether the error is finite
+    wherever it is defined."""
     tokens, actions_BTU, embodiment_B = window
     decode, first, judged_BT = config.decode, config.prompt_frames - 1, real_BT
     if causally:

@@ -1,7 +1,7 @@
 """Means with standard errors that are clustered by episode.
 
-Windows of one episode share scene, task and lighting, so that they are not independent. The deviations of one episode's
-windows are added up before they are squared. Reference: Cameron and Miller 2015, "A Practitioner's Guide to
+Windows of one episode share scene, task and lighting, so they are not independent. The deviations of an episode's
+windows are therefore added up before they are squared. Reference: Cameron and Miller 2015, "A Practitioner's Guide to
 Cluster-Robust Inference", for a regression on a constant.
 """
 
@@ -21,31 +21,31 @@ from hma_jax.evaluation.sums import add_up
 
 @dataclass(frozen=True)
 class Stat:
-    """A mean over `n` values with its standard error (nan where there is no telling)."""
+    """A mean over `n` values with its standard error (nan where it is unknown)."""
 
     mean: float
     sem: float
     n: int
-    episodes: int = 0  # that the values come from; 0: the values are independent
+    episodes: int = 0  # number of episodes that the values come from; 0: the values are independent
 
     @property
     def clusters(self) -> int:
-        """Independent groups of values that the error counts."""
+        """The number of independent groups of values on which the error is based."""
         return self.episodes or self.n
 
 
 class Estimate(NamedTuple):
     """A statistic of a dataset's windows, with its influence function: each window's effect on it, to first order.
 
-    For another sample of windows the statistic would be about `value` + the mean of their `influence`. Estimates on the
-    same windows can be subtracted: effects of windows that both share cancel.
+    For another sample of windows the statistic would be about `value` + the mean of the `influence` of those windows.
+    Estimates on the same windows can be subtracted: effects of windows that both share cancel.
     """
 
     value: float
     influence: np.ndarray  # [n], of mean 0
 
     def minus(self, other: Estimate) -> Estimate:
-        with np.errstate(invalid="ignore"):  # of two infinite perplexities nothing is known
+        with np.errstate(invalid="ignore"):  # the difference of two infinite perplexities is unknown
             return Estimate(self.value - other.value, self.influence - other.influence)
 
 
@@ -58,14 +58,14 @@ def estimate_mean(values: Any) -> Estimate:
 
 
 def estimate_perplexity(losses: Any, group: int) -> Estimate:
-    """`official_perplexity` of windows in batches of `group`. Its influence is that of the corpus
-    perplexity: a dataset may hold too few batches to estimate one from their scatter."""
+    """`official_perplexity` of windows in batches of `group`. Its influence is that of the corpus perplexity, because a
+    dataset may hold too few batches to estimate an error from their scatter."""
     return _exponential(official_perplexity(*group_means(losses, group)), losses)
 
 
 def estimate_corpus_perplexity(losses: Any) -> Estimate:
-    """exp of the mean loss over all windows (infinite beyond what a float holds); influence by the
-    delta method."""
+    """exp of the mean loss over all windows (infinite if it exceeds the range of a float); influence by the delta
+    method."""
     with np.errstate(over="ignore"):
         return _exponential(float(np.exp(np.mean(np.asarray(losses, np.float64)))), losses)
 
@@ -76,20 +76,20 @@ def _exponential(value: float, losses: Any) -> Estimate:
 
 
 class Clusters(NamedTuple):
-    """Which episode each of n windows is of, numbered from 0 to `count` - 1."""
+    """The episode of each of n windows, as a number from 0 to `count` - 1."""
 
     which: np.ndarray  # int [n]
     count: int
 
 
 def clusters_of(episode_n: Any) -> Clusters:
-    """From episode numbers of any kind."""
+    """The clusters of `episode_n`, episode numbers of any kind."""
     names, which = np.unique(np.asarray(episode_n), return_inverse=True)
     return Clusters(which, len(names))
 
 
 def stat_of(estimate: Estimate, clusters: Clusters | None = None) -> Stat:
-    """An estimate with its standard error; `clusters` says which episode each window is of.
+    """An estimate with its standard error; `clusters` holds the episode of each window.
 
     sem^2 = G / (G - 1) sum_g (sum_{i in g} u_i)^2 / n^2 over G episodes g, with influences u. G / (G - 1) is
     the correction for few episodes. nan with one episode, which gives no variance between episodes.
@@ -105,17 +105,17 @@ def stat_of(estimate: Estimate, clusters: Clusters | None = None) -> Stat:
 
 
 def mean_and_sem(values: Any, episode_n: Any = None) -> Stat:
-    """Mean of a 1-D collection with its standard error (`stat_of`); `episode_n` says which episode each value is of."""
+    """Mean of a 1-D collection with its standard error (`stat_of`); `episode_n` is the episode of each value."""
     return stat_of(estimate_mean(values), None if episode_n is None else clusters_of(episode_n))
 
 
 def stratified(stats: Iterable[Stat], weights: Iterable[float] | None = None) -> Stat:
-    """Mean over datasets, every dataset counting equally or by its weight w: sem = sqrt(sum w^2 sem^2) / sum w.
+    """Mean over datasets, all with equal weight or with `weights` w: sem = sqrt(sum w^2 sem^2) / sum w.
 
-    The datasets are fixed, not a sample of possible datasets: only the episodes drawn within
-    each contribute error. A dataset of one episode cannot know its own error; its mean is taken to
-    scatter as that of one episode of the others does on average. Where none of these scatters at all, as of means that
-    are zero exactly, its error stays unknown. `n` and `episodes` count those of all.
+    The datasets are fixed, not a sample of possible datasets: only the episodes drawn within each contribute error. The
+    error of a dataset with one episode cannot be estimated from it; its mean is assumed to scatter as one episode of
+    the other datasets does on average. If none of these scatters at all, as with means that are exactly zero, the error
+    stays unknown. `n` and `episodes` are sums over all datasets.
     """
     stats = list(stats)
     require(len(stats) > 0, "no datasets to average over")

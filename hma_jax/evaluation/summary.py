@@ -32,7 +32,7 @@ class Summary:
     datasets: dict[str, dict[str, Stat]] = field(default_factory=dict)
 
     def over(self, names: Iterable[str]) -> dict[str, Stat]:
-        """Each metric averaged over those of the named datasets that have it, all counting equally."""
+        """Each metric averaged, with equal weights, over those of the named datasets that have it."""
         chosen = [self.datasets[name] for name in names]
         require(len(chosen) > 0, "no datasets to average an evaluation over")
         metrics = dict.fromkeys(metric for d in chosen for metric in d)
@@ -51,7 +51,7 @@ class Summary:
 
 
 def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
-    """Means over the windows of each dataset, and its perplexities; errors clustered by episode.
+    """Means over the windows of each dataset, and the dataset's perplexities; errors are clustered by episode.
 
     Metrics that some windows lack (`OPTIONAL_METRICS`) are averaged over the windows that have them; a
     dataset where no window has one lacks the metric.
@@ -70,7 +70,7 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
     """`a` minus `b`, window by window, on the datasets and metrics that both have.
 
     Paired by window: what makes a window hard for both models cancels. Errors are clustered by episode. Raises
-    ConfigError if they share no dataset, or if the windows of one that they share are not the same.
+    ConfigError if the two share no dataset, or if a dataset that they share has different windows.
     """
     shared = [name for name in a.datasets if name in b.datasets]
     require(len(shared) > 0, "two evaluations without a common dataset cannot be compared")
@@ -100,6 +100,6 @@ def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimat
 
 
 def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray]) -> dict[str, Stat]:
-    """Means of the optional metrics in `columns`, of the windows that have them."""
+    """Means of the optional metrics in `columns`, over the windows that have them."""
     there = {metric: ~np.isnan(columns[metric]) for metric in OPTIONAL_METRICS if metric in columns}
     return {m: mean_and_sem(columns[m][some], windows.episode[some]) for m, some in there.items() if some.any()}

@@ -1,4 +1,4 @@
-"""Sums of a few numbers that are the same everywhere."""
+"""Sums of a few numbers, with the same result on every Python version."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ from collections.abc import Iterable
 
 
 def add_up(values: Iterable[float]) -> float:
-    """The sum, one after the other, to the same last digit everywhere: `sum` of Python 3.12 and later rounds once,
-    that of 3.11 at every addition."""
+    """The sum, added one after the other, equal to the last digit everywhere. Python's `sum` rounds once from version
+    3.12 on, and at every addition in 3.11."""
     return functools.reduce(operator.add, values, 0.0)

@@ -1,7 +1,7 @@
-"""Every window's numbers: one row per window, from which all means follow.
+"""The numbers of every window: one row per window, from which all means are computed.
 
-On disk a Parquet file in long form, a row for every window and metric, which pandas, polars, DuckDB or R open as
-it is and which is joined with those of other trials by putting one after the other:
+On disk it is a Parquet file in long form, with a row for every window and metric. pandas, polars, DuckDB and R read it
+directly, and tables of several trials are joined by concatenation:
 
     trial     name of the trial, or of the directory of a model that is evaluated alone
     robot     name of the dataset, which is that of the robot
@@ -11,8 +11,8 @@ it is and which is joined with those of other trials by putting one after the ot
     metric    (`protocol`, `images`)
     value     float32, as devices compute it
 
-(robot, episode, window) names a window: the same one in every evaluation of any model, whatever
-other datasets there are. Within a metric, rows stand in the order of the frozen manifest.
+(robot, episode, window) identifies a window: it is the same in every evaluation of any model, whatever other datasets
+there are. Within a metric, rows stand in the order of the frozen manifest.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 FILE = "windows.parquet"
 LEGACY_FILE = "windows.csv.gz"
-"""What earlier versions wrote."""
+"""The file that earlier versions wrote."""
 
 COLUMNS = ("dataset", "episode", "start", "frames")
 """Fields of a `WindowTable` besides its metrics."""
@@ -48,7 +48,7 @@ class WindowTable:
     dataset: np.ndarray  # str
     episode: np.ndarray  # int64
     start: np.ndarray  # int64
-    frames: np.ndarray  # int64: real ones
+    frames: np.ndarray  # int64: number of real frames
     metrics: Mapping[str, np.ndarray]  # float64
 
     def __post_init__(self):
@@ -63,7 +63,7 @@ class WindowTable:
 
     @cached_property
     def datasets(self) -> tuple[str, ...]:
-        """In the order of their first windows."""
+        """The names of the datasets, in the order of their first windows."""
         return tuple(dict.fromkeys(self.dataset.tolist()))
 
     @property
@@ -92,13 +92,13 @@ class WindowTable:
         return WindowTable(*(getattr(self, name)[index] for name in COLUMNS), metrics)
 
     def has_windows_of(self, other: WindowTable) -> bool:
-        """Whether it has exactly the windows of `other`, in the same order, and none twice."""
+        """Whether this table has exactly the windows of `other`, in the same order, and none twice."""
         named = ("dataset", "episode", "start")
         return all(np.array_equal(getattr(self, n), getattr(other, n)) for n in named) and self.distinct
 
     def aligned_to(self, other: WindowTable) -> WindowTable:
-        """The same windows in the order of `other`. Raises ConfigError, naming the first window that differs, if
-        `other` has others, or one of them twice."""
+        """The same windows in the order of `other`. Raises ConfigError, which names the first window that differs, if
+        the two tables have different windows, or one has a window twice."""
         if self.has_windows_of(other):  # as trials of one study do
             return self
         own, wanted = self.names, other.names
@@ -115,7 +115,7 @@ class WindowTable:
         return self.rows(np.asarray([at[name] for name in wanted], np.int64))
 
     def to_arrow(self, trial: str) -> pa.Table:
-        """The long form, of the windows of `trial`."""
+        """The long form; `trial` is the name of the trial in every row."""
         import pyarrow as pa
 
         metrics, n = len(self.metrics), len(self)
@@ -143,7 +143,7 @@ class WindowTable:
 
     @classmethod
     def from_arrow(cls, table: pa.Table) -> WindowTable:
-        """The inverse, of one trial's rows in any order of metrics. Raises ValueError unless every metric has the
+        """The inverse, for one trial's rows with metrics in any order. Raises ValueError unless every metric has the
         same windows in the same order."""
         (metrics, metric), (trials, trial), (robots, robot) = (_coded(table[n]) for n in ("metric", "trial", "robot"))
         codes, firsts = np.unique(metric, return_index=True)
@@ -161,7 +161,7 @@ class WindowTable:
         return cls(np.asarray(robots, str)[first["robot"]], *whole, values)
 
     def save(self, path: str | Path, trial: str) -> None:
-        """Writes the Parquet file; whole or not at all, and the same bytes for the same numbers."""
+        """Writes the Parquet file, whole or not at all, with the same bytes for the same numbers."""
         write_arrow(Path(path), self.to_arrow(trial))
 
     @classmethod
@@ -195,7 +195,7 @@ def read_arrow(path: str | Path) -> pa.Table:
 
 
 def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
-    """The names in a column, and for every row the number of its own. Raises ValueError where a name is missing."""
+    """The names in a column, and for every row the index of its name. Raises ValueError where a name is missing."""
     import pyarrow as pa
 
     coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
