@@ -1,8 +1,8 @@
 """The robots whose parameters a step updates.
 
-A batch of B examples has at most B robots, of a model that may know hundreds. Their slices are taken out
-before gradients are computed and put back after the update: no gradient, no moment and no transfer of the
-others' parameters is made, which stand still in such a step anyway.
+A batch of B examples has at most B robots, while a model may know hundreds. The slices of the batch's robots are taken
+out before gradients are computed, and put back after the update. The parameters of other robots, which do not change in
+such a step anyway, then need no gradients, no moments and no transfers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hma_jax.model.params import Params, ParamSpec, is_spec
 
 
 class Active(NamedTuple):
-    """The robots of one step: G = min(max(B, 2), E) different ones, those of the batch among them."""
+    """The robots of one step: G = min(max(B, 2), E) different ones, which include those of the batch."""
 
     robots_G: jax.Array  # int32: their places on the embodiment axis
     robot_row_B: jax.Array  # int32: each example's robot, as a place in `robots_G`
@@ -24,13 +24,13 @@ class Active(NamedTuple):
 
     @property
     def places_G(self) -> jax.Array | None:
-        """`robots_G`, None where that is everyone."""
+        """`robots_G`, or None where it is all robots."""
         return None if self.everyone else self.robots_G
 
 
 def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
-    """The robots of a batch, then as many others as make a fixed number."""
-    # Two at least: XLA turns the write of a single robot into a slice update, delays reading its old moments, and then
+    """The robots of a batch, then enough others to make a fixed number."""
+    # At least two: XLA turns the write of a single robot into a slice update, delays reading its old moments, and then
     # copies all robots' arrays in each step. The second robot, without an example, is not changed.
     count = min(max(len(embodiment_B), 2), embodiments)
     if count == embodiments:
@@ -42,7 +42,7 @@ def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
 
 
 def take(tree: Params, specs: Params, places_G: jax.Array | None) -> Params:
-    """Parameters, or any tree with an array per parameter, reduced to the robots' slices at these places of the
+    """Parameters, or any tree with an array per parameter, reduced to the robots' slices at `places_G` on the
     embodiment axis; None keeps all slices. A slice beyond the end of the axis has arbitrary values, which nothing
     reads."""
     if places_G is None:
@@ -51,8 +51,8 @@ def take(tree: Params, specs: Params, places_G: jax.Array | None) -> Params:
     def slices(spec: ParamSpec, x: jax.Array) -> jax.Array:
         if spec.embodiment_axis is None:
             return x
-        # Clipped where these are all robots: a choice between slices and what is beyond them would change how updates
-        # are rounded.
+        # With as many places as robots, indices are clipped: a selection between slices and values beyond the end would
+        # change how updates are rounded.
         mode = "clip" if len(places_G) == spec.shape[spec.embodiment_axis] else None
         return jnp.take(x, places_G, axis=spec.embodiment_axis, mode=mode)
 
@@ -60,8 +60,8 @@ def take(tree: Params, specs: Params, places_G: jax.Array | None) -> Params:
 
 
 def put(tree: Params, new: Params, specs: Params, places_G: jax.Array | None) -> Params:
-    """`tree` with robots' slices at these places, and whatever all robots share, from `new`; slices beyond the end of
-    the axis are left out."""
+    """`tree` with the robots' slices at `places_G`, and everything that all robots share, taken from `new`; slices
+    beyond the end of the axis are dropped."""
     if places_G is None:
         return new
 

@@ -1,4 +1,4 @@
-"""New robots for a trained model: their own slices are appended, what was there stays.
+"""New robots for a trained model: their slices are appended, and the existing ones stay.
 
 All per-robot parameters have an embodiment axis, and actions are padded to U. A new robot with wider actions adds rows
 to the old robots' slices; these are zeros, and so are the padded actions that they multiply.
@@ -21,11 +21,10 @@ from hma_jax.model.params import EMBODIMENT_AXIS, Params, ParamSpec, draw, is_sp
 def add_embodiments(
     params: Params, model: ModelConfig, table: EmbodimentTable, new: Sequence[Embodiment], seed: int
 ) -> tuple[Params, EmbodimentTable]:
-    """Parameters, in memory of the host, and table with the `new` robots after those of `table`.
+    """The parameters, in host memory, and the table, with the `new` robots after those of `table`.
 
-    Predictions for the old robots do not change by a bit. The new slices are drawn as
-    in a model that had the robots from the start, from `seed`. Raises ConfigError for a name that
-    the table has already.
+    Predictions for the old robots do not change by a bit. The new slices are drawn with `seed`, as in a model that had
+    the robots from the start. Raises ConfigError for a name that is already in the table.
     """
     known = [e.name for e in new if e.name in table.names]
     require(not known, f"the model already knows {', '.join(known)}; do not add them, but train the model further")
@@ -35,7 +34,7 @@ def add_embodiments(
     def extend(path: tuple[Any, ...], spec: ParamSpec, old: jax.Array | np.ndarray) -> np.ndarray:
         if EMBODIMENT_AXIS not in spec.axes:
             return np.asarray(old)
-        # Old slices over the start of every axis; beyond them, in the axis of actions, zeros.
+        # Old slices at the start of every axis; beyond them, along the axis of actions, zeros.
         everywhere = [slice(0, size) for size in old.shape]
         robots = [slice(None)] * old.ndim
         robots[spec.embodiment_axis] = slice(0, table.size)

@@ -1,13 +1,13 @@
-"""A run that starts from a checkpoint of another.
+"""A run that starts from a checkpoint of another run.
 
-A run that was branched (`branch`) may go on with another optimiser, other masks, another order of data or another
-number of steps: after a spike of the loss, or to extend a run from before its learning rate decayed. Its checkpoints
-remember where it was branched and how it was trained until then.
+A run that was branched (`branch`) may continue with another optimiser, other masks, another order of data or another
+number of steps: for example after a spike of the loss, or to extend a run from before its learning rate decayed. Its
+checkpoints record where it was branched and how it was trained until then.
 
-Trials share the steps that they have in common (`begin_from`). With the schedule wsd, runs that differ in their
-number of steps alone are the same until the earlier one decays (`optimizer.steps_in_common`). A run that continues
-from there leaves the same bytes as one that was trained from its first step, for an optimiser step depends on the
-state and the step's number and on nothing else.
+Trials share the steps that they have in common (`begin_from`). With the schedule wsd, runs that differ only in their
+number of steps are the same until the decay of the shorter one (`optimizer.steps_in_common`). A run that continues from
+there leaves the same bytes as one that was trained from its first step, because an optimiser step depends only on the
+state and the step's number.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from hma_jax.training.reading import list_steps, read_description, require_finis
 from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 
 LOGS = ("metrics.jsonl", "validation.jsonl", "timing.jsonl")
-"""Cut after the step from which a run goes on when it starts (`log.RunLog`)."""
+"""Logs that are cut after the step from which a run continues, when it starts (`log.RunLog`)."""
 
 FILE = "branch.json"
-"""In a run that was branched: a list of the branchings that led to it, {"step", "train"} each."""
+"""The file, in a run that was branched, with the list of the branchings that led to it, {"step", "train"} each."""
 
 MAY_CHANGE = (
     "train.steps",
@@ -43,7 +43,7 @@ MAY_CHANGE = (
 
 
 def last_step(run_dir: Path, latest: int) -> int:
-    """The last step up to `latest` of which a run has a checkpoint; 0 without one."""
+    """The last step, up to `latest`, for which a run has a checkpoint; 0 without one."""
     return max((step for step in list_steps(run_dir / CHECKPOINTS) if step <= latest), default=0)
 
 
@@ -53,10 +53,10 @@ def has_checkpoint(run_dir: Path) -> bool:
 
 
 def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
-    """Puts into `run_dir` the last checkpoint of `source` up to step `latest`, and what was logged until then.
+    """Copies into `run_dir` the last checkpoint of `source` up to step `latest`, and the logs until then.
 
-    Returns its step; None, and nothing is done, without one, or if `run_dir` has a checkpoint of its own. The
-    checkpoint appears whole or not at all, after the logs, also if the power fails. Whether the two runs agree is
+    Returns its step. Does nothing and returns None if there is none, or if `run_dir` has a checkpoint of its own. The
+    checkpoint appears whole or not at all, after the logs, even if the power fails. Whether the two runs agree is
     checked when it is restored. Raises OSError.
     """
     step = last_step(source, latest)
@@ -70,7 +70,7 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
             sync(run_dir / name)
     sync(run_dir)
     aside = run_dir / f".{step}.copied"
-    shutil.rmtree(aside, ignore_errors=True)  # of a copy that was cut short
+    shutil.rmtree(aside, ignore_errors=True)  # left by a copy that was cut short
     shutil.copytree(source / CHECKPOINTS / str(step), aside)
     sync_tree(aside)
     os.replace(aside, place)
@@ -79,8 +79,8 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
 
 
 def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
-    """Makes `run_dir` a run that has the checkpoint of `step` (None: the newest) of `source`, and that may go on from
-    there with other settings (MAY_CHANGE). Returns the step.
+    """Makes `run_dir` a run that has the checkpoint of `step` (None: the newest) of `source`, and that may continue
+    from there with other settings (MAY_CHANGE). Returns the step.
 
     Raises ConfigError if `source` has no such checkpoint or `run_dir` has one; OSError, CheckpointError.
     """
@@ -96,7 +96,7 @@ def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
         step > 0,
         f"{source} was converted, so it has nothing to go on with but its weights: `hma train --from` starts with these",
     )
-    require_finished(source / CHECKPOINTS / str(step))  # alone in `run_dir` it would pass for one of an earlier version
+    require_finished(source / CHECKPOINTS / str(step))  # alone in `run_dir` it would look like an early version's
     described = read_description(source / CHECKPOINTS / str(step))
     require("train" in described, f"{source} is not a run of a model; give the directory of a training run")
     earlier = described["provenance"].get("branched", [])
@@ -108,8 +108,8 @@ def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
 
 
 def read_branchings(run_dir: Path) -> list[dict[str, Any]]:
-    """The branchings that led to a run, the last one last; empty for a run that was not branched. Raises ConfigError
-    for a damaged file, and for a branch without a checkpoint."""
+    """The branchings that led to a run, in order; empty for a run that was not branched. Raises ConfigError for a
+    damaged file, and for a branch without a checkpoint."""
     path = run_dir / FILE
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

@@ -1,13 +1,13 @@
 """Checkpoints: whole or absent, on any mesh, and never mistaken for another run's.
 
-Orbax (v1) writes asynchronously. Then what it wrote is flushed to disk and listed with hashes, and only then does
-it get its name, DIRECTORY/<step>: what has that name is complete, and whoever reads it checks the hashes. Earlier
-checkpoints are removed after that. What a save left behind that did not come so far has another name (LEFTOVER), and
-the next save removes it.
+Orbax (v1) writes asynchronously. Then its files are flushed to disk and listed with hashes, and only then does the
+checkpoint get its name, DIRECTORY/<step>. So a directory with such a name is complete, and readers check the hashes.
+Earlier checkpoints are removed after that. A save that was interrupted earlier leaves a directory with another name
+(LEFTOVER), which the next save removes.
 
-Each field of a state is an item of its own, so that parameters are read without moments. Beside them every checkpoint
-carries the JSON description of its run (configurations, embodiment table, data provenance); restoring under another
-description is refused by name.
+Each field of a state is an item of its own, so that parameters can be read without moments. Every checkpoint also
+carries the JSON description of its run (configurations, embodiment table, data provenance). Restoring under another
+description is refused, and the error names the differences.
 """
 
 from __future__ import annotations
@@ -53,16 +53,17 @@ Load = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 """Reads the items of a checkpoint, as `load_items`."""
 
 UNFINISHED, REMOVED = ".unfinished", ".removed"
-"""Ends of the names of a checkpoint that is being written, or removed."""
+"""How the names of checkpoints end that are being written, or removed."""
 
 LEFTOVER = re.compile(rf"[0-9]+(\{UNFINISHED}|\{REMOVED}|\.orbax-checkpoint-tmp)")
-"""How the names of these begin, and of what Orbax writes into. Other names are a user's, who set a checkpoint aside."""
+"""How these names begin, and those of the directories that Orbax writes into. Other names were given by a user who set
+a checkpoint aside."""
 
 TRIES = 10
-"""A save is given up once so many in a row have failed because their disk did not answer: after about four minutes."""
+"""Saving is given up after this many failures in a row because the disk did not answer: after about four minutes."""
 
 LONGEST_PAUSE = 60.0
-"""Seconds, at most, before a save is repeated; the first pauses are 1, 2, 4, ... seconds."""
+"""The longest time, in seconds, until a save is repeated; the first pauses are 1, 2, 4, ... seconds."""
 
 T = TypeVar("T")
 
@@ -70,8 +71,8 @@ log = logging.getLogger(__name__)
 
 
 class SaveError(OSError):
-    """Something of a run could not be written. Its last finished checkpoint is kept. `passing`: a disk or network
-    failed, which may answer again; `reason`: what the system says of a checkpoint."""
+    """A file of a run could not be written. The run's last finished checkpoint is kept. `passing`: a disk or network
+    failed that may answer again; `reason`: the system's message about a checkpoint."""
 
     def __init__(self, message: str, passing: bool = False, reason: str = ""):
         super().__init__(message)
@@ -90,11 +91,11 @@ class Checkpoints:
         keep_steps: tuple[int, ...] = (),
         keep_every: int = 0,
     ):
-        """The newest `keep` checkpoints stay, those of `keep_steps`, and of every `keep_every` steps (0: none).
-        `modernise` brings a description that an earlier version wrote to the form of `meta`.
+        """The newest `keep` checkpoints are kept, and those of `keep_steps` and of every `keep_every` steps (0: none).
+        `modernise` converts a description that an earlier version wrote to the form of `meta`.
 
-        Raises CheckpointError if `directory` cannot be written, ConfigError if what is written there cannot be read, or
-        for a description that is not JSON.
+        Raises CheckpointError if `directory` cannot be written, and ConfigError if checkpoints there could not be read
+        (`run_lock.require_plain`), or for a description that is not JSON.
         """
         require_plain(directory)
         try:
@@ -113,9 +114,9 @@ class Checkpoints:
             ) from error
         self._background = ThreadPoolExecutor(1, "checkpoint")
         self._pending: tuple[int, Future[OSError | None]] | None = None
-        self._failed: list[SaveError] = []  # since the last save that came to its end
+        self._failed: list[SaveError] = []  # since the last save that succeeded
         self._repeat_at = 0.0  # time.monotonic()
-        self._bytes = 0  # of the state that was saved last
+        self._bytes = 0  # size of the state that was saved last
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -138,11 +139,10 @@ class Checkpoints:
     # --- Saving ------------------------------------------------------------------------------
 
     def save(self, step: int, state: Any) -> None:
-        """Starts an asynchronous save of a named tuple, an item per field that is not None; the arrays
-        are copied before this returns.
+        """Starts an asynchronous save of a named tuple, with an item per field that is not None. The arrays are copied
+        before this returns.
 
-        Raises SaveError if this save or the one before it could not be written, unless it is to be repeated
-        (`to_repeat`).
+        Raises SaveError if this save or the one before it failed, unless it is to be repeated (`to_repeat`).
         """
         self._bear(self._settle())
         items = {name: item for name, item in state._asdict().items() if item is not None}
@@ -161,8 +161,8 @@ class Checkpoints:
             self._pending = step, self._background.submit(self._finish, step, response)
 
     def raise_failure(self) -> None:
-        """Raises the SaveError of a save that has failed since, unless it is to be repeated; does not wait for one that
-        is under way."""
+        """Raises the SaveError of a save that has failed in the meantime, unless it is to be repeated. Does not wait
+        for a save that is running."""
         if self._pending is not None and self._pending[1].done():
             self._bear(self._settle())
 
@@ -172,7 +172,7 @@ class Checkpoints:
         return bool(self._failed) and self._pending is None and time.monotonic() >= self._repeat_at
 
     def finish(self, step: int, state: Any) -> None:
-        """Waits until the save of `step`, which was started, is complete; repeats it where that may help. Raises
+        """Waits until the save of `step`, which was started before, is complete; repeats it where that may help. Raises
         SaveError."""
         self._bear(self._settle())
         while self._failed:
@@ -187,7 +187,7 @@ class Checkpoints:
             raise error or self._failed[-1]
 
     def _settle(self) -> SaveError | None:
-        """Waits for the last save. Returns the error of one that can be repeated, and raises that of another."""
+        """Waits for the last save. Returns its error if the save can be repeated, and raises it otherwise."""
         if self._pending is None:
             return None
         (step, future), self._pending = self._pending, None
@@ -201,7 +201,7 @@ class Checkpoints:
         return None
 
     def _bear(self, error: SaveError | None) -> None:
-        """Notes that a save is to be repeated. Raises its error after as many as are borne."""
+        """Notes that a failed save is to be repeated. Raises its error after `TRIES` failures in a row."""
         if error is None:
             return
         self._failed.append(error)
@@ -212,8 +212,8 @@ class Checkpoints:
         log.warning("%s; the run goes on, and saves again in %.0f s", error.args[0].partition(". ")[0], pause)
 
     def _finish(self, step: int, response: Any) -> OSError | None:
-        """In the background: waits for Orbax, then flushes and lists what it wrote, and gives it its name. Every
-        process does so for its own shards. Returns the error, the same in all processes, if that fails."""
+        """Runs in the background: waits for Orbax, then flushes and lists its files, and gives the checkpoint its name.
+        Every process flushes and hashes its own shards. Returns the error, the same in all processes, if this fails."""
         response.result()
         try:
             told = _in_all("hashes", lambda: [] if is_writer() else _own_shards(self._unfinished(step)))
@@ -224,15 +224,15 @@ class Checkpoints:
 
     def _complete(self, step: int, rows: list[Any]) -> None:
         unfinished = self._unfinished(step)
-        sync_tree(unfinished)  # Orbax flushes arrays alone, neither its other files nor their names
+        sync_tree(unfinished)  # Orbax flushes only arrays, neither its other files nor their names
         write_list(unfinished, rows)
-        if not (self.directory / str(step)).exists():  # otherwise only the flush of its name had failed
+        if not (self.directory / str(step)).exists():  # otherwise only the flush after the renaming had failed
             os.replace(unfinished, self.directory / str(step))
         sync(self.directory)
         for old in list_steps(self.directory)[: -self.keep]:
             kept = old in self.keep_steps or self.keep_every and old % self.keep_every == 0
             if not kept:
-                with suppress(FileNotFoundError):  # another name first: what has a number is never half removed
+                with suppress(FileNotFoundError):  # renamed first: a numbered directory is never half removed
                     os.replace(self.directory / str(old), self.directory / f"{old}{REMOVED}")
         self._remove_leftovers()
 
@@ -245,8 +245,8 @@ class Checkpoints:
         return self.directory / f"{step}{UNFINISHED}"
 
     def _failure(self, step: int, error: Exception, agreed: bool = False) -> SaveError:
-        """The error of a failed save. Raises it where repeating the save would not help: the disk is full, or other
-        processes do not know of it."""
+        """The error of a failed save. Raises it where repeating the save would not help (the disk is full, say), or
+        where other processes may not know of the failure."""
         reason = _reason(error)
         try:
             latest = self.latest_step
@@ -282,11 +282,12 @@ class Checkpoints:
         skip_damaged: bool = False,
         load: Load = load_items,
     ) -> tuple[int, Any]:
-        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say, read by `load`.
+        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say, and read by `load`.
 
-        `may_change` says which fields of its description ('train.steps') may differ, at its step. With `skip_damaged`,
-        checkpoints after the newest whole one are moved to `damaged` beside this directory. Raises
-        CheckpointError naming every other difference, or the file that is damaged; ReadError if one cannot be read now.
+        `may_change(description, step)` gives the fields of the checkpoint's description (such as 'train.steps') that
+        may differ. With `skip_damaged`, damaged checkpoints after the newest whole one are moved to `damaged` beside
+        this directory. Raises CheckpointError, which names every other difference or the damaged file, and ReadError if
+        a file cannot be read at the moment.
         """
         if skip_damaged:
             with writer_first("damaged checkpoints"):
@@ -337,8 +338,8 @@ class Checkpoints:
 
 
 def _require_writable(directory: Path) -> None:
-    """Raises OSError if nothing can be created in `directory`. Orbax would fail in a thread that others then wait for
-    without end."""
+    """Raises OSError if nothing can be created in `directory`. Otherwise Orbax would fail in a thread for which others
+    then wait for ever."""
     if not os.access(directory, os.W_OK | os.X_OK):
         read_only = os.statvfs(directory).f_flag & os.ST_RDONLY  # raises OSError if it is gone, or does not answer
         code = errno.EROFS if read_only else errno.EACCES
@@ -346,8 +347,8 @@ def _require_writable(directory: Path) -> None:
 
 
 def _own_shards(checkpoint: Path) -> list[Any]:
-    """Flushes and hashes the files that this process alone wrote. The writer does so for the others, and for those that
-    a shared disk does not show here yet."""
+    """Flushes and hashes the files that only this process wrote. The writer does so for all other files, and for those
+    that a shared disk does not show here yet."""
     own = f"/ocdbt.process_{jax.process_index()}/"
     rows = hash_files(checkpoint, lambda name: own in name)
     for row in rows:
@@ -356,7 +357,7 @@ def _own_shards(checkpoint: Path) -> list[Any]:
 
 
 def _in_all(name: str, act: Callable[[], T]) -> list[T]:
-    """What `act` returns in each of the processes, which all call this. An OSError of any of them is raised in all."""
+    """What `act` returns in each process; all processes call this. An OSError in any of them is raised in all."""
     try:
         own = {"result": act()}
     except OSError as error:

@@ -1,6 +1,6 @@
-"""A step whose numbers are not finite: the error, and the record of the batch that it was given.
+"""A step whose numbers are not finite: the error, and a file about the batch of the step.
 
-DIFFERS: the release goes on after a loss that is NaN, with a gradient of zeros (reference section 4.1).
+DIFFERS: after a loss that is NaN the release continues, with a gradient of zeros (reference section 4.1).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from hma_jax.training.state import FINITE
 
 FILE = "diverged.json"
 MAX_LISTED = 4
-"""Records of a batch in the message; the file has all."""
+"""The most records of a batch that the message lists; the file has all."""
 
 Records = Callable[[int], Sequence[str]]
-"""A line for each record that the batch at a place of the stream (0: the first) is made of."""
+"""The index of a batch in the stream (0: the first) -> a line for each record of which it is made."""
 
 log = logging.getLogger(__name__)
 
@@ -29,8 +29,8 @@ class DivergedError(RuntimeError):
 
 
 def require_finite(step: int, values: Mapping[str, float], run_dir: Path | None, records: Records) -> None:
-    """Raises DivergedError, naming `step` and the records of its batch, if its loss or one of its checks
-    (`state.FINITE`) failed. All of them are written to FILE in `run_dir`, unless that is None."""
+    """Raises DivergedError, which names `step` and records of its batch, if the loss is not finite or one of the step's
+    checks (`state.FINITE`) failed. All records are written to FILE in `run_dir`, unless that is None."""
     bad = [name.removeprefix(FINITE) for name, fine in values.items() if name.startswith(FINITE) and not fine]
     if math.isfinite(values["loss"]) and not bad:
         return
@@ -55,5 +55,5 @@ def require_finite(step: int, values: Mapping[str, float], run_dir: Path | None,
 def _write(path: Path, record: Mapping[str, object]) -> None:
     try:
         write_file(path, json.dumps(record, indent=1))
-    except OSError as error:  # that the step diverged is the news
+    except OSError as error:  # the divergence is the error to report
         log.warning("%s could not be written: %s", path, error.strerror)

@@ -1,6 +1,6 @@
-"""A list of a checkpoint's files with their hashes, by which damage is detected when they are read.
+"""A list of a checkpoint's files with their hashes, with which damage is detected when they are read.
 
-The list lies in the checkpoint's own directory, so that it is moved and deleted with it.
+The list is in the checkpoint's own directory, so it is moved and deleted with it.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from hma_jax.runtime.files import write_file
 NAME = "sha256.json"
 
 THREADS = 8
-"""At most so many files are hashed at once: one core computes SHA-256 more slowly than most disks read."""
+"""The most files that are hashed at once: one core computes SHA-256 more slowly than most disks read."""
 
 T = TypeVar("T")
 Row = list[Any]
-"""What the list says of a file: path within the checkpoint, size in bytes, SHA-256."""
+"""The list's entry for a file: path within the checkpoint, size in bytes, SHA-256."""
 
 Chosen = Callable[[str], bool]
-"""Whether a file, named by its path within the checkpoint, is meant."""
+"""A file's path within the checkpoint -> whether the file is chosen."""
 
 
 class Damaged(Exception):
@@ -36,7 +36,8 @@ class Damaged(Exception):
 
 
 class ReadError(OSError):
-    """A file cannot be read now: a shared disk does not answer, or too many files are open. It may be whole."""
+    """A file cannot be read at the moment: a shared disk does not answer, or too many files are open. It may be
+    undamaged."""
 
     @classmethod
     def of(cls, path: Path, reason: str) -> ReadError:
@@ -53,7 +54,7 @@ def hash_files(checkpoint: Path, chosen: Chosen) -> list[Row]:
 
 
 def write_list(checkpoint: Path, known: Iterable[Row] = ()) -> None:
-    """Lists every file under `checkpoint`; those of the rows that are `known` are not hashed again."""
+    """Writes the list of every file under `checkpoint`; files in the rows that are `known` are not hashed again."""
     rows = {row[0]: row for row in known}
     rows |= {row[0]: row for row in hash_files(checkpoint, lambda name: name not in rows)}
     files = [rows[name] for name in sorted(rows)]
@@ -61,7 +62,7 @@ def write_list(checkpoint: Path, known: Iterable[Row] = ()) -> None:
 
 
 def read_list(checkpoint: Path) -> str:
-    """The list as it is written, which differs between checkpoints with other contents; '' if there is none."""
+    """The text of the list, which differs between checkpoints with different contents; '' if there is none."""
     path = checkpoint / NAME
     return path.read_text() if path.exists() else ""
 
@@ -69,9 +70,9 @@ def read_list(checkpoint: Path) -> str:
 def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:
     """Compares the `chosen` files with the list. False if there is no list.
 
-    With `share` (i, n) the i-th of n processes compares every n-th file, so that each is read by one of them.
-    Raises Damaged for the first file that is missing or differs, the list itself included, and ReadError for one that
-    cannot be read.
+    With `share` (i, n) process i of n compares every n-th file, so that each file is read by one process. Raises
+    Damaged for the first file that is missing or differs, the list itself included, and ReadError for one that cannot
+    be read.
     """
     path = checkpoint / NAME
     try:
@@ -119,7 +120,7 @@ def _files(checkpoint: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _in_threads(function: Callable[[Any], T], items: Iterable[Any]) -> list[T]:
-    """As `map`. Raises what the first of the items raises."""
+    """`map` in threads. Raises the exception of the first item that raises one."""
     with ThreadPoolExecutor(THREADS, "hash") as threads:
         return list(threads.map(function, items))
 

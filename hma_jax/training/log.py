@@ -22,16 +22,16 @@ from hma_jax.training.tensorboard import TensorBoardWriter
 log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, dict[str, float]], None]
-"""Called as progress(step, steps, metrics) after every step; once the run was validated, with the latest
-of its numbers as 'validation/loss' and so on."""
+"""Called as progress(step, steps, metrics) after every step. Once the run was validated, the metrics include the latest
+validation numbers, as 'validation/loss' and so on."""
 
 
 FLUSH_SECONDS = 30.0
-"""After so long at most, files show what was written."""
+"""The longest time until written lines are visible in the files."""
 
 
 def open_log(run_dir: Path, start: int, steps: int, **how: Any) -> RunLog | SilentLog:
-    """The log of this process: only one of a program writes. Raises as `RunLog`."""
+    """The log of this process: only one process of a program writes. Raises as `RunLog`."""
     return RunLog(run_dir, start, steps, **how) if is_writer() else SilentLog(steps, how["progress"])
 
 
@@ -50,13 +50,13 @@ class SilentLog:
             self.progress(step, self.steps, dict(values))
 
     def nothing(self, *_: Any) -> None:
-        """In place of everything that only the writer does."""
+        """Replaces everything that only the writer does."""
 
     start_clock = discount = waited = write_start = write_validation = flush = close = nothing
 
 
 class RunLog:
-    """Writes the files of a run directory that `loop` lists; drops lines of steps that were not saved."""
+    """Writes the files of a run directory that `loop` lists. Drops lines of steps after the checkpoint."""
 
     def __init__(
         self,
@@ -71,8 +71,8 @@ class RunLog:
         progress: Progress | None,
         whole: bool = False,
     ):
-        """`every` steps there is a line of timing. With `whole`, raises ConfigError if the log lacks steps up to
-        `start`: the checkpoint does not need it."""
+        """A line of timing is written every `every` steps. With `whole`, raises ConfigError if the log lacks steps up
+        to `start` (the checkpoint itself can be resumed without them)."""
         self.run_dir, self.steps, self.every = run_dir, steps, every
         self.flops_per_step, self.peak_flops = flops_per_step, peak_flops
         self.clock, self.progress = clock, progress
@@ -96,7 +96,7 @@ class RunLog:
             self.tensorboard = TensorBoardWriter(run_dir / "tensorboard", start + 1)
 
     def _cut(self, name: str, step: int) -> list[dict[str, Any]]:
-        """Drops what comes after `step`, and torn lines. Returns the records kept."""
+        """Drops lines after `step`, and incomplete lines. Returns the records kept."""
         path = self.run_dir / name
         if not path.exists():
             return []
@@ -109,19 +109,19 @@ class RunLog:
         return kept
 
     def start_clock(self, step: int) -> None:
-        """From here on time counts as training."""
+        """From now on, after `step` steps, time counts as training."""
         self.mark = (self.clock(), step)
 
     def discount(self, seconds: float) -> None:
-        """Takes `seconds` that just passed out of the timing."""
+        """Excludes `seconds` that have just passed from the timing."""
         self.mark = (self.mark[0] + seconds, self.mark[1])
 
     def waited(self, seconds: float) -> None:
-        """Counts `seconds` in which a step waited for its batch."""
+        """Adds `seconds` in which a step waited for its batch."""
         self.waiting += seconds
 
     def write_start(self, record: Mapping[str, Any]) -> None:
-        """A line of execution.jsonl: every start of the run, never cut."""
+        """Writes a line of execution.jsonl, which has one for every start of the run and is never cut."""
         self._append("execution.jsonl", {**record, **({"steps_missing_in_log": self.missing} if self.missing else {})})
         self.flush()
 
@@ -175,7 +175,7 @@ class RunLog:
             self.tensorboard.flush()
 
     def close(self) -> None:
-        """Does not fail: what matters was flushed before, and a full disk reported."""
+        """Closes the files. It does not fail: what matters was flushed before, and a full disk was reported then."""
         for file in (*self.files.values(), self.tensorboard):
             with suppress(OSError):
                 file.close()
@@ -193,8 +193,8 @@ class RunLog:
 
 
 def _read_until(text: str, step: int) -> list[dict[str, Any]]:
-    """The records of JSON lines up to `step`, without lines that are none: the last may be torn by a kill, after all
-    that was flushed before the checkpoint."""
+    """The records up to `step` in JSON lines. Lines that are not JSON are dropped: a kill may leave an incomplete line,
+    but only after everything that was flushed before the checkpoint."""
     kept: list[dict[str, Any]] = []
     for line in text.split("\n"):
         try:

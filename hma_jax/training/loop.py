@@ -1,7 +1,7 @@
 """The training loop: files, clocks and signals around a pure step. It does no maths.
 
-Any model trains here; what differs is the step function. The loop dispatches step n + 1
-before it reads the metrics of step n, so the device never waits for the log.
+It trains any model; only the step function differs. The loop dispatches step n + 1 before it reads the metrics of step
+n, so the device never waits for the log.
 
 Files of a run directory:
     metrics.jsonl     one line per step, deterministic fields only: a run that was killed and
@@ -45,7 +45,7 @@ from hma_jax.training.step_trace import PROFILE, StepTrace
 
 
 class Interrupted(RuntimeError):
-    """The run was asked to stop (Ctrl-C, SIGTERM, SIGHUP) and saved its state first. `exit` is the code to end with."""
+    """The run was asked to stop (Ctrl-C, SIGTERM, SIGHUP) and has saved its state. `exit` is the exit code."""
 
     def __init__(self, message: str, exit: Exit = Exit.INTERRUPTED):
         super().__init__(message)
@@ -56,21 +56,22 @@ class Interrupted(RuntimeError):
 class LoopOptions:
     """How a run is observed and saved; nothing here changes its result.
 
-    The state is saved at the end, when interrupted, and every so many steps and minutes (0: never).
+    The state is saved at the end, when the run is interrupted, and at the intervals in steps and minutes below (0:
+    never).
     """
 
     checkpoint_every: int = 0  # steps
-    checkpoint_minutes: float = 10.0  # since the last save: what a kill loses at most
+    checkpoint_minutes: float = 10.0  # since the last save: the most that a kill loses
     keep_checkpoints: int = 2  # the newest ones
-    keep_steps: tuple[int, ...] = ()  # saved after these too, and kept: others go on from there
-    keep_every: int = 0  # steps: saved after every so many too, and kept
-    skip_damaged: bool = False  # go on from the newest checkpoint that is whole
+    keep_steps: tuple[int, ...] = ()  # also saved after these steps, and kept: other runs continue from there
+    keep_every: int = 0  # steps: also saved at this interval, and kept
+    skip_damaged: bool = False  # continue from the newest undamaged checkpoint
     log_every: int = 10  # steps between lines of timing.jsonl
-    whole_log: bool = False  # refuse to go on where metrics.jsonl lacks steps: a result is made from all of them
-    trace_steps: int = 0  # so many steps after a start are profiled
+    whole_log: bool = False  # refuse to continue if metrics.jsonl lacks steps: a result is made from all of them
+    trace_steps: int = 0  # number of steps that are profiled after a start
     flops_per_step: float = 0.0  # by formula, for achieved FLOP/s; 0: unknown
     peak_flops: float | None = None  # of all devices together, for MFU
-    # may_change(the checkpoint's description, its step) -> names of fields that may differ when a run resumes.
+    # may_change(description of the checkpoint, its step) -> names of the fields that may differ when a run resumes.
     may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: ()
     clock: Callable[[], float] = time.perf_counter  # seconds
 
@@ -94,19 +95,19 @@ class RunInfo:
 
     description: Description  # its identity: compared with the checkpoint's
     execution: Mapping[str, Any] = field(default_factory=dict)  # how it is computed: recorded only
-    # Brings a description that an earlier version wrote to today's form.
+    # Converts a description that an earlier version wrote to the current form.
     modernise: Callable[[Description], Description] = lambda described: described
-    # Called for the error message when a step was not finite.
+    # Called for the error message when the numbers of a step were not finite.
     records: Records = lambda index: ()
-    # Reads a state, also of an earlier version.
+    # Reads a state, including one that an earlier version wrote.
     load: Load = load_items
 
 
 @dataclass(frozen=True)
 class FitResult:
     state: Any = field(repr=False)
-    losses: list[float]  # one per step that the log has, from the run's first (processes but 0: of this start)
-    seconds: float  # spent in steps by this process, without compiling, validating and writing a profile
+    losses: list[float]  # one per step in the log, from the run's first step (processes other than 0: of this start)
+    seconds: float  # that this process spent in steps, without compiling, validating and writing a profile
     compile_seconds: float
     resumed_from: int
 
@@ -129,13 +130,13 @@ def fit(
 
     `step_fn(state, batch) -> (state, metrics)` is a jitted pure function that donates its
     state, a named tuple; `metrics` holds scalars, one of them 'loss', and checks (`state.FINITE`).
-    `shapes` are the state's, with shardings; `make_state()` is called only when nothing is restored,
-    so that there never are two. `make_batches(start)` gives host batches from step `start` on.
-    With several processes (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin
-    with this start. When any of them is asked to stop, or a save by the minute is due, all do so after the same step.
-    Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy, ConfigError for batches that end before
-    the steps do, or that are given instead of a function that makes them, and an OSError of `progress`, such as that of
-    a pipe that nobody reads, once the state is saved.
+    `shapes` are the state's, with shardings; `make_state()` is called only when nothing is restored, so that there are
+    never two states. `make_batches(start)` gives host batches from step `start` on. With several processes
+    (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin with this start. When any of
+    them is asked to stop, or when a save is due by the clock, all do so after the same step. Raises DivergedError,
+    Interrupted, CheckpointError, SaveError and RunBusy; ConfigError for batches that end before the steps do, or that
+    are passed instead of a function that makes them; and, once the state is saved, an OSError of `progress`, such as
+    that of a pipe that nobody reads.
     """
     require(
         callable(make_batches),
@@ -230,7 +231,7 @@ class _BetweenSteps:
         self._log, self._checkpoints, self._lock, self._stop = log, checkpoints, lock, stop
         self._agreement = AgreedMaximum()
         self._pending: tuple[int, dict[str, jax.Array]] | None = None  # a step whose metrics are not written yet
-        self.unread: OSError | None = None  # nobody reads the progress: a stop request
+        self.unread: OSError | None = None  # the error if nobody reads the progress: a stop request
         self._began = self._saved = self._seconds_aside = 0.0  # see `start_clock`
 
     def start_clock(self, start: int) -> None:
@@ -239,12 +240,12 @@ class _BetweenSteps:
         self._log.start_clock(start)
 
     def seconds(self) -> float:
-        """Spent in training since `start_clock`."""
+        """Seconds spent in training since `start_clock`."""
         return self._options.clock() - self._began - self._seconds_aside
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """What is done within is not counted as training."""
+        """Time spent in the block is not counted as training."""
         before = self._options.clock()
         yield
         took = self._options.clock() - before
@@ -252,7 +253,7 @@ class _BetweenSteps:
         self._seconds_aside += took
 
     def act(self, step: int, state: Any, metrics: dict[str, jax.Array]) -> None:
-        """After `step` was dispatched. Raises as `fit`."""
+        """Called after `step` was dispatched. Raises as `fit`."""
         self._report()
         self._pending = step, metrics
         self._checkpoints.raise_failure()
@@ -273,7 +274,7 @@ class _BetweenSteps:
         self._agreement.submit(self._request)
         if stopping and not last:
             self._checkpoints.finish(step, state)
-            if self.unread and not self._stop.is_set():  # Ctrl-C ends the reader of a pipe, too
+            if self.unread and not self._stop.is_set():  # Ctrl-C also ends the reader of a pipe
                 raise self.unread
             raise Interrupted(
                 f"stopped at step {step} of {self._steps}; the same command resumes from {self._run_dir}",
@@ -281,12 +282,12 @@ class _BetweenSteps:
             )
 
     def _report(self) -> None:
-        """Writes the metrics of a step that waits for it. Raises DivergedError, and writes nothing, if they are not
-        finite."""
+        """Writes the metrics of the pending step, if there is one. Raises DivergedError, and writes nothing, if they
+        are not finite."""
         if self._pending is None:
             return
         step, metrics = self._pending
-        # With as many digits as single precision has: half the bytes of a log, and nothing is lost.
+        # With the digits of single precision: this halves the size of the log, and nothing is lost.
         values = {name: float(str(np.float32(value))) for name, value in jax.device_get(metrics).items()}
         require_finite(step, values, self._log.run_dir, self._records)
         self._pending = None
@@ -294,7 +295,7 @@ class _BetweenSteps:
             self._log.write(step, {name: value for name, value in values.items() if not name.startswith(FINITE)})
         except SaveError:
             raise
-        except OSError as error:  # of the progress, which the log reports last
+        except OSError as error:  # from the progress report, which is the last thing that the log does
             self.unread = error
 
     def _request(self) -> int:
@@ -305,7 +306,7 @@ class _BetweenSteps:
 
 
 def _next(batches: Iterator[Any], done: int, steps: int) -> Any:
-    """The batch of the step after `done` ones."""
+    """The batch of the step after `done` steps."""
     try:
         return next(batches)
     except StopIteration:
@@ -332,7 +333,7 @@ def _is_due(step: int, options: LoopOptions) -> bool:
 
 
 def _is_late(seconds: float, options: LoopOptions) -> bool:
-    """Whether to save `seconds` after the last time."""
+    """Whether a save is due `seconds` after the last one."""
     return options.checkpoint_minutes > 0 and seconds >= 60 * options.checkpoint_minutes
 
 
@@ -353,14 +354,14 @@ def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:
 class _Stop(threading.Event):
     """Set when the run is asked to stop; `exit` says how."""
 
-    exit = Exit.STOPPED  # where another process of the program was asked
+    exit = Exit.STOPPED  # if another process of the program was asked
 
 
 @contextmanager
 def _stop_requests() -> Iterator[_Stop]:
-    """An event set by SIGINT, SIGTERM or SIGHUP; a second SIGINT acts as usual, but further signals of other kinds do
-    not: schedulers send several, and wrappers pass each of them on to a process that has had it. A request that the
-    block did not act on is left pending for the code after it."""
+    """An event that SIGINT, SIGTERM or SIGHUP sets. A second SIGINT acts as usual, but further signals of the other
+    kinds do not: schedulers send several, and wrappers forward each of them to a process that has already received it.
+    A request that the block did not act on is left pending for the code after it."""
     event = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield event  # only the main thread may install handlers
@@ -378,14 +379,14 @@ def _stop_requests() -> Iterator[_Stop]:
 
     for number in previous:
         signal.signal(number, on_signal)
-    if (pending := take_pending_stop()) is not None:  # of a signal before this block whose exception was swallowed
+    if (pending := take_pending_stop()) is not None:  # from a signal before this block whose exception was swallowed
         event.exit = pending
         event.set()
     try:
         yield event
-        if event.is_set():  # in the last step, after which there is nothing left to stop here
+        if event.is_set():  # set in the last step, after which there is nothing left to stop here
             leave_stop_pending(event.exit)
     finally:
         for number, handler in previous.items():
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as SIGHUP is from the first one on
+            if signal.getsignal(number) is not signal.SIG_IGN:  # SIGHUP is ignored after the first one
                 signal.signal(number, handler)

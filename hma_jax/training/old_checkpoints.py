@@ -16,10 +16,10 @@ from hma_jax.training.train_only import own_specs
 
 
 def load_trained(checkpoint: Path, shapes: Mapping[str, Any], declared: Declared, trained_E: np.ndarray) -> Any:
-    """Loads a state (`load_items`) whose moments are those of the per-robot parameters of the `trained_E` robots alone.
+    """Loads a state (`load_items`) with moments only for the per-robot parameters of the `trained_E` robots.
 
-    The checkpoint may have moments of all parameters: then those of all robots' own parameters are read into memory of
-    the host, and the trained ones are taken.
+    The checkpoint may have moments of all parameters. Then those of all robots' own parameters are read into host
+    memory, and those of the trained robots are taken from them.
     """
     wanted = shapes["opt_state"]
     if saved_shapes(checkpoint, "opt_state", "first") == jax.tree.map(lambda x: tuple(x.shape), wanted.first):

@@ -1,9 +1,8 @@
 """AdamW, and Muon for matrices, with muP multipliers; parameters without an example in a step are not updated.
 
-Multipliers, decay mask, embodiment axes and uses are read off the parameter declarations. A
-robot without an example in the global batch keeps its slices, moments and bias-correction
-count as they were, and so does a head without a target; a dense AdamW would go on decaying
-them (reference appendix B.1).
+Multipliers, decay mask, embodiment axes and uses come from the parameter declarations. A robot without an example in
+the global batch keeps its slices, moments and bias-correction count, and so does a head without a target; a dense AdamW
+would continue to decay them (reference appendix B.1).
 """
 
 from __future__ import annotations
@@ -25,31 +24,33 @@ from hma_jax.training.active_robots import Active
 
 
 class Presence(NamedTuple):
-    """Which parameters a step updates: for each `Use`, whether the batch has an example of it, and for which robots."""
+    """The parameters that a step updates: for each `Use`, whether the batch has an example of it, and for which
+    robots."""
 
     shared: dict[Use, jax.Array]  # bool []
     robots: dict[Use, jax.Array]  # bool [E]
 
     def of(self, spec: ParamSpec) -> jax.Array:
-        """Whether the step concerns a parameter: bool, and for robots' own parameters each robot's slice."""
+        """Whether the step updates a parameter: one bool, or, for per-robot parameters, one for each robot's slice."""
         return _entry_of(spec, self.shared, self.robots)
 
 
 class AdamState(NamedTuple):
-    """Moments like the parameters that are trained, and how often each was updated, for bias correction."""
+    """Moments of the parameters that are trained, and how often each parameter was updated, for bias correction."""
 
     first: Params
     second: Params
-    count: dict[Use, jax.Array]  # int32 []: of parameters that all robots share
-    count_E: dict[Use, jax.Array]  # int32 [E]: of each robot's own
+    count: dict[Use, jax.Array]  # int32 []: for parameters that all robots share
+    count_E: dict[Use, jax.Array]  # int32 [E]: for each robot's own parameters
 
 
 def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
-    """Learning rate at the muP base width for each step, linear warm-up first, over no more than all steps.
+    """Learning rate at the muP base width for each step. It begins with a linear warm-up, which takes at most all
+    steps.
 
     `constant` holds, `cosine` falls towards final_fraction over the whole run, `wsd` holds and then falls towards it
-    linearly during the last decay_fraction of the steps. Both would reach it one step after the last: the last of n
-    decay steps of wsd is still 1 / n of the way above it.
+    linearly during the last decay_fraction of the steps. Both would reach final_fraction one step after the last: in
+    the last of n decay steps of wsd, 1 / n of the fall remains.
     """
     peak, end = config.learning_rate, config.learning_rate * config.final_fraction
     warmup = min(config.warmup_steps, steps)
@@ -79,7 +80,7 @@ def decay_fits(config: OptimizerConfig, steps: int) -> bool:
 
 
 def check_schedule(config: OptimizerConfig, steps: int) -> None:
-    """Raises ConfigError for a decay that would begin within the warm-up and end above final_fraction, or never
+    """Raises ConfigError for a decay that would begin during the warm-up and end above final_fraction, or never
     begin."""
     few = f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps})"
     if config.schedule == "cosine":
@@ -118,10 +119,10 @@ def init_adam(params: Params, embodiments: int) -> AdamState:
     )
 
 
-MUON_MOMENTUM = 0.95  # with one look ahead (Nesterov)
+MUON_MOMENTUM = 0.95  # Nesterov momentum
 MUON_GAIN = 0.2
-"""Root mean square of a square matrix's update in units of the rate, about what Adam's is (Liu et al. 2025), so that
-both take the same rate."""
+"""Root mean square of a square matrix's update, in units of the learning rate. It is about that of Adam (Liu et al.
+2025), so that both use the same rate."""
 
 
 ORTHOGONALISE = "orthogonalise_matrices"
@@ -129,12 +130,13 @@ ORTHOGONALISE = "orthogonalise_matrices"
 
 
 def muon_direction(momentum: jax.Array, spec: ParamSpec, multiplier: float, min_shard_size: int) -> jax.Array:
-    """What a `hidden` parameter is moved along, in units of the rate at the base width: each of its matrices made
-    orthogonal, so that all its singular values are about 1. `momentum` may have fewer robots than the declaration.
+    """The direction in which a `hidden` parameter is moved, in units of the rate at the base width: each of its
+    matrices is made orthogonal, so that all its singular values are about 1. `momentum` may have fewer robots than the
+    declaration.
 
-    muP wants the spectral norm of an update to stay as it is at the base width (Yang et al. 2023): its root mean square
-    falls as 1 / sqrt(m) of itself, so of `multiplier`, 1 / m, only the root is left to apply to the size. On a mesh the
-    matrices of a parameter of `min_shard_size` numbers or more are shared out among the devices.
+    muP requires the spectral norm of an update to stay as it is at the base width (Yang et al. 2023). With orthogonal
+    matrices the root mean square already falls as 1 / sqrt(m), so only the square root of `multiplier`, 1 / m, is still
+    applied. On a mesh the matrices of a parameter of `min_shard_size` numbers or more are distributed over the devices.
     """
     rows, columns = (tuple(len(spec.shape) + axis for axis in side) for side in spec.matrix)
     axes = rows, columns
@@ -155,16 +157,18 @@ def _orthogonalised(x: jax.Array, axes: MatrixAxes) -> jax.Array:
 
 
 def _shared_out(x: jax.Array, axes: MatrixAxes, storage: PartitionSpec) -> jax.Array:
-    """`_orthogonalised` on a mesh, of x stored by `storage`: each device makes some whole matrices orthogonal.
+    """`_orthogonalised` on a mesh, for x stored as `storage` says: each device makes some whole matrices orthogonal.
 
-    Matrices that are stored in parts are sent to one device each, and back. Otherwise each of the fifteen products
-    would gather all matrices on every device, and what several devices store, each of them would compute.
+    Matrices that are stored in parts are each sent to one device, and back. Otherwise each of the fifteen products
+    would gather all matrices on every device, and matrices that several devices store would be computed by each of
+    them.
     """
     sizes = jax.sharding.get_abstract_mesh().shape
     batch = tuple(axis for axis in range(x.ndim) if axis not in axes[0] + axes[1])
     order = (*batch, *axes[0], *axes[1])
     split = {name: axis for axis, part in enumerate(storage) for name in mesh_axes(part)}
-    # Mesh axes that the matrices are yet to be split along, and which side of a matrix each splits in storage.
+    # The mesh axes over which the matrices are still to be distributed, and which side of a matrix each splits in
+    # storage.
     sides = {
         name: next((side for side in (1, 2) if split.get(name) in axes[side - 1]), None)
         for name, size in sizes.items()
@@ -176,7 +180,7 @@ def _shared_out(x: jax.Array, axes: MatrixAxes, storage: PartitionSpec) -> jax.A
         m = turned.reshape([math.prod(own.shape[axis] for axis in group) for group in (batch, *axes)])
         count = len(m)
         m = jnp.pad(m, ((0, -count % math.prod(sizes[name] for name in sides)), (0, 0), (0, 0)))
-        # Rows and columns may come together in any order: they go apart again as they came.
+        # Rows and columns may be joined in any order, because they are split again in the reverse order.
         for name, side in sides.items():
             if side is None:
                 part = len(m) // sizes[name]
@@ -208,16 +212,16 @@ def apply_update(
 ) -> tuple[Params, AdamState]:
     """New parameters and state after one step. On a mesh, parameters of fewer than `min_shard_size` numbers are whole.
 
-    p <- p - rate * (multiplier * adam + weight_decay * p), the second term only where the declaration says so. With
-    `config.matrices` muon, matrices between two widths take `muon_direction` in place of the first and have no second
-    moment. Weight decay is not divided by m: muP scales a hidden matrix's decay up as much as its rate down (reference
-    section 4.4).
+    p <- p - rate * (multiplier * adam + weight_decay * p), with the second term only where the declaration says so.
+    With `config.matrices` muon, matrices between two widths use `muon_direction` instead of the first term and have no
+    second moment. Weight decay is not divided by m: muP scales a hidden matrix's decay up by as much as it scales its
+    rate down (reference section 4.4).
     """
     count = {use: n + presence.shared[use].astype(n.dtype) for use, n in state.count.items()}
     count_E = {use: n + presence.robots[use].astype(n.dtype) for use, n in state.count_E.items()}
     b1, b2 = config.beta1, config.beta2
 
-    # Each: (gradient, first and second moment) -> (new moments, what is moved along).
+    # Each: (gradient, first and second moment) -> (new moments, direction of the update).
     def adamw(g, m, v, spec: ParamSpec, multiplier: float):
         # The count may be 0 before a first example; its (unused) correction must stay finite.
         steps = jnp.maximum(_entry_of(spec, count, count_E), 1).astype(jnp.float32)
@@ -249,13 +253,14 @@ def apply_update(
 
 
 def take_adam(state: AdamState, specs: Params, active: Active, places_G: jax.Array | None) -> AdamState:
-    """The moments and counts of a step's robots, and of what all share; their moments are at `places_G`."""
+    """The moments and counts of a step's robots, and of the shared parameters. The robots' moments are at
+    `places_G`."""
     first, second = (active_robots.take(moment, specs, places_G) for moment in (state.first, state.second))
     return AdamState(first, second, state.count, {use: n[active.robots_G] for use, n in state.count_E.items()})
 
 
 def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active, places_G: jax.Array | None) -> AdamState:
-    """`state` with those of `new` in their places."""
+    """`state` with the moments and counts of `new` in their places."""
     first = active_robots.put(state.first, new.first, specs, places_G)
     second = active_robots.put(state.second, new.second, specs, places_G)
     count_E = {use: n.at[active.robots_G].set(new.count_E[use]) for use, n in state.count_E.items()}
@@ -263,12 +268,12 @@ def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active, pl
 
 
 def _entry_of(spec: ParamSpec, shared: dict[Use, jax.Array], robots_E: dict[Use, jax.Array]) -> jax.Array:
-    """A parameter's entry of two tables by use: of what all robots share, and of each robot's own."""
+    """A parameter's entry in one of two tables by use: that of shared parameters, or that of each robot's own."""
     return shared[spec.use] if spec.embodiment_axis is None else spec.along_robots(robots_E[spec.use])
 
 
 def clip_by_global_norm(grads: Params, limit: float) -> tuple[Params, jax.Array]:
-    """Gradients scaled to a global norm of at most `limit`, and the norm before."""
+    """Gradients scaled to a global norm of at most `limit`, and their norm before."""
     norm = optax.tree.norm(grads)
     scale = jnp.minimum(1.0, limit / jnp.maximum(norm, 1e-12))
     return jax.tree.map(lambda g: g * scale, grads), norm

@@ -26,7 +26,7 @@ from hma_jax.training.hashes import NAME, Damaged, ReadError, verify
 from hma_jax.training.run_lock import list_steps
 
 WHOLE_STATE = "state"
-"""The one item of checkpoints that were written before there were several."""
+"""The single item of checkpoints that were written before there were several items."""
 
 log = logging.getLogger(__name__)
 
@@ -37,13 +37,13 @@ class CheckpointError(ConfigError):
 
 def agree_on_latest(directory: Path) -> int | None:
     """The latest step with a checkpoint as process 0 sees it: a shared disk may show the others an older state of the
-    directory. Raises ReadError, in all processes, if it cannot be listed now."""
+    directory. Raises ReadError, in all processes, if the directory cannot be listed at the moment."""
     steps: list[int] = []
     with raised_in_all("checkpoints"):
         try:
             if is_writer():
                 steps = list_steps(directory)
-        except OSError as error:  # no advice of `ReadError.of`: to remove this directory removes every checkpoint
+        except OSError as error:  # not `ReadError.of`: its advice would remove every checkpoint
             raise ReadError(
                 f"{directory} cannot be read now ({error.strerror}). Run the same command again when its disk answers"
             ) from error
@@ -53,8 +53,8 @@ def agree_on_latest(directory: Path) -> int | None:
 
 @contextmanager
 def raised_in_all(name: str) -> Iterator[None]:
-    """The first CheckpointError or ReadError that any of several processes raises in the block, which all go through,
-    is raised in all."""
+    """Raises in all processes the first CheckpointError or ReadError that any of them raises in the block. All
+    processes must run the block."""
     own: CheckpointError | ReadError | None = None
     try:
         yield
@@ -80,15 +80,15 @@ def find_damage(checkpoint: Path) -> Damaged | None:
 
 
 def require_finished(checkpoint: Path) -> None:
-    """Raises CheckpointError, in all of several processes, if writing `checkpoint` was interrupted."""
+    """Raises CheckpointError, in all processes, if writing `checkpoint` was interrupted."""
     with raised_in_all("finished"), _reading(checkpoint):
         _require_listed(checkpoint)
 
 
 def _require_listed(checkpoint: Path) -> None:
-    """Raises Damaged for a checkpoint without a list of hashes after one that has it: nobody can tell whether its files
-    are as they were written. Where none has a list, a version that wrote none made them. One that training has removed
-    meanwhile is no matter of this."""
+    """Raises Damaged for a checkpoint without a list of hashes after one that has a list: it is then unknown whether
+    its files are as they were written. If no checkpoint has a list, an early version that wrote none made them. A
+    checkpoint that training has removed in the meantime is not an error here."""
     if (checkpoint / NAME).exists() or not checkpoint.is_dir():
         return
     earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
@@ -97,8 +97,8 @@ def _require_listed(checkpoint: Path) -> None:
 
 
 def read_description(checkpoint: Path) -> dict[str, Any]:
-    """The description of the run that wrote it. Raises CheckpointError if its files are damaged, ReadError if they
-    cannot be read now."""
+    """The description of the run that wrote the checkpoint. Raises CheckpointError if its files are damaged, ReadError
+    if they cannot be read at the moment."""
     with _reading(checkpoint):
         listed = verify(checkpoint, lambda name: "/" not in name)
         if not listed:
@@ -107,16 +107,16 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
                 "is read without checking their hashes",
                 checkpoint,
             )
-        # Of a path that is not absolute, Orbax warns for every item.
+        # Orbax warns, for every item, about a path that is not absolute.
         return ocp.checkpointables_metadata(checkpoint.absolute()).custom_metadata or {}
 
 
 def load_items(checkpoint: Path, shapes: Mapping[str, Any], partial: bool = False) -> dict[str, Any]:
-    """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says, or in memory of the host
-    if it is one of NumPy arrays (`on_host`). With `partial` trees may lack arrays that are there.
+    """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says, or in host memory if the
+    tree is of NumPy arrays (`on_host`). With `partial`, the trees may lack arrays that the checkpoint has.
 
-    With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing, ReadError if
-    one cannot be read now.
+    With several processes all call this. Raises CheckpointError if a file of these items is damaged or missing,
+    ReadError if one cannot be read at the moment.
     """
     share = jax.process_index(), jax.process_count()
     with raised_in_all("damage"):
@@ -132,8 +132,8 @@ def load_items(checkpoint: Path, shapes: Mapping[str, Any], partial: bool = Fals
 
 
 def on_host(shapes: Any) -> Any:
-    """A tree of shapes (jax.ShapeDtypeStruct) as one of NumPy arrays, which take no memory themselves: what Orbax then
-    reads is not on devices."""
+    """A tree of shapes (jax.ShapeDtypeStruct) as a tree of NumPy arrays, which take no memory themselves. With it Orbax
+    reads into host memory, not onto devices."""
     return jax.tree.map(lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape), shapes)
 
 
@@ -149,15 +149,16 @@ def saved_shapes(checkpoint: Path, item: str, field: str) -> Any:
 
 
 def has_item(checkpoint: Path, name: str) -> bool:
-    """Raises CheckpointError for a checkpoint that is gone, ReadError if it cannot be read now."""
+    """Whether a checkpoint has an item of this name. Raises CheckpointError if the checkpoint is gone, ReadError if it
+    cannot be read at the moment."""
     with _reading(checkpoint):
         return name in os.listdir(checkpoint)
 
 
 @contextmanager
 def _reading(checkpoint: Path) -> Iterator[None]:
-    """Turns damage, and whatever Orbax raises for it (types of four libraries), into a CheckpointError; what the system
-    says of a disk, into a ReadError."""
+    """Turns damage, and whatever Orbax raises for it (types of four libraries), into a CheckpointError, and errors of
+    the system about a disk into a ReadError."""
     hush_orbax()
     try:
         yield
@@ -180,7 +181,7 @@ def _reading(checkpoint: Path) -> Iterator[None]:
 
 
 def error_code(error: Exception) -> int | None:
-    """The operating system's number, which the storage library of Orbax gives in words."""
+    """The operating system's error number, which Orbax's storage library gives inside its message."""
     found = re.search(r"os_error_code='(\d+)'", str(error))
     return int(found[1]) if found else error.errno if isinstance(error, OSError) else None
 
@@ -201,8 +202,8 @@ def _advice(checkpoint: Path) -> str:
 
 
 def hush_orbax() -> None:
-    """From now on Orbax logs no errors: it raises each of them as well, and what it logs are pages of
-    tracebacks and of damaged files, also from threads that go on after a save has failed."""
+    """From now on Orbax logs no errors. It raises each of them as well, and its log entries are pages of tracebacks and
+    of damaged files, some from threads that continue after a save has failed."""
     logging.getLogger("absl").addFilter(_is_no_error_of_orbax)  # once, however often it is added
 
 

@@ -14,12 +14,12 @@ from hma_jax.runtime.locks import Held, Lock, exclusive
 NAME, EVALUATION = ".lock", ".evaluation.lock"
 
 CHECKPOINTS = "checkpoints"
-"""The folder of a run directory with a folder per checkpoint. Named and listed here, so that a program that only lists
-them does not import Orbax."""
+"""The folder of a run directory that has a folder per checkpoint. It is named and listed here, so that a program that
+only lists checkpoints does not import Orbax."""
 
 
 def list_steps(directory: Path) -> list[int]:
-    """Steps with a finished checkpoint, in order; what Orbax has not finished has another name."""
+    """Steps with a finished checkpoint, in order; unfinished checkpoints have other names."""
     if not directory.is_dir():
         return []
     numbered = [path for path in directory.iterdir() if path.name.isascii() and path.name.isdecimal()]
@@ -31,13 +31,13 @@ class RunBusy(Held):
 
 
 def is_address(path: Path) -> bool:
-    """Whether a path was made from a URL such as gs://bucket/run, of which `Path` keeps one slash."""
+    """Whether a path was made from a URL such as gs://bucket/run, in which `Path` keeps only one slash."""
     return re.match(r"[a-z][a-z0-9+.-]+:/", str(path)) is not None
 
 
 def require_plain(directory: Path) -> None:
-    """Raises ConfigError for a place where checkpoints would be written that nobody can read: Orbax looks for what the
-    processes have written by a pattern that begins with the path."""
+    """Raises ConfigError for a path with brackets, because checkpoints written there could not be read: Orbax looks for
+    the files of the processes with a pattern that begins with the path."""
     found = re.search(r"\[[^/]+\]", str(directory.absolute()))
     require(
         found is None,
@@ -49,8 +49,8 @@ def require_plain(directory: Path) -> None:
 @contextmanager
 def locked_run(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
     """Makes `run_dir` and holds it: to train in it or, with EVALUATION, to write the evaluation of its model.
-    Raises RunBusy naming the process that holds it already, ConfigError if it cannot be written, and OSError if its
-    disk fails."""
+    Raises RunBusy, which names the process that already holds it, ConfigError if it cannot be written, and OSError if
+    its disk fails."""
     require(
         not is_address(run_dir),
         f"a run directory must be on a file system, got the address {run_dir}; mount the bucket, or choose a disk "

@@ -1,4 +1,4 @@
-"""Runs on disk: what their checkpoints say of them, and reading them back."""
+"""Runs on disk: how their checkpoints describe them, and how they are read."""
 
 from __future__ import annotations
 
@@ -52,18 +52,19 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether all steps of its training were made. A converted model has step 0 and is taken as it is."""
+        """Whether all steps of its training were made. A converted model has step 0 and counts as finished."""
         return not 0 < self.step < self.train.steps
 
 
-@dataclass(frozen=True, eq=False)  # compared by identity: it has a hash, which a tree of arrays has not
+@dataclass(frozen=True, eq=False)  # compared by identity, so that it can be hashed, which a tree of arrays cannot
 class Model:
-    """A trained model, ready for inference: `declared.merge(params)` is what computes, inside a traced function.
+    """A trained model, ready for inference: inside a traced function, `declared.merge(params)` is the module that
+    computes.
 
-    It can be pickled; where it is unpickled, its parameters lie on the default device.
+    It can be pickled; unpickled, its parameters are on the default device.
     """
 
-    run: Run  # with parameters as `model.params.inference_params` makes them; what is converted is that of `load_run`
+    run: Run  # with parameters from `model.params.inference_params`; for conversion use `load_run`
     declared: Declared[HMA]
     execution: ExecutionConfig
 
@@ -77,7 +78,7 @@ class Model:
 
     @property
     def params(self) -> Params:
-        """On this process's default device."""
+        """The parameters, on this process's default device."""
         return self.run.params
 
     @property
@@ -86,7 +87,8 @@ class Model:
 
     @cached_property
     def identity(self) -> str:
-        """A hash of the settings, the table and the parameters; these are read from their device once for it."""
+        """A hash of the settings, the table and the parameters, for which the parameters are read from their device
+        once."""
         digest = hashlib.sha256(stable_hash([self.config, self.table]).encode())
         for path, array in jax.tree.leaves_with_path(self.params):
             digest.update(path_name(path).encode())
@@ -114,7 +116,7 @@ def describe_run(
 
 
 def read_configs(described: dict[str, Any], where: str) -> tuple[ModelConfig, TrainConfig, EmbodimentTable]:
-    """What a description that this or an earlier version wrote says of a run.
+    """The configurations of a run, from a description that this or an earlier version wrote.
 
     A field that it lacks has the value that computes what was computed without it (`config.base.later`). Raises
     ConfigError, which begins with `where`, for a field that this version does not know.
@@ -129,7 +131,7 @@ def read_configs(described: dict[str, Any], where: str) -> tuple[ModelConfig, Tr
 
 
 def modernise(described: dict[str, Any]) -> dict[str, Any]:
-    """A description that this or an earlier version wrote, as `describe_run` writes it today. Raises as
+    """A description that this or an earlier version wrote, in the form that `describe_run` writes. Raises as
     `read_configs`."""
     return describe_run(*read_configs(described, "the checkpoint"), described["provenance"])
 
@@ -146,14 +148,14 @@ def require_frames(run: Run, deed: str) -> None:
 
 
 def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
-    """The parameters and description of a run's latest checkpoint; its moments are not read.
+    """The parameters and description in a run's latest checkpoint; the moments are not read.
 
-    The parameters lie in memory of the host, as arrays of NumPy: one device may be too small for them. Of a run that
-    is being trained, and removes the checkpoint while it is read, a newer one is taken. With several processes all
-    call this, and read the same one. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign,
-    ReadError if it cannot be read now, and ConfigError for weights that the run does not keep, or that are called
-    otherwise. A shipped model keeps one item of weights: their average if `train.ema_decay` is not 0.
-    Logs a warning, once per run and step, for a model whose training is not finished.
+    The parameters are in host memory, as NumPy arrays: one device may be too small for them. If the run is being
+    trained and removes the checkpoint while it is read, a newer one is taken. With several processes all call this, and
+    read the same checkpoint. Raises CheckpointError if there is no checkpoint, or it is damaged or of another kind,
+    ReadError if it cannot be read at the moment, and ConfigError for weights that the run does not keep, or an unknown
+    name of weights. A shipped model keeps one item of weights: their average if `train.ema_decay` is not 0. Logs a
+    warning, once per run and step, for a model whose training is not finished.
     """
     require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)
@@ -173,7 +175,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
             if not run.finished and is_writer():
                 _warn_of_unfinished(str(run_dir), run.step, run.train.steps)
             return run
-        except (CheckpointError, ReadError):  # of what another host removed, NFS says that it cannot be read
+        except (CheckpointError, ReadError):  # NFS says that a file cannot be read if another host removed it
             read, step = step, agree_on_latest(directory)
             if step in (None, read):
                 raise
@@ -225,11 +227,10 @@ def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
 
 
 def load_model(run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig(), weights: Weights = "auto") -> Model:
-    """The model of a run's latest checkpoint, to be computed as `execution` says; its parameters are cast once,
-    here.
+    """The model in a run's latest checkpoint, to be computed as `execution` says; its parameters are cast once, here.
 
     `weights` are the last ones, their moving average (`ema`), or the average where the run keeps one
-    (`auto`). Raises as `load_run`, and ConfigError for an `execution` that is none.
+    (`auto`). Raises as `load_run`, and ConfigError if `execution` is not an ExecutionConfig.
     """
     require(
         isinstance(execution, ExecutionConfig),

@@ -23,7 +23,7 @@ from hma_jax.training.optimizer import init_adam
 from hma_jax.training.train_only import own_specs
 
 FINITE = "finite/"
-"""Prefix of the names of a step's checks: metrics that are not logged, but stop a run if false."""
+"""Prefix of the names of a step's checks: metrics that are not logged, but stop a run if they are false."""
 
 
 class TrainState(NamedTuple):
@@ -49,9 +49,9 @@ def init_state(
 ) -> TrainState:
     """The state before step 1, around a copy of `params` or freshly drawn ones.
 
-    It is laid out as `shapes` says (`state_shapes`; default: on the default device, without an
-    average). No device ever holds more than its part. `params`, which become float32, stay the
-    caller's: training donates its state, never them. Raises ConfigError for `params` of another model.
+    It is laid out as `shapes` says (`state_shapes`; default: on the default device, without an average). No device ever
+    holds more than its part. `params` are copied as float32 and stay the caller's: training donates its state, never
+    `params`. Raises ConfigError for `params` of another model.
     """
     shapes = state_shapes(declared, table) if shapes is None else shapes
     layout = _layout(shapes)
@@ -67,7 +67,7 @@ def init_state(
 
 
 def _layout(shapes: TrainState) -> TrainState | None:
-    """Where its arrays lie; None: on the default device."""
+    """The shardings of its arrays; None: all are on the default device."""
     return None if shapes.step.sharding is None else jax.tree.map(lambda x: x.sharding, shapes)
 
 
@@ -88,7 +88,7 @@ def all_finite(tree: Any) -> jax.Array:
 
 
 def copy(x: jax.Array) -> jax.Array:
-    """A buffer of its own, laid out alike."""
+    """A copy in its own buffer, with the same layout."""
     return jax.device_put(x, x.sharding, may_alias=False)
 
 
@@ -102,8 +102,9 @@ def state_shapes(
 ) -> TrainState:
     """A state's shapes (jax.ShapeDtypeStruct) and, given a mesh, their shardings.
 
-    Moments and `average` (whether there is a moving average) lie as parameters of their shapes, counters on every
-    device. There are moments of what is trained: of everything, or of the robots' own parameters of `only`.
+    Moments, and the moving average (if `average`), are laid out like parameters of their shapes; counters are on every
+    device. There are moments for what is trained: for everything, or for the per-robot parameters of the robots in
+    `only`.
     """
 
     def laid_out(declared: Declared) -> Params:

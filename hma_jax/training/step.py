@@ -56,9 +56,8 @@ def make_train_step(
 ) -> Callable[[TrainState, Batch], tuple[TrainState, dict[str, jax.Array]]]:
     """step(state, batch) -> (state, metrics), to be jitted with the state donated.
 
-    The loss is the mean over all masked tokens of the global batch, plus the weighted mean over
-    its hidden actions, whatever the number of micro-batches. Randomness is fold_in(seed, step),
-    then the example's row.
+    The loss is the mean over all masked tokens of the global batch, plus the weighted mean over its hidden actions; it
+    does not depend on the number of micro-batches. Randomness is fold_in(seed, step), then the example's row.
     """
     trained_E = np.array([name in (config.only or table.names) for name in table.names])
     check_step(table, trained_E, model, config, accumulate)
@@ -106,8 +105,8 @@ def make_train_step(
 def make_gradient(
     declared: Declared[HMA], masking: MaskingConfig, accumulate: int
 ) -> Callable[[Params, Batch, TargetCounts], tuple[Params, LossSums]]:
-    """gradient(params, rows, counts) -> (gradient of the loss, loss sums) over rows in so many micro-batches; `counts`
-    are the targets of all rows, which are as `loss_of_rows` takes them."""
+    """gradient(params, rows, counts) -> (gradient of the loss, loss sums) over `rows`, as `loss_of_rows` takes them, in
+    `accumulate` micro-batches. `counts` are the targets of all rows."""
 
     def sums(params: Params, rows: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
         result = loss_of_rows(declared.merge(params), rows, masking, training=True)
@@ -132,8 +131,8 @@ def make_gradient(
 
 
 def loss_of_rows(model: HMA, rows: Batch, masking: MaskingConfig, *, training: bool) -> LossSums:
-    """`masked_loss` of a batch that has `masked`, `key` (`noise_keys`) and, where the parameters are those of some
-    robots only, `slice` (`robot_row_B`)."""
+    """`masked_loss` of a batch that also has `masked`, `key` (`noise_keys`) and, where the parameters are those of only
+    some robots, `slice` (`robot_row_B`)."""
     return masked_loss(
         model, rows["masked"], rows["tokens"], rows["actions"], rows["embodiment"], masking, rows["key"],
         rows.get("slice"), rows.get("real"), training=training,
@@ -158,7 +157,7 @@ def check_step(
 
 
 def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
-    """Raises ConfigError if these robots have no targets: every loss would be a mean over none, 0."""
+    """Raises ConfigError if these robots have no targets: every loss would be a mean over nothing, 0."""
     frames = masking.predicts_frames and any(robot.video_targets for robot in robots)
     actions = masking.predicts_actions and any(robot.chunk for robot in robots)
     predicted = "frames" if masking.predicts_frames else "actions"
@@ -190,9 +189,9 @@ def find_presence(
     real_BT: jax.Array | None = None,
     leak: ActionLeak = "none",
 ) -> Presence:
-    """Which parameters a batch updates. Of per-robot parameters only those of `trained_E`; shared ones not at all
-    unless `everything` is trained. Padding frames (not `real_BT`) do not count. Through a `leak` hidden actions are
-    shown."""
+    """The parameters that a batch updates. Per-robot parameters are updated only for the robots of `trained_E`, shared
+    ones only if `everything` is trained. Padding frames (not `real_BT`) do not count. Hidden actions that a `leak`
+    shows count as shown."""
     action_hidden_BT = masked.action_hidden_T
     # Blocks without conditioning have nothing to leak into.
     leaks = leak == "all" or (leak == "conditioning" and model.block_conditioning is not None)

@@ -1,6 +1,6 @@
-"""A profile of some steps of a run, which JAX records: what devices and host did when.
+"""A profile of some steps of a run, recorded by JAX: what devices and host did, and when.
 
-It is written for XProf and TensorBoard, and once more for https://ui.perfetto.dev (docs/performance.md).
+It is written in one format for XProf and TensorBoard, and in another for https://ui.perfetto.dev (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ PROFILE = "profile"
 """Folder of a run directory."""
 
 SETTLED = 10
-"""Steps after a start that are not recorded, if there are others: buffers fill in them, libraries choose programs."""
+"""Steps after a start that are not recorded, if there are others: in these steps buffers fill and libraries choose
+programs."""
 
 
 def traced_steps(count: int, start: int, steps: int) -> tuple[int, int]:
-    """The first and the last of `count` steps that are recorded, or as many as there are, of a run that goes from step
+    """The first and the last of the steps that are recorded, `count` or as many as there are, in a run from step
     `start` to `steps`; (0, 0) for none."""
     if not count or start >= steps:
         return 0, 0
@@ -37,12 +38,12 @@ class StepTrace:
         self._recording = False
 
     def start(self) -> None:
-        """Before the first step, when the device has nothing to do."""
+        """Starts recording; called before the first recorded step, when the device is idle."""
         jax.profiler.start_trace(self.directory, create_perfetto_trace=True)
         self._recording = True
 
     def stop(self) -> None:
-        """Writes the profile, when the last step is computed."""
+        """Writes the profile; called when the last recorded step has been computed."""
         self._recording = False
         jax.profiler.stop_trace()
 

@@ -14,8 +14,8 @@ from tensorboardX.summary import scalar
 class TensorBoardWriter:
     """An event file in `directory`; events of earlier files from `first_step` on are hidden.
 
-    The library's SummaryWriter hands events to a thread through a queue of ten. When the disk is full
-    that thread dies, and a run would wait for ever; here the error is raised. Raises OSError.
+    The library's SummaryWriter passes events to a thread through a queue of ten. When the disk is full that thread
+    dies, and the run would wait for ever. This class raises OSError instead.
     """
 
     def __init__(self, directory: Path, first_step: int):

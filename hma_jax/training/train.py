@@ -54,14 +54,14 @@ def train_model(
     initial: Params | None = None,
     records: Records = lambda index: (),
 ) -> FitResult:
-    """Trains to `config.steps`, resuming what is in `run_dir`.
+    """Trains to `config.steps`, resuming the run in `run_dir` if there is one.
 
     `make_batches(start)` gives this process's rows (`runtime.rows.own_rows`) of the global batches from step `start`
-    on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what data the
-    batches come from; resuming on other data is refused, and `modernise_provenance` brings a provenance that an earlier
-    version wrote to today's form before the two are compared. `execution` and `validation` may differ when a run
-    resumes. `records` names what a batch is made of, for the message when its step is not finite. Raises ConfigError,
-    CheckpointError, SaveError, DivergedError, Interrupted.
+    on. A new run starts from a copy of the `initial` parameters, or from randomly drawn ones. `provenance` says what
+    data the batches come from; resuming on other data is refused. `modernise_provenance` converts a provenance that an
+    earlier version wrote to the current form before the two are compared. `execution` and `validation` may differ when
+    a run resumes. `records` names the records of a batch, for the message when its step is not finite. Raises
+    ConfigError, CheckpointError, SaveError, DivergedError, Interrupted.
     """
     declared = declare_model(model, table, execution)
     mesh = execution.mesh
@@ -73,9 +73,9 @@ def train_model(
     rows = len(own_rows(device_mesh, config.batch))
     # Runs that differ only in their seed or in the statistics of their robots' actions share one compiled step: the
     # seed is part of the batch, and the host normalises the actions. With action heads the statistics are constants of
-    # the program instead, because the loss would have other last bits if its targets came normalised. Evaluation has
-    # them as inputs of its program (`HMA.with_action_units`). Training does not: every result depends on the last bits
-    # of its steps, and it has not been shown on every platform that they would stay the same.
+    # the program instead, because the loss would differ in its last bits if its targets were normalised on the host. In
+    # evaluation they are inputs of the program (`HMA.with_action_units`). In training they are not: every result
+    # depends on the last bits of its steps, and it has not been shown on every platform that these would stay the same.
     scale, program_table = (None, table) if model.action_heads else (table.scale(), table.standardised())
 
     def put(batch: Any) -> Any:
@@ -126,9 +126,9 @@ def train_model(
 def _may_change(
     config: TrainConfig, branched: list[dict[str, Any]], saved: dict[str, Any], step: int
 ) -> tuple[str, ...]:
-    """What may differ when a run resumes, as `LoopOptions.may_change`: more or fewer steps from a step at which the
-    learning rate did not depend on their number, unless it has taken more already; for a branch, at the step of its
-    branching, much else."""
+    """The fields that may differ when a run resumes, as `LoopOptions.may_change`. The number of steps may change if the
+    checkpoint is at a step up to which the learning rate does not depend on it, and is not beyond the new number. A
+    branch, at the step of its branching, may change much else."""
     if branched and step == branched[-1]["step"] <= config.steps:
         return branch.MAY_CHANGE
     same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
@@ -136,9 +136,10 @@ def _may_change(
 
 
 def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, table: EmbodimentTable) -> None:
-    """Raises ConfigError for a batch of the host that is not as `step.Batch` says, with so many `rows`.
+    """Raises ConfigError for a host batch that is not as `step.Batch` says, or does not have `rows` rows.
 
-    A step would compute with ids and robots that there are not, and with fewer rows than `TrainConfig.batch` says.
+    Without this check a step would compute with ids and robots that do not exist, and with fewer rows than
+    `TrainConfig.batch` says.
     """
     wanted = {
         "tokens": (rows, model.frames, *model.frame_shape),
@@ -156,7 +157,7 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
 
 
 def _normalised(batch: Mapping[str, np.ndarray], scale: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """A batch of the host with its actions as `ActionUnits.normalise` has them; `scale` is the table's."""
+    """A host batch with its actions normalised as by `ActionUnits.normalise`; `scale` is the table's."""
     of_rows = [x[batch["embodiment"]][:, None] for x in scale]
     return {**batch, "actions": normalise(np.asarray(batch["actions"], np.float32), *of_rows, xp=np)}
 
@@ -170,12 +171,12 @@ def _jitted_step(
     execution: ExecutionConfig,
     device_mesh: Mesh,
 ) -> Callable:
-    """The step that `make` makes (`make_train_step`, or what a test put in its place, which must not meet the kept
-    one), of runs of any seed, which comes with the batch. With a `table` that is standardised
-    the actions come normalised.
+    """The compiled step of `make`, for runs of any seed: the seed is part of the batch. With a `table` that is
+    standardised the actions come normalised. `make` is `make_train_step`, or what a test puts in its place; it is an
+    argument so that the two have separate cache entries.
 
-    Kept for the next run of the same process, which is often the same one, resumed, or one of another seed: tracing
-    and compiling a step takes seconds.
+    The step is kept for the next run in the same process, which is often the same run, resumed, or one with another
+    seed: tracing and compiling a step takes seconds.
     """
     declared = declare_model(model, table, execution)
     shapes = state_shapes(declared, table, device_mesh, execution.mesh, average=config.ema_decay > 0, only=config.only)

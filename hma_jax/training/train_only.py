@@ -1,7 +1,7 @@
-"""Runs with `train.only`: they train nothing but the per-robot parameters of some robots.
+"""Runs with `train.only`: they train only the per-robot parameters of some robots.
 
-The optimiser keeps moments of these parameters alone. Where a robot is added to a model, nearly all other parameters
-are frozen; their moments would be two thirds of the state.
+The optimiser keeps moments only for these parameters. When a robot is added to a model, nearly all parameters are
+frozen, and their moments would be two thirds of the state.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from hma_jax.training.active_robots import Active
 
 
 class Everything:
-    """A run that trains all parameters: there are moments of all of them."""
+    """A run that trains all parameters, and has moments for all of them."""
 
     shared = True  # whether parameters that all robots share are trained
 
     def __init__(self, specs: Params, trained_E: np.ndarray):
-        self.specs = specs  # of the parameters that there are moments of
+        self.specs = specs  # of the parameters that have moments
         self.trained_E = trained_E
 
     def pick(self, tree: Params) -> Params:
-        """The entries that are trained of parameters, or of a tree like them."""
+        """The trained entries of the parameters, or of a tree with the same structure."""
         return tree
 
     def put(self, tree: Params, trained: Params) -> Params:
-        """`tree` with what `pick` picks from such a tree replaced by `trained`."""
+        """`tree` with the entries that `pick` returns replaced by `trained`."""
         return trained
 
     def mask(self, grads: Params, active: Active) -> Params:
-        """Gradients of a step's robots, zero for what is not trained."""
+        """Gradients of a step's robots, with zeros for what is not trained."""
         return grads
 
     def moment_places(self, active: Active) -> jax.Array | None:
-        """Where the moments of a step's robots are; None: those of all robots, in their order."""
+        """The places of the moments of a step's robots; None: all robots, in their order."""
         return active.places_G
 
 
 class OwnOnly(Everything):
-    """A run that trains the per-robot parameters of the `trained_E` robots alone."""
+    """A run that trains only the per-robot parameters of the `trained_E` robots."""
 
     shared = False
 
@@ -98,7 +98,7 @@ def put_own(tree: Params, own: Params) -> Params:
 
 
 def own_specs(specs: Params, robots: int) -> Params:
-    """The specs of the per-robot parameters in a model of so many `robots`."""
+    """The specs of the per-robot parameters in a model of `robots` robots."""
 
     def of(spec: ParamSpec) -> ParamSpec:
         shape = [robots if i == spec.embodiment_axis else size for i, size in enumerate(spec.shape)]

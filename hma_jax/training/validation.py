@@ -1,4 +1,4 @@
-"""Held-out loss during training, on the same windows and masks each time; no part of a run's identity."""
+"""Held-out loss during training, on the same windows and masks each time; it is not part of a run's identity."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Validation:
     """What a run is validated on.
 
     `batches()` yields this process's rows of a few global batches, as large as in training, perhaps with `valid`
-    bool [B] (False: a padding row) and `real` bool [B, T] (False: a padding frame). A batch that is all of one dataset
-    may name it as `dataset`. It is read once; the windows stay in memory of the host.
+    bool [B] (False: a padding row) and `real` bool [B, T] (False: a padding frame). A batch of a single dataset may
+    name it as `dataset`. The batches are read once; the windows stay in host memory.
     """
 
     every: int  # steps
@@ -54,8 +54,8 @@ def make_validation_hook(
     execution: ExecutionConfig,
     put_batch: Callable[[Any], Any],
 ) -> ValidationHook:
-    """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one; where
-    batches name several datasets, also the loss of each as `loss/NAME`."""
+    """Measures `loss` (and its parts) for the parameters and, as `ema_loss`, for their average if there is one. If
+    batches name several datasets, it also measures the loss of each, as `loss/NAME`."""
     compute = _jitted_sums(model, table, masking, execution, jax.sharding.get_mesh())
     held: list[dict[str, np.ndarray]] = []
     datasets: list[str] = []  # of each batch; "" where it does not name one
@@ -92,7 +92,8 @@ def make_validation_hook(
 def _jitted_sums(
     model: ModelConfig, table: EmbodimentTable, masking: MaskingConfig, execution: ExecutionConfig, device_mesh: Mesh
 ) -> Callable:
-    """`make_sums` on a mesh, which may be empty; kept for the next run of the same process, as its step is."""
+    """`make_sums`, compiled for a mesh, which may be empty; kept for the next run in the same process, like the
+    step."""
     layout = None if device_mesh.empty else replicated(device_mesh)
     declared = declare_model(model, table, execution)
     return jax.jit(make_sums(declared, table, model, masking, execution.accumulate), out_shardings=layout)
@@ -104,8 +105,8 @@ def make_sums(
     """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function.
 
     The batch is split into as many micro-batches as a training step's, so it fits into memory if a step does. Settings
-    that weigh targets or degrade the past in training alone are switched off, so that runs with different values of
-    them can be compared. Masks, random ids and label smoothing are those of training.
+    that weigh targets or degrade the past only in training are switched off, so that runs with different values of them
+    can be compared. Masks, random ids and label smoothing are those of training.
     """
     masking = replace(masking, change_weight=1.0, own_past=0.0, own_past_rounds=1, displaced_past=0.0)
 
