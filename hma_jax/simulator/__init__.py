@@ -1,9 +1,9 @@
 """A trained model as a simulator: pixels and a robot's raw actions in, pixels out.
 
-`simulator` has the class that programs use, `programs` what it compiles, `episode` the host's record of an episode,
-`robots` the commands of a robot, `starts` recorded beginnings of episodes, `folder` all of it on disk, `warm_up` what
-is compiled ahead, `interface` what true simulators share with it, `environment` Gymnasium environments of both.
-Decoding and the window are `hma_jax.generation`'s.
+`simulator` has the class that programs use, `programs` its compiled programs, `episode` the host's record of an
+episode, `robots` the commands of a robot, `starts` recorded beginnings of episodes, `folder` the files on disk,
+`warm_up` compilation ahead of use, `interface` the interface that true simulators share, and `environment` Gymnasium
+environments of both. Decoding and the window are in `hma_jax.generation`.
 """
 
 from hma_jax.simulator.episode import Snapshot

@@ -1,4 +1,4 @@
-"""Simulators as Gymnasium knows them (extra `simulator`): one robot, images in, its raw actions out.
+"""Simulators as Gymnasium environments (extra `simulator`): one robot, raw actions in, images out.
 
 Importing this module registers `HMA/Robot-v0`, alone and as a vector environment:
 
@@ -30,12 +30,12 @@ from hma_jax.simulator.starts import Start
 
 ID = "HMA/Robot-v0"
 MAX_STEPS = 200
-"""Frames after which an episode is truncated, unless `gymnasium.make` or `gymnasium.make_vec` is told other
-`max_episode_steps`."""
+"""Frames after which an episode is truncated, unless `max_episode_steps` is passed to `gymnasium.make` or
+`gymnasium.make_vec`."""
 
 
 def action_space(robot: Robot) -> gymnasium.spaces.Box:
-    """Raw actions [A], between the least and greatest that the robot was ever given."""
+    """Raw actions [A], between the smallest and largest values that the robot was given in recordings."""
     return gymnasium.spaces.Box(np.array(robot.low, np.float32), np.array(robot.high, np.float32), dtype=np.float32)
 
 
@@ -45,11 +45,11 @@ def observation_space(simulator: AnySimulator) -> gymnasium.spaces.Box:
 
 
 _driven_by: WeakKeyDictionary[AnySimulator, object] = WeakKeyDictionary()
-"""The key of the environment that began the episodes of a simulator; others must not step them."""
+"""Simulator -> the key of the environment that began its episodes; other environments must not step them."""
 
 
 class _Task:
-    """What both environments need: a simulator, one of its robots, where its episodes start and who judges them."""
+    """What both environments need: a simulator, one of its robots, the starts of its episodes and the judge."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class _Task:
         self.starts = [start for start in starts if start.robot == robot]
 
     def at_its_rate(self, metadata: dict[str, Any]) -> dict[str, Any]:
-        """With frames per second of the robot's own time, for whoever films it, where that is known."""
+        """`metadata` with the frames per second of the robot's own time, for recorders of videos, where it is known."""
         rate = self.robot.hz / self.robot.stride
         return metadata | ({"render_fps": int(rate) if rate.is_integer() else rate} if rate else {})
 
@@ -107,8 +107,8 @@ class _Task:
     def begin(
         self, rngs: Sequence[np.random.Generator], episodes: Sequence[int], options: dict[str, Any] | None
     ) -> np.ndarray:
-        """Starts and seeds of `episodes`, a pair drawn from each of `rngs`; `options` may name the start. Once it began
-        all of them, other environments cannot step them."""
+        """Begins `episodes`, with a start and a seed drawn from each of `rngs`; `options` may name the start. From then
+        on other environments cannot step the simulator."""
         _refuse_forked(self.simulator)
         if len(episodes) < len(self.simulator):
             self._refuse_others_episodes()
@@ -127,12 +127,13 @@ class _Task:
         return images
 
     def step(self, actions: Actions) -> np.ndarray:
-        """As the simulator's."""
+        """As the simulator's `step`."""
         self._refuse_others_episodes()
         return self.simulator.step(actions)
 
     def _refuse_others_episodes(self) -> None:
-        """They would go on under actions that are not theirs, and look like this environment's."""
+        """Raises ConfigError if another environment began the simulator's episodes: stepping would continue those under
+        this environment's actions."""
         require(
             _driven_by.get(self.simulator, self._key) is self._key,
             "another environment has begun its episodes in this one's simulator, where this one's are lost: give each "
@@ -142,8 +143,8 @@ class _Task:
 
 
 def _refuse_forked(simulator: AnySimulator | None) -> None:
-    """Raises ConfigError where a model (None: one to be loaded) would wait for ever: a process that was forked has
-    JAX's state, but not its threads."""
+    """Raises ConfigError where a model (None: one to be loaded) would wait for ever: a forked process has JAX's state,
+    but not its threads."""
     if simulator is None or isinstance(simulator, Simulator):
         require(
             Simulator.made_in in (None, os.getpid()),
@@ -153,11 +154,12 @@ def _refuse_forked(simulator: AnySimulator | None) -> None:
 
 
 class RobotEnv(gymnasium.Env):
-    """One episode of one robot. A step is a frame of the model: the action is held for it. What truncates episodes
-    is Gymnasium's `TimeLimit`, which `gymnasium.make` puts around it.
+    """One episode of one robot. A step is a frame of the model, during which the action is held. Episodes are truncated
+    by Gymnasium's `TimeLimit`, in which `gymnasium.make` wraps the environment.
 
-    `reset(options={"start": i})` begins at that start, otherwise at a drawn one. Rewards and ends are the `judge`'s.
-    `info["clipped"]`, bool [A], says which action values lay outside the range; `robot.dimensions` names them.
+    `reset(options={"start": i})` begins at start i, otherwise at a randomly drawn one. The `judge` gives rewards and
+    ends episodes. `info["clipped"]`, bool [A], says which action values lay outside the range; `robot.dimensions` names
+    them.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
@@ -173,7 +175,7 @@ class RobotEnv(gymnasium.Env):
         render_mode: str | None = None,
         **options: Any,
     ):
-        """`options` are those of `Simulator.load`. Raises ConfigError."""
+        """`options` are passed to `Simulator.load`. Raises ConfigError."""
         self._task = _Task(1, run, robot, simulator, starts, judge, options)
         self.robot = self._task.robot
         self.render_mode, self.metadata = render_mode, self._task.at_its_rate(self.metadata)
@@ -196,12 +198,13 @@ class RobotEnv(gymnasium.Env):
 
 
 class RobotVectorEnv(VectorEnv):
-    """Many episodes of one robot in one batch. An episode that has ended begins anew with the next step, whose action
-    for it is ignored (Gymnasium's NEXT_STEP).
+    """Many episodes of one robot in one batch. An episode that has ended begins again in the next step, which ignores
+    its action (Gymnasium's NEXT_STEP).
 
-    `reset(seed=[...])` seeds each episode by itself: it is then as in `RobotEnv` with that seed. None leaves one as it
-    is seeded. `reset(options={"reset_mask": mask})` begins anew those alone that a bool array [num_envs] marks.
-    `info["clipped"]`, bool [num_envs, A], is that of `RobotEnv`; `info["_clipped"]` marks the episodes that stepped.
+    `reset(seed=[...])` seeds each episode separately: it is then as in `RobotEnv` with that seed. None keeps the
+    seeding of an episode. `reset(options={"reset_mask": mask})` restarts only the episodes that `mask`, bool
+    [num_envs], marks. `info["clipped"]`, bool [num_envs, A], is that of `RobotEnv`; `info["_clipped"]` marks the
+    episodes that stepped.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4, "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -231,7 +234,7 @@ class RobotVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._steps = np.zeros(num_envs, int)
         self._over = np.zeros(num_envs, bool)
-        self._rngs: list[np.random.Generator] = []  # of each episode; one for all unless they are seeded by themselves
+        self._rngs: list[np.random.Generator] = []  # of each episode; one shared generator unless seeded separately
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -269,7 +272,7 @@ class RobotVectorEnv(VectorEnv):
         which = np.flatnonzero(again).tolist()
         self._task.step([None if b in which else action for b, action in enumerate(actions)])
         info = {"clipped": self._task.clipped(), "_clipped": ~again}
-        rewards, done = self._task.judge(simulator)  # before others begin: a start does not count, as after `reset`
+        rewards, done = self._task.judge(simulator)  # before ended episodes restart: starts are not judged
         if which:
             self._task.begin([self._rngs[b] for b in which], which, None)
         self._steps = np.where(again, 0, self._steps + 1)

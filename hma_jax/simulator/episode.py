@@ -25,18 +25,19 @@ class Episode:
     robot: Robot
     index: int  # of the robot in the model's table
     seed: int
-    count: int  # frames so far, those of the start that the model did not see excluded
-    frames: deque[np.ndarray]  # tokens [S (, C)] of the newest of them
-    chunks: deque[np.ndarray]  # [U], between them: one fewer
+    count: int  # frames so far, without those of the start that the model did not see
+    frames: deque[np.ndarray]  # tokens [S (, C)] of the newest frames
+    chunks: deque[np.ndarray]  # [U], between these frames: one fewer
     pending: list[np.ndarray] = field(default_factory=list)  # native actions [A] of a chunk that is not complete yet
 
     def max_rewind(self, capacity: int) -> int:
-        """By how many frames it can be rewound: to its first, or as far as a window of `capacity` frames is kept."""
+        """The number of frames by which it can be rewound: to its first frame, or as far as a window of `capacity`
+        frames is kept."""
         kept = len(self.frames)
         return kept - (1 if kept == self.count else capacity)
 
     def rewound(self, frames: int) -> Episode:
-        """A copy, so many frames earlier."""
+        """A copy of the episode, `frames` frames earlier."""
         other = copy.deepcopy(self)
         for _ in range(frames):
             other.frames.pop()
@@ -48,8 +49,8 @@ class Episode:
 def begin_episode(
     robot: Robot, index: int, start: Start, seed: int, capacity: int, history: int, width: int
 ) -> Episode:
-    """The record of an episode that starts from the last `capacity` frames of `start` at most, its chunks padded to
-    `width`; `frames` is still empty. Raises ConfigError for actions that do not fit the frames."""
+    """The record of an episode that starts from at most the last `capacity` frames of `start`, with chunks padded to
+    `width`. Its `frames` are still empty. Raises ConfigError for actions that do not fit the frames."""
     between = len(start.images) - 1
     require(
         start.actions.shape == (between * robot.stride, robot.action_dim),
@@ -69,7 +70,7 @@ GROWING_FIELDS = ("frames", "chunks", "pending")
 
 
 class Snapshot(NamedTuple):
-    """Where all episodes of a simulator stood."""
+    """The state of all episodes of a simulator at one time."""
 
     state: Episodes
     images: np.ndarray  # read-only
@@ -78,7 +79,7 @@ class Snapshot(NamedTuple):
 
 
 def as_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
-    """A snapshot as arrays by name, for a file: its state, and the GROWING_FIELDS of its episodes, which must all have
+    """A snapshot as named arrays, for a file: its state, and the GROWING_FIELDS of its episodes, which must all have
     begun."""
     arrays = {"images": snapshot.images, "identity": np.array(snapshot.identity)}
     for i, leaf in enumerate(jax.tree.leaves(snapshot.state)):
@@ -90,10 +91,10 @@ def as_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], fresh: Snapshot) -> Snapshot:
-    """The snapshot that `as_arrays` stored. `fresh` is one of the same simulator right after the same episodes began.
-    Raises KeyError for arrays of other episodes."""
+    """The snapshot that `as_arrays` stored. `fresh` is a snapshot of the same simulator right after the same episodes
+    began. Raises KeyError for arrays of other episodes."""
     leaves, tree = jax.tree.flatten(fresh.state)
-    # On the same device, or programs would be compiled once more; a file stores bfloat16 as raw 16-bit values.
+    # On the same device: otherwise programs would be compiled again. A file stores bfloat16 as raw 16-bit values.
     state = [jax.device_put(arrays[f"state/{i}"].view(x.dtype), x.sharding) for i, x in enumerate(leaves)]
     episodes = copy.deepcopy(fresh.episodes)
     for b, episode in enumerate(episodes):

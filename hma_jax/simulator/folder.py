@@ -1,4 +1,4 @@
-"""A simulator on disk: a run, its tokenizer, its robots' commands and starts of episodes.
+"""A simulator on disk: a run, its tokenizer, the commands of its robots, and starts of episodes.
 
     RUN/checkpoints   the model (`hma_jax.training.runs`)
     RUN/tokenizer     or RUN/../tokenizer, where a study has it
@@ -33,12 +33,12 @@ TOKENIZER = "tokenizer"
 DECODE = "decode.json"
 
 DEFAULT_DECODE = DecodeConfig(sampler=SamplerConfig("dpm++", 12, temperature=0.0))
-"""How frames are decoded without a decode.json: greedily, also latents, which take fewer evaluations of the denoiser
-than in evaluation."""
+"""How frames are decoded without a decode.json: greedily. Latents are decoded greedily too, with fewer evaluations of
+the denoiser than in evaluation."""
 
 
 def find_tokenizer(directory: Path, run: Run, given: Path | None) -> Tokenizer:
-    """The tokenizer whose tokens the run was trained on. Raises ConfigError if it is not there, or another one is."""
+    """The tokenizer whose tokens the run was trained on. Raises ConfigError if there is none, or a different one."""
     places = [Path(given)] if given else [directory / TOKENIZER, directory.absolute().parent / TOKENIZER]
     found = [place for place in places if place.is_dir()]
     require(
@@ -56,7 +56,7 @@ def find_tokenizer(directory: Path, run: Run, given: Path | None) -> Tokenizer:
 
 
 def find_robots(directory: Path, table: EmbodimentTable) -> tuple[Robot, ...]:
-    """The robots of the table that have actions: as robots.json describes them, otherwise by their statistics."""
+    """The robots of the table that have actions, as robots.json describes them, or otherwise from their statistics."""
     described = {robot.name: robot for robot in load_robots(directory / ROBOTS)}
     return tuple(described.get(e.name) or Robot.of(e) for e in table.entries if e.action_dim)
 
@@ -68,23 +68,23 @@ def find_starts(directory: Path) -> tuple[Start, ...]:
 
 
 def find_decode(directory: Path) -> DecodeConfig:
-    """From decode.json; what it leaves out is as in DEFAULT_DECODE or, where the field came later than the file may be
-    (`hma_jax.config.base.later`), as before. Raises ConfigError for a file that is damaged."""
+    """The settings in decode.json. Fields that it leaves out are as in DEFAULT_DECODE or, for fields that may be newer
+    than the file (`hma_jax.config.base.later`), have the value from before. Raises ConfigError for a damaged file."""
     path = directory / DECODE
     stated = completed(_read(path), DEFAULT_DECODE) if path.exists() else {}
     return from_dict(DecodeConfig, _completed(to_dict(DEFAULT_DECODE), stated), str(path))
 
 
 def _completed(usual: Any, stated: Any) -> Any:
-    """`stated`, with what it leaves out of `usual`."""
+    """`stated`, with missing fields taken from `usual`."""
     if not (isinstance(usual, dict) and isinstance(stated, dict)):
         return stated
     return usual | {name: _completed(usual.get(name), value) for name, value in stated.items()}
 
 
 def change_decode(decode: DecodeConfig, temperature: float | None = None, **fields: Any) -> DecodeConfig:
-    """`decode` with other fields; None leaves one as it is. `temperature` is that of whatever a model samples, token
-    ids or latents."""
+    """`decode` with other `fields`; None keeps a field. `temperature` applies to whatever a model samples, token ids or
+    latents."""
     given = {name: value for name, value in fields.items() if value is not None}
     if temperature is not None:
         sampler = replace(given.get("sampler", decode.sampler), temperature=temperature)
@@ -93,7 +93,7 @@ def change_decode(decode: DecodeConfig, temperature: float | None = None, **fiel
 
 
 def load_robots(path: Path) -> tuple[Robot, ...]:
-    """Empty where there is no such file. Raises ConfigError for one that is damaged."""
+    """The robots in a file; empty if there is none. Raises ConfigError for a damaged file."""
     if not path.exists():
         return ()
     rows = _read(path)

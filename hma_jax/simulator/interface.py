@@ -15,11 +15,11 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 Actions = Sequence[ArrayLike | None] | np.ndarray | jax.Array
-"""One entry per episode: numbers, or None for one that waits."""
+"""One entry per episode: an array of numbers, or None for an episode that waits."""
 
 
 class AnySimulator(Protocol):
-    """B episodes that begin at recorded starts and advance frame by frame; `Simulator` says what each means."""
+    """B episodes that begin at recorded starts and advance frame by frame; `Simulator` documents the methods."""
 
     @property
     def robots(self) -> Mapping[str, Robot]: ...
@@ -48,19 +48,19 @@ class AnySimulator(Protocol):
 
 
 HISTORY = 600
-"""Frames that an episode can be rewound by, by default."""
+"""The number of frames by which an episode can be rewound, by default."""
 
 
 def read_only(images: np.ndarray) -> np.ndarray:
-    """A view that cannot be written to: callers of a simulator see its frames, and do not change them."""
+    """A view that cannot be written to, so that callers of a simulator see its frames but cannot change them."""
     view = images.view()
     view.flags.writeable = False
     return view
 
 
 def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
-    """`values` as ints. Raises ConfigError for anything else: 0.5 is not truncated to 0, and a mask is no list of
-    numbers."""
+    """`values` as ints. Raises ConfigError for anything but integers: 0.5 is not truncated to 0, and a mask is not a
+    list of numbers."""
     try:
         given = list(values)
         if not any(isinstance(value, bool) for value in given):
@@ -71,8 +71,8 @@ def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
 
 
 def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
-    """Which of `count` episodes a call is of; None: all. Raises ConfigError for numbers that repeat or that there are
-    not."""
+    """The episodes, of `count`, that a call is about; None: all. Raises ConfigError for numbers that repeat or do not
+    exist."""
     which = list(range(count)) if episodes is None else whole_numbers("episodes", episodes)
     require(
         all(0 <= b < count for b in which) and len(set(which)) == len(which),
@@ -82,7 +82,8 @@ def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
 
 
 def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
-    """One for each of `count` episodes, where one is given for all. Raises ConfigError for what is none."""
+    """A start for each of `count` episodes, where one may be given for all. Raises ConfigError for anything but
+    Starts."""
     each = list(starts) if isinstance(starts, Sequence) and not isinstance(starts, str) else [starts] * count
     others = [start for start in each if not isinstance(start, Start)]
     require(not others, f"an episode begins at a Start (see the simulator's `starts`), not at {others[:1]}")
@@ -90,9 +91,9 @@ def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
 
 
 Judge = Callable[[Any], tuple[np.ndarray, np.ndarray]]
-"""A function of an `AnySimulator` to rewards and termination at its present frames: (float [B], bool [B]: the task
-is done and the episode over). If a judge has a method `begin(simulator, episodes)`, it is called after `episodes`
-were reset."""
+"""A function from an `AnySimulator` to rewards and terminations at its present frames: (float [B], bool [B]: the task
+is done and the episode over). If a judge has a method `begin(simulator, episodes)`, it is called after `episodes` were
+reset."""
 
 
 def no_judge(simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,9 @@
-"""What a simulator compiles: from pixels and raw actions to pixels in one call each, of fixed shapes.
+"""The programs that a simulator compiles: each maps pixels and raw actions to pixels in one call, with fixed shapes.
 
-`reset_from_images`, `reset_from_tokens`, `advance` and `take` each map the state of all episodes to a new one; all but
-the last donate it. The first three work on some of the episodes, and are compiled once per power of two of how many
-(`padded`): the other episodes cost nothing. Advancing all of them is a program of its own, which copies no state.
+`reset_from_images`, `reset_from_tokens`, `advance` and `take` each map the state of all episodes to a new one; all
+except the last donate it. The first three work on some of the episodes, so that the others cost nothing, and are
+compiled for each power of two of their number (`padded`). Advancing all episodes is a separate program, which copies no
+state.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from hma_jax.training.runs import Model
 
 
 class ResetInputs(NamedTuple):
-    """Frames and chunks from which n of the episodes start, or are rewound to; padded to T - 1 frames."""
+    """Frames and chunks from which n of the episodes start, or to which they are rewound, padded to T - 1 frames."""
 
-    rows: np.ndarray  # int32 [n]: which episodes; one may be repeated with equal values
+    rows: np.ndarray  # int32 [n]: the episodes; one may be repeated, with equal values
     frames: np.ndarray  # uint8 [n, T - 1, H, W, 3], or tokens [n, T - 1, S (, C)]
     chunks: np.ndarray  # float32 [n, T - 2, U]
     robots: np.ndarray  # int32 [n]
@@ -35,7 +36,7 @@ class ResetInputs(NamedTuple):
 
     @classmethod
     def empty(cls, rows: Sequence[int], capacity: int, width: int, shape: tuple[int, ...], dtype: Any) -> ResetInputs:
-        """For the episodes `rows`, with frames of `shape`; zeros until `set_episode`."""
+        """Inputs for the episodes `rows`, with frames of `shape`; all zeros until `set_episode`."""
         n = len(rows)
         frames, chunks = np.zeros((n, capacity, *shape), dtype), np.zeros((n, capacity - 1, width), np.float32)
         return cls(np.array(rows, np.int32), frames, chunks, *np.zeros((3, n), np.int32))
@@ -102,13 +103,13 @@ class Programs:
         self.reset_from_images = jax.jit(reset_from_images, donate_argnums=1)
         self.reset_from_tokens = jax.jit(reset_from_tokens, donate_argnums=1)
         self.advance = jax.jit(advance, donate_argnums=1)
-        self.take = jax.jit(take)  # of all rows in order: a copy
+        self.take = jax.jit(take)  # with all rows in order, it is a copy
         frame = model.config.frame_shape, model.config.frame_dtype
         blank = ResetInputs.empty(range(episodes), capacity, model.table.action_width, *frame)
         self._shapes = jax.eval_shape(fresh, self.weights, blank)
 
     def empty(self) -> Episodes:
-        """The state before any episode has begun, on the device of the weights: programs return it there, and would be
-        compiled once more for a state on another device."""
+        """The state before any episode has begun, on the device of the weights. Programs return states there, and would
+        be compiled again for a state on another device."""
         sharding = jax.tree.leaves(self.weights)[0].sharding
         return jax.device_put(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes), sharding)

@@ -1,4 +1,4 @@
-"""A robot's commands: its action dimensions, their ranges, and what is done with values outside."""
+"""A robot's commands: its action dimensions, their ranges, and how values outside the range are handled."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from hma_jax.config import ConfigError, require
 from hma_jax.model.embodiments import DEAD_STD, Embodiment
 
 Outside = Literal["clip", "refuse"]
-"""What is done with a value outside a robot's recorded range: it is clipped, and reported, or it is an error."""
+"""How a value outside a robot's recorded range is handled: it is clipped and reported, or it is an error."""
 
 KEYS = 4
-"""Keys of the page that move a robot: right, up, D, W."""
+"""The number of keys on the page that move a robot: right, up, D, W."""
 
 SPREAD = 3.0
-"""Standard deviations on both sides of the mean that are taken for a range where none is known."""
+"""The range of an action value, in standard deviations on both sides of the mean, where no range is known."""
 
 
 @dataclass(frozen=True)
 class Robot:
     """One robot's commands, in its raw units, as recorded.
 
-    `low` and `high` are the least and greatest values that it was ever given in training (`recorded`), or, where
-    only statistics are known, quantiles or `SPREAD` standard deviations around the mean.
+    `low` and `high` are the smallest and largest values in its training data (`recorded`) or, where only statistics are
+    known, quantiles or `SPREAD` standard deviations around the mean.
     """
 
     name: str
     stride: int  # native actions per frame of the model
     low: tuple[float, ...]  # [A]
     high: tuple[float, ...]
-    rest: tuple[float, ...]  # an action to begin with: 0 where the range has it, otherwise the mean
-    dimensions: tuple[str, ...] = ()  # what each value is called
-    unit: str = ""  # of the values, for people
-    keeps: bool = False  # actions are target positions: keys shift the last one; else releasing them gives `rest`
-    # What the keys right, up, D and W do to each value, in shares of half its range; left, down, A and S do the
+    rest: tuple[float, ...]  # an action to begin with: 0 where the range contains it, otherwise the mean
+    dimensions: tuple[str, ...] = ()  # the name of each value
+    unit: str = ""  # of the values, for display
+    keeps: bool = False  # actions are target positions: keys shift the last one. Otherwise released keys give `rest`
+    # What the keys right, up, D and W add to each value, in shares of half its range; left, down, A and S do the
     # opposite.
     keys: tuple[tuple[float, ...], ...] = ()
     hz: float = 0.0  # native actions per second; 0: not known
@@ -58,7 +58,7 @@ class Robot:
         )
         if not self.dimensions:
             object.__setattr__(self, "dimensions", tuple(f"action {i}" for i in range(self.action_dim)))
-        if not self.keys:  # two values: both pairs of keys move them; more: each key one
+        if not self.keys:  # up to two values: both pairs of keys move them; more: each key moves one
             moved = [key % 2 if self.action_dim <= 2 else key for key in range(KEYS)]
             rows = tuple(tuple(float(d == at) for d in range(self.action_dim)) for at in moved)
             object.__setattr__(self, "keys", rows)
@@ -78,7 +78,7 @@ class Robot:
 
     @classmethod
     def of(cls, entry: Embodiment) -> Robot:
-        """From its entry in a model's table."""
+        """The robot of an entry in a model's table."""
         if entry.low:
             low, high = entry.low, entry.high
         else:
@@ -97,7 +97,7 @@ class Robot:
     def chunk(self, action: ArrayLike) -> np.ndarray:
         """float32 [stride, A] of one action [A], held for a whole frame, or of a chunk [stride, A].
 
-        Raises ConfigError for another shape, for other types than real numbers and for a value that is not finite.
+        Raises ConfigError for any other shape, for types other than real numbers, and for values that are not finite.
         """
         action = self.numbers(action)
         shapes = (self.action_dim,), (self.stride, self.action_dim)
@@ -111,7 +111,7 @@ class Robot:
 
     def clip_to_range(self, actions: np.ndarray, outside: Outside) -> tuple[np.ndarray, np.ndarray]:
         """(`actions` [..., A] clipped to the range, bool [A]: dimensions that were outside). Raises ConfigError if
-        there are any and `outside` is "refuse"."""
+        there are such dimensions and `outside` is "refuse"."""
         low, high = np.asarray(self.low, np.float32), np.asarray(self.high, np.float32)
         beyond = ((actions < low) | (actions > high)).reshape(-1, self.action_dim).any(0)
         if outside == "refuse" and beyond.any():
@@ -122,7 +122,8 @@ class Robot:
         return np.clip(actions, low, high), beyond
 
     def describe(self, beyond: np.ndarray, actions: np.ndarray) -> str:
-        """A message that says which of `actions` [..., A] are out of range, for dimensions `beyond` [A]."""
+        """A message about the values of `actions` [..., A] that are out of range, in the dimensions that `beyond` [A]
+        marks."""
         values = actions.reshape(-1, self.action_dim)
         known = "it was trained on" if self.recorded else "its statistics allow"
         return "; ".join(
@@ -149,7 +150,7 @@ def rest_action(low: Sequence[float], high: Sequence[float], mean: Sequence[floa
 
 
 def require_robot(name: str, known: Sequence[str]) -> None:
-    """Raises ConfigError for a name that is none of the model's robots, and says which one may be meant."""
+    """Raises ConfigError, which suggests a similar name, for a name that is not one of the model's robots."""
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
     require(name in known, f"the model has no robot {name!r}; {hint}")

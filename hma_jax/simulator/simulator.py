@@ -1,6 +1,7 @@
-"""A trained model as a simulator: episodes that are reset, step under raw actions, are saved, branched and rewound.
+"""A trained model as a simulator: episodes are reset, stepped with raw actions, saved, branched and rewound.
 
-Owns the host's record of each episode; the state on the device, and what computes with it, are `programs`'.
+This module owns the host's record of each episode; the state on the device and the programs that compute with it are in
+`programs`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from hma_jax.tokenizers.base import Tokenizer, token_mismatch
 from hma_jax.training.runs import Model, load_model, require_frames
 
 Rate = Literal["model", "native"]
-"""Whether a step is a frame of the model, or one native action: then a frame comes with every stride-th."""
+"""Whether a step is a frame of the model, or one native action; then every stride-th step gives a frame."""
 
 log = logging.getLogger(__name__)
 
@@ -37,16 +38,16 @@ log = logging.getLogger(__name__)
 class Simulator:
     """B episodes at once, each with its own robot, beginning and end.
 
-    An episode must begin (`reset`) before it advances (`step`). Frames are uint8 [B, H, W, 3], as the tokenizer
-    decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
-    frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
-    says. A model trained on passive video ignores actions. ConfigError is raised
-    for whatever cannot be done; nothing has changed then. After a fault of the device, and where a tokenizer or a model
-    makes what are no tokens (NaN, say), every episode may have to begin again (`counts` is 0 then).
+    An episode must begin (`reset`) before it advances (`step`). Frames, including the first ones, are uint8 [B, H, W,
+    3], as the tokenizer decodes them. What an episode shows depends only on its start, its actions and its seed: frame
+    t is drawn from fold_in(key(seed), t). Past the model's window of T frames it continues as `decode.slide` says. A
+    model trained on passive video ignores actions. ConfigError is raised for whatever cannot be done; nothing has then
+    changed. After a fault of the device, or if a tokenizer or a model gives values that are not tokens (NaN, say),
+    every episode may have to begin again (`counts` is then 0).
     """
 
     made_in: ClassVar[int | None] = None
-    """The process in which the first one was made."""
+    """The id of the process in which the first simulator was made."""
 
     def __init__(
         self,
@@ -61,8 +62,8 @@ class Simulator:
         rate: Rate = "model",
         history: int = HISTORY,
     ):
-        """`robots` replace descriptions derived from the model's table. Actions `outside` their range are clipped
-        (reported in `clipped`, and logged once per robot) or refused."""
+        """`robots` replace the descriptions derived from the model's table. `outside` says whether actions outside
+        their range are clipped (reported in `clipped`, and logged once per robot) or refused."""
         config = model.config
         require_frames(model.run, "show")
         [episodes], [history] = whole_numbers("episodes", [episodes]), whole_numbers("history", [history])
@@ -105,22 +106,22 @@ class Simulator:
     ) -> Simulator:
         """Loads the simulator of a training run, with the files beside it (`folder`).
 
-        `options` are the constructor's and override these files; an option that is None counts as not given. Robots
-        that are not among those given stay as the files describe them.
+        `options` are those of the constructor and override these files; an option that is None counts as not given.
+        Robots that are not given are as the files describe them.
 
-        Raises ConfigError if there is no run, if it predicts no frames, or if the tokenizer is not the one that it was
-        trained with.
+        Raises ConfigError if there is no run, if it predicts no frames, or if the tokenizer is not the one with which
+        it was trained.
         """
         run = Path(run)
         model = load_model(run, execution, weights)
         given = {name: value for name, value in options.items() if value is not None}
         found = {"starts": find_starts(run), "decode": find_decode(run)} | given
-        found["robots"] = (*find_robots(run, model.table), *given.get("robots", ()))  # of one name the last counts
+        found["robots"] = (*find_robots(run, model.table), *given.get("robots", ()))  # of equal names the last counts
         return cls(model, find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None), **found)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Simulator:
-        """Itself: Gymnasium copies what an environment was made of, model included, whenever it is asked for its
-        `spec`. Copies of the episodes are `snapshot` and `branch`."""
+        """Returns this simulator itself: Gymnasium copies the arguments of an environment, model included, whenever it
+        is asked for its `spec`. `snapshot` and `branch` copy episodes."""
         return self
 
     # --- What there is -----------------------------------------------------------------------------
@@ -131,23 +132,23 @@ class Simulator:
 
     @property
     def images(self) -> np.ndarray:
-        """The present frames, uint8 [B, H, W, 3]; black where none has begun. Read-only."""
+        """The present frames, uint8 [B, H, W, 3]; black for episodes that have not begun. Read-only."""
         return read_only(self._images)
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Frames of each episode so far, those of its start that the model did not see excluded; 0: it has not
-        begun."""
+        """The number of frames of each episode so far, without those of its start that the model did not see; 0: it has
+        not begun."""
         return tuple(0 if e is None else e.count for e in self._episodes)
 
     @property
     def ignores_actions(self) -> bool:
-        """Whether the model was trained without actions, so that none has an effect."""
+        """Whether the model was trained without actions, so that actions have no effect."""
         return self.model.run.train.masking.ignores_actions
 
     def update_robots(self, robots: Sequence[Robot]) -> None:
-        """Replaces descriptions of robots, for episodes that begin from now on. Raises ConfigError if one does not
-        fit."""
+        """Replaces descriptions of robots, for episodes that begin from now on. Raises ConfigError if one does not fit
+        the model."""
         for robot in robots:
             known = self.robot(robot.name)
             require(
@@ -158,7 +159,7 @@ class Simulator:
         self.robots = {**self.robots, **{robot.name: robot for robot in robots}}
 
     def robot(self, name: str) -> Robot:
-        """Raises ConfigError for one that the model does not know or that has no actions."""
+        """The robot called `name`. Raises ConfigError if the model does not know it or it has no actions."""
         require_robot(name, tuple(self.robots))
         return self.robots[name]
 
@@ -171,9 +172,11 @@ class Simulator:
         seeds: int | Sequence[int] | np.ndarray = 0,
         episodes: Sequence[int] | None = None,
     ) -> np.ndarray:
-        """Begins `episodes` (default: all) at `starts`, one each or one for all; returns all frames.
+        """Begins `episodes` (default: all) at `starts`, one for each or one for all. Returns the frames of all
+        episodes.
 
-        Of a start's frames the last T - 1 are seen. An int for `seeds` gives the b-th of these episodes seed + b.
+        The model sees the last T - 1 frames of a start. If `seeds` is an int, the b-th of these episodes gets `seeds` +
+        b.
         """
         which = chosen_episodes(episodes, len(self))
         each = each_start(starts, len(which))
@@ -222,7 +225,7 @@ class Simulator:
         return episode
 
     def _update_images(self, which: Sequence[int], seen: np.ndarray) -> np.ndarray:
-        images = self._images.copy()  # callers keep the frames they were given
+        images = self._images.copy()  # callers may keep the frames that they were given
         images[list(which)] = seen
         self._images = images
         return self.images
@@ -233,7 +236,7 @@ class Simulator:
         """The frames after `actions`, one entry per episode: an action [A], held for a frame, a chunk [stride, A], or
         None for an episode that waits. At the native rate every entry is one action [A].
 
-        `clipped` then names the dimensions of each episode whose value lay outside the range.
+        `clipped` then names, for each episode, the dimensions whose values were outside the range.
         """
         require(len(actions) == len(self), f"{len(self)} episodes need as many actions, got {len(actions)}")
         asked: dict[int, np.ndarray] = {}
@@ -256,7 +259,7 @@ class Simulator:
         return self._advance(chunks) if chunks else self.images
 
     def _complete_chunk(self, b: int, chunk: np.ndarray) -> np.ndarray | None:
-        """The chunk [stride, A] to execute, or None while native actions of it are missing."""
+        """The chunk [stride, A] to execute, or None while some of its native actions are missing."""
         episode = self._running_episode(b)
         if self.rate == "model":
             return chunk
@@ -274,8 +277,8 @@ class Simulator:
             )
 
     def _advance_inputs(self, which: list[int]) -> tuple[list[int], np.ndarray | None, np.ndarray]:
-        """(rows, rows_n, chunk_nU) of the program that advances the episodes `which`: their numbers, padded; the same
-        as its argument, None for all episodes; their chunks, still zeros."""
+        """(rows, rows_n, chunk_nU) for the program that advances the episodes `which`: their numbers, padded; the same
+        as an argument of the program, None for all episodes; their chunks, still zeros."""
         rows = padded(which, len(self))
         rows_n = None if len(which) == len(self) else np.array(rows, np.int32)
         return rows, rows_n, np.zeros((len(rows), self.model.table.action_width), np.float32)
@@ -300,8 +303,8 @@ class Simulator:
 
     @contextmanager
     def _donating_state(self) -> Iterator[None]:
-        """Around a program to which the state is donated, until its results have arrived. If the program fails after
-        that, the state is lost: all episodes are then as before their first reset."""
+        """Used around a program to which the state is donated, until its results have arrived. If the program fails
+        after the donation, the state is lost: all episodes are then as before their first reset."""
         try:
             yield
         except BaseException:  # an interrupt by the user too
@@ -311,8 +314,8 @@ class Simulator:
             raise
 
     def compile(self, together: int) -> None:
-        """Compiles the program that advances so many episodes at once, ahead of its first use. From any thread: no
-        episode changes."""
+        """Compiles the program that advances `together` episodes at once, ahead of its first use. It may be called from
+        any thread: no episode changes."""
         [together] = whole_numbers("together", [together])
         require(
             1 <= together <= len(self), f"between 1 and {len(self)} episodes can be stepped together, got {together}"
@@ -324,7 +327,7 @@ class Simulator:
     # --- Going back, and apart ---------------------------------------------------------------------
 
     def snapshot(self) -> Snapshot:
-        """Where all episodes stand now."""
+        """The present state of all episodes."""
         episodes = copy.deepcopy(tuple(self._episodes))
         return Snapshot(self._copy_state(self._state), self.images, episodes, self._identity)
 
@@ -333,7 +336,7 @@ class Simulator:
         return f"{self.model.identity} {self.tokenizer.identity}"
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
-        """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same frames.
+        """Continues from a snapshot of this simulator, any number of times; the same actions then give the same frames.
         Raises ConfigError for a snapshot of another model or tokenizer, or of another number of episodes."""
         require(
             isinstance(snapshot, Snapshot), f"restore takes what `snapshot` returned, got {type(snapshot).__name__}"
@@ -350,7 +353,8 @@ class Simulator:
         return self.images
 
     def branch(self, sources: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Episode b becomes a copy of episode sources[b], seed included: later differences are due to actions alone."""
+        """Episode b becomes a copy of episode sources[b], seed included, so that later differences are due only to
+        actions."""
         copied = whole_numbers("sources", sources)
         fits = len(copied) == len(self) and all(0 <= s < len(self) for s in copied)
         require(fits, f"branch needs {len(self)} numbers of episodes to copy, each below {len(self)}, got {copied}")
@@ -360,10 +364,10 @@ class Simulator:
         return self.images
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
-        """Takes `episodes` (default: all) back by so many frames.
+        """Takes `episodes` (default: all) back by `frames` frames.
 
-        What followed is forgotten, and comes again under the same actions: exactly with `decode.slide` "exact";
-        with "streaming" the window is computed anew, which is nearer to exact than what had been there.
+        Later frames are forgotten, and come again under the same actions: exactly with `decode.slide` "exact". With
+        "streaming" the window is computed anew, which is nearer to exact than the previous cache.
         """
         [frames] = whole_numbers("frames", [frames])
         require(frames >= 0, f"the number of frames to rewind must not be negative, got {frames}")
@@ -387,7 +391,7 @@ class Simulator:
         return self._update_images(which, seen[: len(which)])
 
     def max_rewind(self, b: int) -> int:
-        """By how many frames episode b can be rewound."""
+        """The number of frames by which episode b can be rewound."""
         return self._running_episode(b).max_rewind(self.capacity)
 
     def last_action(self, b: int) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""Recorded beginnings of episodes, from which a simulator starts, and the file that holds them."""
+"""Recorded beginnings of episodes, from which a simulator starts, and their file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Start:
     robot: str
     images: np.ndarray  # uint8 [n, H, W, 3]
     actions: np.ndarray  # float32 [(n - 1) stride, A], raw
-    seed: int | None = None  # with which the robot's true simulator begins the same episode
+    seed: int | None = None  # the seed with which the robot's true simulator begins the same episode
 
     def __post_init__(self):
         object.__setattr__(self, "images", np.asarray(self.images))
@@ -48,7 +48,7 @@ class Start:
 
 
 def save_starts(starts: Sequence[Start], path: Path) -> None:
-    """Writes all of them, compressed, or nothing."""
+    """Writes all starts, compressed, or nothing."""
     arrays: dict[str, np.ndarray] = {}
     for i, start in enumerate(starts):
         seed = [] if start.seed is None else [start.seed]
@@ -58,7 +58,7 @@ def save_starts(starts: Sequence[Start], path: Path) -> None:
 
 
 def load_starts(path: Path) -> tuple[Start, ...]:
-    """What `save_starts` wrote. Raises ConfigError for a file that is damaged or something else."""
+    """Reads what `save_starts` wrote. Raises ConfigError for a file that is damaged or of another kind."""
     with reading_arrays(path, "make it again") as arrays:
         starts = []
         for number, robot in sorted({_parts(name) for name in arrays}):

@@ -15,10 +15,11 @@ from hma_jax.simulator.starts import Start
 def warm_up(
     simulator: Simulator, together: int | None = None, progress: Callable[[int, int, str], None] = lambda *_: None
 ) -> None:
-    """Compiles resetting, rewinding and advancing up to `together` episodes at once (default: any number), and restores
-    the simulator's state. For more that advance at once: `warm_up_more`.
+    """Compiles the programs that reset, rewind and advance up to `together` episodes at once (default: any number), and
+    restores the simulator's state. `warm_up_more` compiles those that advance more at once.
 
-    Calls `progress(done, total, what)`: so many of the programs are compiled, and `what` the next one is for."""
+    Calls `progress(done, total, what)`, where `done` of `total` programs are compiled and `what` is the purpose of the
+    next one."""
     each = [n for n in sizes(len(simulator)) if n <= (together or len(simulator))]
     done, total = count(), 3 * len(each)
     kept = simulator.snapshot()
@@ -41,8 +42,8 @@ def warm_up_more(
     ended: Callable[[], bool] = lambda: False,
     reached: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Compiles advancing more than `above` episodes at once, up to all, until `ended()`; from any thread. Calls
-    `reached` with each number that is ready."""
+    """Compiles the programs that advance more than `above` episodes at once, up to all, until `ended()`. It may run in
+    any thread. Calls `reached` with each number of episodes that is ready."""
     for together in sizes(len(simulator)):
         if above < together and not ended():
             simulator.compile(together)
@@ -50,6 +51,6 @@ def warm_up_more(
 
 
 def sizes(episodes: int) -> list[int]:
-    """How many each of the programs that advance any number of so many episodes advances at most."""
+    """For each of the programs that advance any number of `episodes` episodes, the most that it advances."""
     numbers = range(1, episodes + 1)
     return list({(len(padded(list(range(n)), episodes)), n == episodes): n for n in numbers}.values())
