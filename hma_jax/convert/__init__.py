@@ -1,7 +1,7 @@
-"""Checkpoints to and from other formats: the official release's, safetensors, StableHLO.
+"""Conversion of checkpoints to and from other formats: the official release's, safetensors, StableHLO.
 
-Models meet in a `training.runs.Run`: readers return one, writers take one. Readers of pretrained
-tokenizers return one that `tokenizers.io` saves.
+The common form of models is `training.runs.Run`: readers return one, writers take one. Readers of pretrained tokenizers
+return a tokenizer that `tokenizers.io` can save.
 """
 
 from hma_jax.convert.atomic import require_free

@@ -1,4 +1,4 @@
-"""Directories that appear whole or not at all, also after a loss of power."""
+"""Directories that appear whole or not at all, even after a loss of power."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hma_jax.runtime.outputs import writing_to
 
 
 def require_free(directory: Path) -> None:
-    """Raises ConfigError if there is something at `directory`, which an output would replace."""
+    """Raises ConfigError if there is something at `directory` that an output would replace."""
     directory = Path(directory)
     empty = directory.is_dir() and not any(directory.iterdir())
     require(
@@ -26,8 +26,8 @@ def require_free(directory: Path) -> None:
 
 @contextmanager
 def atomic_directory(directory: Path) -> Iterator[Path]:
-    """A temporary directory to write into, renamed to `directory`, or to what that is a link to, when the block
-    succeeds. One that a killed process left behind is removed.
+    """A temporary directory to write into, which is renamed to `directory` (or to its target, if that is a link) when
+    the block succeeds. A temporary directory that a killed process left behind is removed.
 
     Raises ConfigError if something is there already, if nothing can be written there, or while another process writes
     there.

@@ -1,9 +1,8 @@
-"""muP's multipliers moved into the weights: the same model for a program that multiplies otherwise.
+"""muP's multipliers moved into the weights: the same model for a program with other multipliers.
 
-Two numbers beside the weights scale with the width: what divides the inputs of read-outs (the discrete
-logits and actions, the condition of the diffusion heads), and what multiplies q.k in attention. A model
-computes the same under other numbers if the matrices next to them take up the ratio. Facts: reference
-sections 1.5 and 1.7.
+Two numbers besides the weights depend on the width: the divisor of the inputs of read-outs (the discrete logits and
+actions, the condition of the diffusion heads), and the factor on q.k in attention. A model computes the same with other
+numbers if the matrices next to them absorb the ratio. Facts: reference sections 1.5 and 1.7.
 """
 
 from __future__ import annotations
@@ -21,21 +20,21 @@ ATTENTION = ("trunk/blocks/space", "trunk/blocks/time")
 
 
 def readout_ratio(model: ModelConfig, target: ModelConfig) -> float:
-    """What read-outs are multiplied by so that `target` computes what `model` does."""
+    """The factor on the weights of read-outs with which `target` computes what `model` does."""
     return target.mup_multiplier("readout") / model.mup_multiplier("readout")
 
 
 def query_ratio(model: ModelConfig, target: ModelConfig) -> float:
-    """What q.k is multiplied by so that `target` computes what `model` does."""
+    """The factor on q.k with which `target` computes what `model` does."""
     return attention_scale(model) / attention_scale(target)
 
 
 def folded(
     arrays: Mapping[str, np.ndarray], leaves: Mapping[str, ParamSpec], model: ModelConfig, target: ModelConfig
 ) -> dict[str, np.ndarray]:
-    """Path -> parameters with which `target` computes what `model` does with `arrays`.
+    """Path -> array: the parameters with which `target` computes what `model` does with `arrays`.
 
-    The two differ in `mup` only. Values that need no change are handed on, not copied.
+    The two differ only in `mup`. Arrays that need no change are returned as they are, not copied.
     """
     out = dict(arrays)
 
@@ -49,7 +48,7 @@ def folded(
     ratio = query_ratio(model, target)
     for layer in ATTENTION:
         if model.qk_norm:
-            # One norm is behind q and k: each takes the square root.
+            # q and k share one norm, so each is multiplied by the square root.
             multiply(f"{layer}/norm/gain", math.sqrt(ratio))
             multiply(f"{layer}/norm/bias", math.sqrt(ratio))
         elif ratio != 1:
@@ -60,5 +59,5 @@ def folded(
 
 
 def _queries_times(qkv: np.ndarray, ratio: float) -> np.ndarray:
-    """[..., 3, H, I] of q, k and v, of which the first is multiplied."""
+    """q, k and v [..., 3, H, I], of which q is multiplied by `ratio`."""
     return np.asarray(qkv) * np.array([ratio, 1, 1], np.float32)[:, None, None]

@@ -1,4 +1,4 @@
-"""A model for other frameworks: arrays under our paths, and a JSON description that explains them.
+"""A model for other frameworks: arrays named by our parameter paths, and a JSON description of them.
 
 model.safetensors   every parameter, float32
 model.json          step, which weights (last or ema), configurations, robots and provenance; of every array its
@@ -36,7 +36,7 @@ def describe_tensors(leaves: Mapping[str, ParamSpec]) -> dict[str, dict[str, Any
 
 
 def write_neutral(run: Run, directory: Path) -> None:
-    """Raises ConfigError if `directory` exists, and as `require_run`."""
+    """Writes both files. Raises ConfigError if `directory` exists, and as `require_run`."""
     require_run(run)
     arrays = {path: np.asarray(x) for path, x in flat(run.params).items()}
     description = {
@@ -53,7 +53,7 @@ def write_neutral(run: Run, directory: Path) -> None:
 
 
 def read_neutral(directory: Path) -> Run:
-    """Raises ConfigError naming the field or tensors that do not fit."""
+    """Reads both files. Raises ConfigError, which names the field or tensors that do not fit."""
     directory = Path(directory)
     path = directory / DESCRIPTION
     try:
@@ -80,7 +80,7 @@ def read_neutral(directory: Path) -> Run:
         kind = type(description[name]).__name__
         require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
     model, train, table = read_configs(description, str(path))
-    # Earlier versions did not say which; by default they wrote the average where there was one.
+    # Earlier versions did not state which weights; by default they wrote the average where there was one.
     which = description.get("weights", "ema" if train.ema_decay else "last")
     require_choice(which, ("last", "ema"), f"{path}: weights")
     leaves = declare_model(model, table).leaves()

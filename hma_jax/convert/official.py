@@ -1,10 +1,10 @@
 """Checkpoints of the official PyTorch release (STMaskGIT and STMAR), as a `Run` and back.
 
-A directory holds config.json and model.safetensors, or a torch file in its place. Reading is strict: a tensor too few,
-too many or of another shape is refused, where the release leaves random weights in its place. Fields that we do not use
-are kept in the run's provenance, so that a run that was imported and not trained since is exported with the same fields
-and, byte for byte, the same tensors. In every other run muP's multipliers are folded into the weights where the release
-would use other ones (`multipliers`).
+A directory holds config.json and model.safetensors, or a torch file instead of the latter. Reading is strict: missing
+or additional tensors and tensors of another shape are refused, where the release would leave random weights. Fields
+that we do not use are kept in the run's provenance, so that a run that was imported and not trained since is exported
+with the same fields and, byte for byte, the same tensors. In every other run, muP's multipliers are folded into the
+weights where the release would use different ones (`multipliers`).
 """
 
 from __future__ import annotations
@@ -45,15 +45,16 @@ from hma_jax.training.runs import Run
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")
-INDEX = "{}.index.json"  # in the place of weights that lie in several files, which it names
+INDEX = "{}.index.json"  # instead of weights that are in several files, which it names
 WRAPPERS = ("module.", "_orig_mod.")
-"""What torch's data parallelism and torch.compile put before every name."""
+"""Prefixes that torch's data parallelism and torch.compile add to every name."""
 
 ACTIONS_IN = ("stem/into/kernel", "action_head/robots/into/kernel")
-"""Parameters [E, U, ...] that multiply actions, given or noised."""
+"""Parameters [E, U, ...] that multiply actions, clean or noised."""
 
 CLIP = 10.0
-"""What the release keeps predicted clean values in while sampling; its configuration has no field for it."""
+"""The range +-CLIP in which the release keeps predicted clean values while sampling; its configuration has no field for
+it."""
 
 
 def official_shapes(model: ModelConfig, table: EmbodimentTable) -> dict[str, tuple[int, ...]]:
@@ -73,7 +74,7 @@ def _statistics(robot: str) -> tuple[str, str]:
 
 
 def read_official(directory: Path) -> Run:
-    """A run at step 0. Raises ConfigError naming the file and field or tensors that do not fit."""
+    """A run at step 0. Raises ConfigError, which names the file and the field or tensors that do not fit."""
     directory = Path(directory)
     config, tensors = read_config(directory), _read_weights(directory)
     where = str(directory / CONFIG)
@@ -86,7 +87,7 @@ def read_official(directory: Path) -> Run:
         model, masking = read_model(config, where), read_masking(config)
     blocks = model.layers + (model.diffusion.depth if model.diffusion else 0)
     require(
-        blocks <= len(tensors),  # before anything is made of each
+        blocks <= len(tensors),  # before anything is built for each layer
         f"{where}: it describes {blocks} layers, but there are only {len(tensors)} tensors",
     )
     names = config["action_domains"]
@@ -114,8 +115,8 @@ def read_official(directory: Path) -> Run:
 
 
 def import_remarks(run: Run) -> list[str]:
-    """What a user must know of a run that `read_official` made and nobody trained since: where it computes otherwise
-    than the release, or may compute otherwise than what was trained."""
+    """What a user must know about a run that `read_official` made and that was not trained since: where it computes
+    differently from the release, or may compute differently from the trained model."""
     remarks = []
     if run.model.conditioning == "cross_attention":
         remarks.append("cross-attention is computed as the paper describes it; the release computes it differently")
@@ -137,7 +138,7 @@ def import_remarks(run: Run) -> list[str]:
 
 @contextmanager
 def _naming_file(where: str) -> Iterator[None]:
-    """Adds the name of the file to errors of our own configurations, which do not know it."""
+    """Adds the name of the file to errors of our configurations, which do not know it."""
     try:
         yield
     except OverflowError as error:
@@ -147,7 +148,7 @@ def _naming_file(where: str) -> Iterator[None]:
 
 
 def read_config(directory: Path) -> dict[str, Any]:
-    """Raises ConfigError if there is no readable config.json."""
+    """The contents of config.json. Raises ConfigError if there is no readable one."""
     path = Path(directory) / CONFIG
     try:
         config = json.loads(path.read_text())
@@ -160,7 +161,7 @@ def read_config(directory: Path) -> dict[str, Any]:
 
 
 def _advice(directory: Path) -> str:
-    """What to give instead of a directory without config.json."""
+    """Advice on what to give instead of a directory without config.json."""
     snapshots = directory / "snapshots"
     if snapshots.is_dir():
         return f"give the directory of a version in {snapshots}, where the Hugging Face hub keeps the files"
@@ -223,7 +224,7 @@ def write_official(run: Run, directory: Path) -> list[str]:
 
 
 def official_config(run: Run) -> dict[str, Any]:
-    """The original config.json where the run still is what it described, else brought up to date.
+    """The original config.json if it still describes the run, otherwise an updated one.
 
     Raises ConfigError if the release could not compute the model.
     """
@@ -261,8 +262,8 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
 
 
 def _imported(run: Run) -> dict[str, Any]:
-    """What `read_official` noted of the checkpoint that the run was made from, or that it was trained on from; {} if
-    there is none."""
+    """What `read_official` recorded about the checkpoint from which the run was made or trained further; {} if there is
+    none."""
     provenance = run.provenance
     while provenance and "official" not in provenance:
         provenance = provenance.get("origin", {}).get("provenance", {})
@@ -271,7 +272,7 @@ def _imported(run: Run) -> dict[str, Any]:
 
 def _exportable(run: Run) -> ModelConfig:
     """The configuration that is written: the imported one if the run came from the release and was not trained since,
-    else `released_form`. Raises ConfigError if the release could not compute it."""
+    otherwise `released_form`. Raises ConfigError if the release could not compute it."""
     if _unchanged_since_import(run):
         return run.model
     require_official(run.model, run.table, run.train.masking.setting)
@@ -285,7 +286,7 @@ def _unchanged_since_import(run: Run) -> bool:
         return False
     if read_model(source["config"], CONFIG) != run.model:
         return False
-    return "weights" not in source or source["weights"] == _hash_of(run.params)  # earlier versions noted none
+    return "weights" not in source or source["weights"] == _hash_of(run.params)  # earlier versions recorded none
 
 
 def _hash_of(params: Params) -> str:
@@ -297,14 +298,14 @@ def _hash_of(params: Params) -> str:
 
 
 def _without_constant_actions(arrays: dict[str, np.ndarray], table: EmbodimentTable) -> dict[str, np.ndarray]:
-    """The parameters that multiply actions, with zeros for action values that do not vary: this model normalises those
-    to 0, the release divides their rounding noise by about 0 (`ActionUnits.normalise`)."""
+    """The parameters that multiply actions, with zeros for action values that do not vary. This model normalises such
+    values to 0, while the release divides their rounding noise by about 0 (`ActionUnits.normalise`)."""
     alive_EU = table.alive()
     return {path: np.where(alive_EU[..., None], arrays[path], 0) for path in ACTIONS_IN if path in arrays}
 
 
 def _same(original: ModelConfig, form: ModelConfig) -> bool:
-    """Whether the multipliers and everything else are equal; a base width means nothing without muP."""
+    """Whether multipliers and everything else are equal; without muP the base width has no meaning."""
     switches = original.mup.enabled == form.mup.enabled
     return original == form or (switches and released_form(original) == released_form(form))
 
@@ -338,7 +339,7 @@ def _remarks(model: ModelConfig, form: ModelConfig) -> list[str]:
 
 
 def _narrow(tensor: np.ndarray, dtype: str | None) -> np.ndarray:
-    """In the type that it was imported in, unless that loses precision."""
+    """The tensor in the type in which it was imported, unless that loses precision."""
     if dtype is None:
         return tensor
     narrow = tensor.astype(dtype)

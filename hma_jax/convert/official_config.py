@@ -1,4 +1,4 @@
-"""The official config.json and ours, both ways. Facts: reference sections 1.1, 2 and 8.2."""
+"""Conversion between the official config.json and our configuration. Facts: reference sections 1.1, 2 and 8.2."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hma_jax.config.json import from_dict
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 BASE_WIDTH = 256
-"""Where the release's muP multipliers are 1."""
+"""The width at which the release's muP multipliers are 1."""
 
 CONTINUOUS_ONLY = {
     "Diffusion": True,
@@ -71,7 +71,7 @@ DISCRETE_DEFAULTS: dict[str, Any] = {
     "mlp_drop": 0.0,
     "mlp_bias": True,
 }
-"""What the release takes for a field that is absent, dead ones included."""
+"""The release's default for each absent field, including fields that have no effect."""
 
 CONTINUOUS_DEFAULTS = DISCRETE_DEFAULTS | {
     "dataloader_apply_corruption": False,
@@ -92,7 +92,7 @@ MODEL_FIELDS = {
     "mlp_bias": "mlp_bias",
     "qk_norm": "qk_norm",
 }
-"""Official field -> the field of ModelConfig that is the same."""
+"""Official field -> the field of ModelConfig with the same meaning."""
 
 DIFFUSION_FIELDS = {
     "vae_embed_dim": "channels",
@@ -126,12 +126,12 @@ def is_continuous(config: Mapping[str, Any]) -> bool:
 
 
 def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
-    """With the release's defaults for absent fields."""
+    """`config` with the release's defaults for absent fields."""
     return {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
 
 
 def _complete(config: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """`_with_defaults`. Raises ConfigError for absent fields that have none, and for counts and lists that are none."""
+    """`_with_defaults`. Raises ConfigError for absent fields that have no default, and for invalid counts and lists."""
     missing = [name for name in REQUIRED if config.get(name) is None]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
     full = _with_defaults(config)
@@ -148,7 +148,8 @@ def _is_count(value: Any) -> bool:
 
 
 def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
-    """Raises ConfigError naming a field that is missing, of the wrong kind or not supported."""
+    """Our configuration of the model. Raises ConfigError, which names a field that is missing, of the wrong kind or not
+    supported."""
     full = _complete(config, where)
     network = full["action_network"]
     require(
@@ -168,7 +169,7 @@ def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
     else:
         fields["tokens"] = size
         fields["factors"] = full["num_factored_vocabs"]
-        # As the release does, which ignores the stored factored_vocab_size.
+        # As in the release, which ignores the stored factored_vocab_size.
         fields["factor_vocab"] = _root(full["image_vocab_size"], fields["factors"], where)
     return from_dict(ModelConfig, fields, where)
 
@@ -187,7 +188,7 @@ def _root(vocab: int | None, factors: int, where: str) -> int:
 
 
 def read_masking(config: Mapping[str, Any]) -> MaskingConfig:
-    """How the release would go on training, but for the hidden actions of the continuous variant
+    """How the release would continue training, except for the hidden actions of the continuous variant
     (`masking.hide_actions`). Raises ConfigError where it would train nothing."""
     full = _with_defaults(config)
     fields = {field: full[official] for official, field in MASKING_FIELDS.items()}
@@ -210,7 +211,7 @@ def read_masking(config: Mapping[str, Any]) -> MaskingConfig:
 def read_table(
     config: Mapping[str, Any], statistics: Mapping[str, tuple[np.ndarray, np.ndarray]], where: str
 ) -> EmbodimentTable:
-    """Robots in the order of action_domains; `statistics` are each one's (mean, std), the buffers."""
+    """Robots in the order of action_domains; `statistics` holds each robot's (mean, std), the buffers."""
     full = _complete(config, where)
     names, chunks = full["action_domains"], full["d_actions"]
     require(

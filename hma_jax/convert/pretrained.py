@@ -1,9 +1,9 @@
-"""Tokenizers that others trained, read from the files they are published in.
+"""Tokenizers that others trained, read from the published files.
 
-The MAGVIT2 tokenizer, 1X's or an Open-MAGVIT2 without adaptive normalisation, comes as `magvit2.ckpt`, a torch file
-of a training run, or its tensors as safetensors; a directory with a config.json beside them may have other sizes. The
-VAE of Stable Video Diffusion comes as a directory of the diffusers library. Reading is strict: a tensor too few, too
-many or of another shape is refused by name, and no code of a file is run.
+The MAGVIT2 tokenizer, 1X's or an Open-MAGVIT2 without adaptive normalisation, is a torch file of a training run
+(`magvit2.ckpt`), or a safetensors file with its tensors. In a directory with a config.json beside the weights it may
+have other sizes. The VAE of Stable Video Diffusion is a directory of the diffusers library. Reading is strict: missing
+or additional tensors and tensors of another shape are refused by name, and no code in a file is run.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 
 LOSS, AVERAGE, ADAPTIVE = "loss.", "model_ema.", "decoder.adaptive."
-"""Tensors in the file of a MAGVIT2 training, by how their names begin: of the discriminator, which no tokenizer needs;
-the moving average of the weights, under their names without dots, which the release does not use; and what later
-Open-MAGVIT2 models have in their decoder."""
+"""Prefixes of names of tensors in the file of a MAGVIT2 training: those of the discriminator, which a tokenizer does
+not need; of the moving average of the weights, named as the weights without dots, which the release does not use; and
+of the part that later Open-MAGVIT2 models have in their decoder."""
 
 FILES = (
     "diffusion_pytorch_model.safetensors",
@@ -39,21 +39,21 @@ FILES = (
     "magvit2.safetensors",
     "magvit2.ckpt",
 )
-"""Where weights lie in a directory; the first that is there is read."""
+"""Names of weight files in a directory; the first that exists is read."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """How one kind is published."""
+    """How one kind of tokenizer is published."""
 
     tokenizer: type[Tokenizer]
     fields: Mapping[str, str]  # official field of config.json -> field of our configuration
-    required: tuple[str, ...]  # official fields without which a config.json is not one of this kind
+    required: tuple[str, ...]  # official fields that every config.json of this kind has
     fixed: Mapping[str, tuple[Any, ...]]  # official field -> values that are supported
     shortcut: str  # official name of the 1x1 convolution beside a residual block
 
     def config(self, official: Mapping[str, Any], where: str, **given: Any) -> Any:
-        """Our configuration. Raises ConfigError naming the field that is missing or not supported."""
+        """Our configuration. Raises ConfigError, which names the field that is missing or not supported."""
         missing = [name for name in self.required if official.get(name) is None]
         require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
         for name, good in self.fixed.items():
@@ -63,7 +63,7 @@ class Source:
         return from_dict(self.tokenizer.config_class, known | given, where)
 
     def official_name(self, path: str) -> str:
-        """'decoder.conv_in.weight' of 'decoder/conv_in/kernel'."""
+        """The official name of our parameter: 'decoder/conv_in/kernel' -> 'decoder.conv_in.weight'."""
         renamed = {"kernel": "weight", "gain": "weight", "shortcut": self.shortcut}
         return ".".join(renamed.get(part, part) for part in path.split("/"))
 
@@ -101,14 +101,14 @@ SVD_VAE = Source(
 
 
 def official_shape(spec: ParamSpec) -> tuple[int, ...]:
-    """In PyTorch's layout: outputs, inputs, then the window."""
-    # A kernel over time is one over time and space there, with a window of one pixel.
+    """The shape in PyTorch's layout: outputs, inputs, then the window."""
+    # There a kernel over time is one over time and space, with a window of one pixel.
     window = (1, 1) if len(spec.shape) == 3 else ()
     return tuple(spec.shape[i] for i in _reversed(spec)) + window
 
 
 def _reversed(spec: ParamSpec) -> tuple[int, ...]:
-    """Our order of a kernel's axes, (window, inputs, outputs), as (outputs, inputs, window)."""
+    """The permutation from our order of a kernel's axes, (window, inputs, outputs), to (outputs, inputs, window)."""
     last = len(spec.shape) - 1
     return (0,) if last == 0 else (last, last - 1, *range(last - 1))
 
@@ -119,8 +119,8 @@ def tokenizer_shapes(source: Source, declared: Declared) -> dict[str, tuple[int,
 
 
 def tokenizer_params(source: Source, declared: Declared, tensors: Mapping[str, Stored], where: str) -> Params:
-    """Our parameters, float32. Raises ConfigError naming tensors that are missing, too many, of another
-    shape, no floats or not finite."""
+    """Our parameters, float32. Raises ConfigError, which names tensors that are missing, not expected, of another
+    shape, not floats or not finite."""
     check_tensors(tokenizer_shapes(source, declared), tensors, where, (*FLOATS, "float64"))
 
     def read(path: str, spec: ParamSpec) -> jnp.ndarray:
@@ -143,9 +143,9 @@ def read_magvit2(
 ) -> Magvit2Tokenizer:
     """From `magvit2.ckpt`, a safetensors file, or a directory of either with config.json.
 
-    `image_size` has to suit the number of levels: any multiple of 2^(levels - 1), 16 for the published one. `weights`:
-    the last ones of the training, as the release takes them, or their moving average.
-    Raises ConfigError naming what of the file is not as it should be.
+    `image_size` must be a multiple of 2^(levels - 1), which is 16 for the published tokenizer. `weights`: the last ones
+    of the training, which the release uses, or their moving average. Raises ConfigError, which names what is wrong in
+    the file.
     """
     path = Path(path)
     given: dict[str, Any] = {"image_size": image_size, "compute_dtype": compute_dtype}
@@ -177,16 +177,16 @@ def read_magvit2(
 
 
 def has_average(path: Path) -> bool:
-    """Whether the weights that `read_magvit2` reads have their moving average beside them."""
+    """Whether the file that `read_magvit2` reads also has the moving average of the weights."""
     return any(name.startswith(AVERAGE) for name in read_tensors(Path(path)))
 
 
 def read_svd_vae(
     directory: Path, *, image_size: ImageSize = 256, patch: int = 2, compute_dtype: Dtype = "float32"
 ) -> SvdVaeTokenizer:
-    """From a directory of the diffusers library: config.json and diffusion_pytorch_model.safetensors.
+    """From a directory of the diffusers library, with config.json and diffusion_pytorch_model.safetensors.
 
-    Raises ConfigError naming what of the files is not as it should be.
+    Raises ConfigError, which names what is wrong in the files.
     """
     directory = Path(directory)
     config = SVD_VAE.config(
@@ -202,7 +202,7 @@ def read_svd_vae(
 
 
 def read_tensors(path: Path) -> dict[str, Stored]:
-    """name -> tensor of a weight file, or of the one in a directory. Raises ConfigError if there is none."""
+    """name -> tensor, from a weight file or from the one in a directory. Raises ConfigError if there is none."""
     if path.is_dir():
         found = [path / name for name in FILES if (path / name).is_file()]
         require(bool(found), f"{path} has none of {', '.join(FILES)}")
@@ -214,9 +214,9 @@ def read_tensors(path: Path) -> dict[str, Stored]:
 
 
 def find_reader(path: Path) -> Callable[..., Tokenizer]:
-    """`read_svd_vae` for a directory whose config.json is of that VAE, else `read_magvit2`.
+    """`read_svd_vae` for a directory whose config.json describes that VAE, otherwise `read_magvit2`.
 
-    Raises ConfigError for a directory of anything else.
+    Raises ConfigError for a directory with anything else.
     """
     path = Path(path)
     if not path.is_dir():

@@ -1,4 +1,4 @@
-"""Which of our models the official release can compute, and in which form it holds them."""
+"""Which of our models the official release can compute, and in which form."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from hma_jax.convert.official_config import BASE_WIDTH, NETWORKS, is_continuous
 from hma_jax.model.embodiments import EmbodimentTable
 
 ATTENTION_SCALE = 8
-"""What the release divides by the head width under muP, to multiply q.k with."""
+"""Under muP the release multiplies q.k by this number divided by the head width."""
 
 
 def can_hold_mup(model: ModelConfig) -> bool:
-    """Whether the release computes with the multipliers of this model's muP.
+    """Whether the release can use the multipliers of this model's muP.
 
-    It takes every width of the discrete variant. A continuous model of another width than 256 stops in
-    the shape check of its muP, because the condition of the diffusion heads is no read-out there.
+    In the discrete variant it accepts every width. A continuous model of a width other than 256 fails the shape check
+    of its muP, because there the condition of the diffusion heads is not a read-out.
     """
     scale = model.mup.attention_scale == ATTENTION_SCALE and "attention" not in model.mup.without
     return scale and (model.diffusion is None or model.width == BASE_WIDTH)
 
 
 def released_form(model: ModelConfig) -> ModelConfig:
-    """The model that the release makes of `model`'s configuration, with action heads and multipliers of
-    its own; `multipliers.folded` are its parameters. muP that it cannot hold is off there."""
+    """The model that the release builds from `model`'s configuration, with action heads and the release's multipliers;
+    `multipliers.folded` gives its parameters. muP is off if the release cannot use it."""
     mup = MupConfig(enabled=model.mup.enabled and can_hold_mup(model), base_width=BASE_WIDTH)
     return replace(model, mup=mup, action_heads=True)
 

@@ -1,4 +1,4 @@
-"""A run directory from a converted model: what `training.runs.load_run` reads and training resumes."""
+"""A run directory made from a converted model, which `training.runs.load_run` can read and training can resume."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from hma_jax.training.state import TrainState, state_shapes
 
 
 def require_run(run: object) -> None:
-    """Raises ConfigError for anything but a Run with the parameters of its checkpoint. A Model is none, and that in a
-    Model in bfloat16 has rounded ones."""
+    """Raises ConfigError for anything but a Run with the parameters of its checkpoint. A Model is not a Run, and the
+    Run in a bfloat16 Model has rounded parameters."""
     give = "give load_run(RUN, 'auto') of hma_jax.training.runs"
     require(isinstance(run, Run), f"what is converted is a Run, not a {type(run).__name__}; {give}")
     rounded = {str(x.dtype) for x in jax.tree.leaves(run.params)} - {"float32"}
@@ -28,8 +28,9 @@ def require_run(run: object) -> None:
 
 
 def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None) -> None:
-    """Writes a checkpoint of step 0 with a fresh optimiser state, and `texts`, files by name, into the run directory.
-    Where the weights were trained, `converted` in its provenance says at which step they were and which ones.
+    """Writes a checkpoint of step 0 with a fresh optimiser state, and `texts` (file name -> contents), into the run
+    directory. If the weights were trained, `converted` in the provenance gives their step, and whether they are the
+    last ones or the average.
 
     Raises ConfigError if `directory` exists, and as `require_run`; SaveError if it cannot be written.
     """
@@ -40,7 +41,7 @@ def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None)
         try:
             with Checkpoints(temporary / CHECKPOINTS, meta) as checkpoints:
                 checkpoints.save(0, fresh_state(run))
-        except SaveError as error:  # it speaks of training, and of a directory that goes now
+        except SaveError as error:  # its message is about training, and about a directory that is now removed
             raise SaveError(
                 f"cannot write {directory}: {error.reason}. Make sure that there is space and permission to write, then "
                 "try again",
@@ -51,7 +52,7 @@ def write_run(run: Run, directory: Path, texts: Mapping[str, str] | None = None)
 
 
 def fresh_state(run: Run) -> TrainState:
-    """What training starts with, in memory of the host."""
+    """The state with which training starts, in host memory."""
     params = jax.tree.map(np.asarray, run.params)
     shapes = state_shapes(declare_model(run.model, run.table), run.table, only=run.train.only)
     # Untouched zeros cost no memory.

@@ -1,4 +1,4 @@
-"""Generation as a StableHLO program with fixed shapes, that runs where this project is not installed.
+"""Generation as a StableHLO program with fixed shapes, which runs without this project installed.
 
 model.stablehlo     `jax.export` bytes; jax.export.deserialize(bytes).call(weights, prompt, actions,
                     embodiment, key) -> new frames
@@ -42,14 +42,14 @@ PROGRAM, WEIGHTS, DESCRIPTION = "model.stablehlo", "model.safetensors", "model.j
 @dataclass(frozen=True)
 class ProgramConfig:
     """The fixed shapes of a program: `batch` examples are continued from `prompt` to `frames` frames. Past the model's
-    window it slides, as `decode.slide` says."""
+    window of T frames the window slides, as `decode.slide` says."""
 
     batch: int = 1
     prompt: int = 4
     frames: int = 5
     decode: DecodeConfig = DecodeConfig()
     platforms: tuple[str, ...] = ("cpu", "cuda", "tpu")
-    dtype: Dtype = "float32"  # number format of the computation, and of the weights that are cast to it
+    dtype: Dtype = "float32"  # number format of the computation, and of the weights, which are cast to it
 
     def __post_init__(self):
         require(self.batch >= 1, f"batch must be at least 1, got {self.batch}")
@@ -71,11 +71,10 @@ def generate_function(
     """generate(weights, prompt, actions, embodiment, key) -> frames prompt .. frames - 1.
 
     weights: path -> array. prompt int32 [B, T', S] or float32 [B, T', S, C]; actions float32
-    [B, T, U], raw and padded with zeros; embodiment int32 [B]; key uint32 [2], of which every row
-    of the batch derives its own random numbers. Actions that a model trained for `setting` was never shown are not
-    looked at.
+    [B, T, U], raw and padded with zeros; embodiment int32 [B]; key uint32 [2], from which every row of the batch
+    derives its own random numbers. Actions that a model trained for `setting` was never shown are ignored.
     """
-    # One program for every platform: none of them may be a single platform's own.
+    # One program for all platforms, so no kernel may be specific to one of them.
     declared = declare_model(model, table, ExecutionConfig(config.dtype, attention="plain"))
 
     def generate(weights, prompt, actions, embodiment, key):
@@ -99,7 +98,8 @@ def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConf
 
 
 def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
-    """Raises ConfigError if `directory` exists or the model predicts no frames, and as `require_run`."""
+    """Writes the three files. Raises ConfigError if `directory` exists or the model predicts no frames, and as
+    `require_run`."""
     require_run(run)
     require_frames(run, "generate")
     # Most parameters of a continuous model are action heads.
@@ -121,7 +121,7 @@ def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
 
 MEANINGS = {
     "prompt": "frames to continue: token ids, or latent patches",
-    "actions": "raw action chunks of all frames, padded with zeros; chunk t is executed after frame t. Not looked at where "
+    "actions": "raw action chunks of all frames, padded with zeros; chunk t is executed after frame t. Ignored where "
     "the robot has none in `table`, or the model was trained without",
     "embodiment": "index of each example's robot in `table`",
     "key": "any two numbers, as jax.random.key_data gives them; row i of the batch draws with fold_in(key, i)",

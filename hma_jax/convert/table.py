@@ -1,10 +1,10 @@
-"""Which official tensor is which part of which of our parameters: one table, read in both directions.
+"""The table of which official tensor is which part of which of our parameters, used in both directions.
 
-An entry has the path of one of our parameters, the names of the official tensors it is made of, and an einops pattern
-from one of its slices to the official layout; read backwards the pattern is the inverse. Along an axis that we stack
-(layers N, robots E, factors Q) every index is an official tensor of its own if the official name has a placeholder for
-it. A robot's slice is cut to its own chunk along U: what lies beyond is padding, which is zero and without influence.
-Facts: reference sections 8.3 and 8.4.
+An entry has the path of one of our parameters, the name of the official tensors that it consists of, and an einops
+pattern from one of its slices to the official layout; read backwards, the pattern is the inverse. Along an axis that we
+stack (layers N, robots E, factors Q), every index is a separate official tensor if the official name has a placeholder
+for it. A robot's slice is cut to its own chunk along U: the rest is padding, which is zero and has no effect. Facts:
+reference sections 8.3 and 8.4.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
 
 PLACEHOLDERS = {LAYER_AXIS: "{layer}", EMBODIMENT_AXIS: "{robot}", "Q": "{factor}"}
-"""In an official name: where the index along a stacked axis, or the robot's name, goes."""
+"""Placeholders in official names, for the index along a stacked axis or the robot's name."""
 
 LINEAR = "i o -> o i"
 SAME = "d -> d"
@@ -127,7 +127,7 @@ CROSS_ATTENTION = (
 
 
 def entries_of(model: ModelConfig) -> dict[str, Entry]:
-    """The entry of each of our parameters, by path; also of parameters that the model's switches leave out."""
+    """The entry of each of our parameters, by path, including parameters that the model's settings leave out."""
     entries = [*SHARED, *(CROSS_ATTENTION if model.conditioning == "cross_attention" else MODULATION)]
     if model.diffusion:
         depth = model.diffusion.depth
@@ -148,7 +148,7 @@ class Part:
 
     name: str
     index: tuple[int | slice, ...]
-    sizes: dict[str, int]  # of the slice's axes, as the pattern calls them
+    sizes: dict[str, int]  # of the slice's axes, by their names in the pattern
     pattern: str
 
     @property
@@ -167,7 +167,7 @@ class Part:
 
 
 def parts_of(entry: Entry, spec: ParamSpec, table: EmbodimentTable) -> Iterator[Part]:
-    """The official tensors that a parameter consists of."""
+    """The official tensors of which a parameter consists."""
     stacked = [axis for axis in spec.axes if axis in PLACEHOLDERS and PLACEHOLDERS[axis] in entry.official]
     axes, shape = spec.axes[len(stacked) :], spec.shape[len(stacked) :]
     for index in np.ndindex(spec.shape[: len(stacked)]):
@@ -186,7 +186,7 @@ def parts_of(entry: Entry, spec: ParamSpec, table: EmbodimentTable) -> Iterator[
 def official_parts(
     model: ModelConfig, table: EmbodimentTable, leaves: Mapping[str, ParamSpec]
 ) -> dict[str, list[Part]]:
-    """Our path -> the official tensors it consists of, for all declared parameters (`Declared.leaves`)."""
+    """Our path -> the official tensors of which it consists, for all declared parameters (`Declared.leaves`)."""
     entries = entries_of(model)
     return {path: list(parts_of(entries[path], spec, table)) for path, spec in leaves.items()}
 
@@ -194,9 +194,9 @@ def official_parts(
 def from_official(
     tensors: Mapping[str, Stored], parts: Mapping[str, list[Part]], leaves: Mapping[str, ParamSpec], where: str
 ) -> Params:
-    """Our parameters from official tensors, of the directory `where`, whose names and shapes have been checked.
+    """Our parameters from official tensors in the directory `where`, whose names and shapes have been checked.
 
-    Raises ConfigError naming one that is not finite.
+    Raises ConfigError, which names a tensor that is not finite.
     """
 
     def assemble(path: str, spec: ParamSpec) -> np.ndarray:
@@ -209,8 +209,8 @@ def from_official(
 
 
 def to_official(params: Params, parts: Mapping[str, list[Part]]) -> dict[str, np.ndarray]:
-    """Official name -> array from our parameters, or from anything shaped like them (gradients)."""
-    # Each parameter is fetched once: it may lie on an accelerator.
+    """Official name -> array, from our parameters or from anything shaped like them (gradients)."""
+    # Each parameter is fetched only once: it may be on an accelerator.
     arrays = {path: np.asarray(x) for path, x in flat(params).items() if path in parts}
     return {part.name: part.to_official(arrays[path]) for path, own in parts.items() for part in own}
 

@@ -26,10 +26,10 @@ DTYPES = {
     "U8": np.dtype(np.uint8),
     "BOOL": np.dtype(np.bool_),
 }
-"""What safetensors calls the element types that a checkpoint may have."""
+"""safetensors' names of the element types that a checkpoint may have."""
 
 FLOATS = ("float32", "float16", "bfloat16")
-"""Element types of weights: all of their values are also values of float32."""
+"""Element types of weights: all their values are also float32 values."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Stored:
 
 
 MOST_NAMED = 10
-"""Tensors that a message names; of more there is only the number."""
+"""The most tensors that a message names; for more it gives only the number."""
 
 
 def check_tensors(
@@ -51,8 +51,8 @@ def check_tensors(
     where: str,
     types: tuple[str, ...] = FLOATS,
 ) -> None:
-    """Raises ConfigError naming (the first few) tensors of the file or directory `where` that are missing, too many, or
-    of another shape or type than `types`."""
+    """Raises ConfigError, which names (the first few) tensors of the file or directory `where` that are missing, not
+    expected, of another shape, or not of one of `types`."""
     found = {name: tensor.shape for name, tensor in tensors.items()}
     wrong = {
         "missing": [f"{n} {want[n]}" for n in want if n not in found],
@@ -101,12 +101,13 @@ def read_safetensors(path: Path) -> dict[str, Stored]:
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
-    """Writes contiguous copies where needed; the values' bytes are kept. Raises OSError.
+    """Writes the tensors, as contiguous copies where needed; the bytes of the values do not change. Raises OSError.
 
-    The file says that its format is PyTorch's, as those of the Hugging Face libraries do: some refuse files without it.
+    The file states PyTorch as its format, as files of the Hugging Face libraries do: some of these refuse files without
+    it.
     """
     dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
-    # safetensors puts a file in the place of ours that its owner alone may read: it gets the mode that the umask gave.
+    # safetensors replaces our file by one that only its owner may read; it then gets the mode that the umask gave ours.
     path.touch()
     mode = stat.S_IMODE(path.stat().st_mode)
     try:

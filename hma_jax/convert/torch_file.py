@@ -1,9 +1,9 @@
 """Reads a plain state dict from a file that torch saved, without torch and without running code.
 
-Such a file is a zip: `data.pkl` describes the tensors, `data/KEY` holds their elements. A pickle
-is a program; this reader knows the few names that a state dict of tensors needs and refuses every
-other by name, before anything is called. In the checkpoint of a whole training run the state dict is
-one entry among others; whatever else a trainer keeps there is passed over without being made.
+Such a file is a zip: `data.pkl` describes the tensors, `data/KEY` holds their elements. A pickle is a program. This
+reader knows the few names that a state dict of tensors needs, and refuses all others, by name, before anything is
+called. In the checkpoint of a whole training run the state dict is one entry among others; everything else that a
+trainer keeps there is skipped without being built.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STORAGES = {
 }
 
 LARGEST = 2**26
-"""Bytes of a description of tensors, at most: more than any model needs."""
+"""The most bytes of a description of tensors: more than any model needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ class _TakesItems(type):
 
 
 class _Ignored(metaclass=_TakesItems):
-    """Stands for any class of a trainer and for its objects: what a pickle makes of it is itself again, since it may be
-    a class (`getattr` gives nested ones), and whatever else is done to it leaves nothing."""
+    """Stands for any class of a trainer and for its objects. An instance of it is again this class, because it may
+    itself be a class (`getattr` gives nested ones), and whatever else a pickle does to it has no effect."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> type[_Ignored]:
         del args, kwargs
@@ -79,17 +79,18 @@ class _Ignored(metaclass=_TakesItems):
 
 
 class _Reader(pickle._Unpickler):
-    """Knows ordered dictionaries, storages and how a tensor is made of one. Of a `whole` training run all else is
-    passed over.
+    """Knows ordered dictionaries, storages, and how a tensor is made from a storage. In the file of a `whole` training
+    run everything else is skipped.
 
-    It is the unpickler in Python: that in C makes room for as many objects as any number in the file says.
+    It is based on the unpickler in Python: the one in C allocates room for as many objects as a number in the file
+    says.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, root: str, whole: bool):
         size = archive.getinfo(f"{root}data.pkl").file_size
         if size > LARGEST:
             raise pickle.UnpicklingError(f"{size:,} bytes, more than {LARGEST:,}")
-        super().__init__(io.BytesIO(archive.read(f"{root}data.pkl")))  # all of it: the checksum comes first
+        super().__init__(io.BytesIO(archive.read(f"{root}data.pkl")))  # whole: its checksum is verified first
         self.path, self.root, self.whole = path, root, whole
         self.bytes = {info.filename: info.file_size for info in archive.infolist()}
 
@@ -149,9 +150,9 @@ class _Reader(pickle._Unpickler):
 
 
 def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
-    """name -> tensor. Raises ConfigError for whatever is not a plain state dict, naming what it is.
+    """name -> tensor. Raises ConfigError, which names what the file contains, for anything but a plain state dict.
 
-    `within` is the entry of a training run's checkpoint that holds the state dict, if it is one.
+    `within` is the entry that holds the state dict if the file is a checkpoint of a training run.
     """
     advice = "; save it with torch.save(model.state_dict(), ...) or as model.safetensors"
     try:
