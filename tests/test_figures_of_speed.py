@@ -112,7 +112,10 @@ def test_the_page_of_speed_shows_the_release_on_two_cores():
         assert cells == [*times, f"{times_longer(newest, stage):.2f}", repeated, others], stage
     page = " ".join(SPEED.read_text().split())
     for name, words in (
-        ("forward", "forward pass took {:.2f} s, before {:.2f} to {:.2f} s, ours {:.2f} s, before {:.2f} to {:.2f} s"),
+        (
+            "forward",
+            "forward pass took {:.2f} s (earlier {:.2f} to {:.2f} s), ours {:.2f} s (earlier {:.2f} to {:.2f} s)",
+        ),
         ("step", "its median was {:.2f} and {:.2f} s in the two runs, ours {:.2f} and {:.2f} s"),
     ):
         figures = []
@@ -121,7 +124,7 @@ def test_the_page_of_speed_shows_the_release_on_two_cores():
             figures += [first, min(others), max(others)] if name == "forward" else [first, second]
         assert words.format(*figures) in page
     first, second, *plain = (read_record(path).matmul_flops_per_second / 1e9 for path in (NEWEST, AGAIN, *EARLIER))
-    assert f"had {first:.0f} and {second:.0f} GFLOP/s, before {min(plain):.0f} to {max(plain):.0f}." in page
+    assert f"ran at {first:.0f} and {second:.0f} GFLOP/s, earlier at {min(plain):.0f} to {max(plain):.0f}." in page
     huge = (before[0][f"release{how}: {stage}"][0] for stage in ("frame", "step") for how in (" with huge pages", ""))
     assert "its frame took {:.2f} s with and {:.2f} s without, its step {:.2f} and {:.2f} s".format(*huge) in page
 
@@ -249,9 +252,9 @@ def test_the_page_of_speed_shows_products_of_two_cores():
     turns = ", ".join(f"{release[OUR_PREFIX + stage][0]:.2f}" for stage in ("forward", "fill", "slide"))
     assert f"at this commit, ours took {turns} and {release[OUR_PREFIX + 'step'][0]:.2f} s" in page
     said = (
-        "products with weights: {:.0f} to {:.0f}; the smallest, of a matrix 256 wide with one frame, {:.0f} to {:.0f}; one of "
-        "the step's {:.0f}; * a plain square product: {:.0f} to {:.0f}; * attention within frames: {:.0f} to {:.0f} (a head "
-        "has 32 values); temporal attention: {:.0f} to {:.0f} (matrices"
+        "products with weights: {:.0f} to {:.0f}; the smallest, of one frame and a matrix 256 wide, {:.0f} to {:.0f}; "
+        "one in the training step {:.0f}; * a plain square product: {:.0f} to {:.0f}; * attention within frames: "
+        "{:.0f} to {:.0f} (a head has 32 values); temporal attention: {:.0f} to {:.0f} (matrices"
     )
     figures = others[0], others[-1], min(smallest), max(smallest), slow, min(plain), max(plain)
     assert said.format(*figures, min(within), max(within), min(over_time), max(over_time)) in page
@@ -285,7 +288,7 @@ def test_the_page_of_speed_says_where_a_pass_goes():
     )
     assert said.format(*shares[0], 100 - sum(shares[0])) in page
     sums = [sum(each) for each in shares]
-    assert f"products of matrices take {min(sums):.0f} to {max(sums):.0f} % of the time" in page
+    assert f"matrix products take {min(sums):.0f} to {max(sums):.0f} % of the time" in page
 
 
 def test_the_page_of_speed_shows_what_cheaper_decoding_costs():
