@@ -158,7 +158,8 @@ def test_the_presets_that_can_go_out_are_those_that_the_page_names():
         ways = ({}, released, released | forgetful)
         needed.setdefault(tuple(next(way for way in ways if leaves(way))), []).append(name)
     as_they_are, and_both = sorted(needed[()]), sorted(needed["action_alignment", "recall"])
-    assert f"The presets {', '.join(as_they_are[:-1])} and {as_they_are[-1]} have all of it. The others want" in page
+    listed = f"{', '.join(as_they_are[:-1])} and {as_they_are[-1]}"
+    assert f"The settings of the presets {listed} can be exported as they are. The others need" in page
     assert f"{', '.join(and_both[:-1])} and {and_both[-1]} also `--set model.recall=false`" in page
     named = re.search(r"suite's forty have no actions \((.*?)\)", page)[1].split(", ")
     assert named == [name for name in PRESETS["accelerator"].dataset_names() if not get_spec(name).action_dims]
