@@ -5,8 +5,8 @@ Question: loss at equal training FLOPs for several budgets: wide models see fewe
 Paper figure: none; the paper fixes the steps.
 Command: python -m experiments.sweeps.compute --preset cpu-full
 Cost: per width and seed one run of the largest budget and a branch for each smaller one; `--dry-run` prints it.
-Expected outcome: at each budget a width that is best, and a wider one at a larger budget. A best width at the end of
-    those tried is marked: the true one may lie beyond.
+Expected outcome: at each budget one width is best, and at a larger budget a wider one. A best width at the end of the
+    range tried is marked: the true best may lie beyond.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """Steps so that every width spends the FLOPs that the reference spends in each of `designs.compute` steps. Raises
-    ConfigError where none of these is enough."""
+    """Every width trains for as many steps as spend the FLOPs of the reference, for each number of steps in
+    `designs.compute`. Raises ConfigError if none of these is enough."""
     from hma_jax.training.optimizer import decay_fits
 
     widths = sorted({*study.widths, study.model.width})
@@ -31,7 +31,7 @@ def plan(study: Study) -> Sweep:
     largest = max(flops.values())
 
     def compares(fewest: int) -> bool:
-        """A run that only warms up, or whose rate does not come down, compares nothing."""
+        """A run that only warms up, or whose learning rate does not decay, is of no use for a comparison."""
         return fewest > study.train.optimizer.warmup_steps and decay_fits(study.train.optimizer, fewest)
 
     def point(width: int, budget: float, seed: int) -> Point:
@@ -73,7 +73,7 @@ def of_width(trial: Trial, width: int) -> Trial:
 
 
 def flops_per_step(trial: Trial) -> float:
-    """Training FLOPs of one step by formula, with action sizes from the registry."""
+    """Training FLOPs of one step, by formula, with action sizes from the registry."""
     from experiments.dry_run.cost import declared_table
     from hma_jax.model.flops import train_flops_per_step
 

@@ -1,9 +1,9 @@
-"""By which way should actions enter the trunk?
+"""How should actions enter the trunk?
 
-Question: perplexity and delta PSNR when actions modulate every block, are further tokens of their
-    frame, are added to its tokens, are attended to, or both modulate and are tokens; and, for the
-    last, when a frame is given the chunk before it instead of the one after it, or the other way
-    round (`model.action_alignment`, whichever the study does not use).
+Question: perplexity and delta PSNR when actions modulate every block, are extra tokens of their frame, are added to its
+    tokens, are attended to, or do both: modulate blocks and enter as tokens. For the last, also with the other
+    `model.action_alignment` than the study's: a frame is given the chunk before it instead of the one after it, or the
+    other way round.
 Paper figure: 5 (b); the alignment is not in the paper.
 Command: python -m experiments.sweeps.conditioning --preset cpu
 Cost: six training runs per seed of `ablation_seeds`, and the control; `--dry-run` prints it.

@@ -1,4 +1,4 @@
-"""What do robots lose when others share their training, the work held fixed?
+"""What do robots lose when others share their training, at a fixed amount of work?
 
 Question: perplexity and delta PSNR on five robots, drawn anew for every seed, as others join the mixture, at a fixed
     total number of windows: later points see less of the judged robots.

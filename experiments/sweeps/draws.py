@@ -1,6 +1,8 @@
-"""Which robots a design judges and which it adds, drawn anew for every seed: no result hangs on five of them.
+"""Which robots a design judges and which it adds, drawn anew for every seed, so that no result depends on one set of
+five.
 
-Drawn by hash of seed and name, so that nothing depends on an order and every set lies inside the larger ones.
+They are drawn by a hash of seed and name, so the order of the robots does not matter, and every set lies inside the
+larger ones.
 """
 
 from __future__ import annotations
@@ -16,9 +18,9 @@ Kinship = Literal["any", "siblings", "strangers"]
 
 
 def draw_judged(study: Study, seed: int, count: int | None = None) -> tuple[str, ...]:
-    """The robots that a seed judges, `designs.judged` or as many as given, in the study's order. In the suite each is
-    of another family, and none is video alone: no action of such a one could be judged. Raises ConfigError if there are
-    too few."""
+    """The robots that a seed judges, `designs.judged` or as many as given, in the study's order. In the suite, each is
+    of another family, and none has video only: without actions there is nothing to judge. Raises ConfigError if there
+    are too few."""
     names, families = study.dataset_names(), _families()
     found: list[str] = []
     for name in _drawn(names, seed):
@@ -38,8 +40,8 @@ def draw_mixture(
 ) -> tuple[str, ...]:
     """The judged robots of a seed and as many newcomers as make `count`, in the study's order.
 
-    `kinship`: newcomers of the judged robots' families alone, or of none of them. Raises ConfigError if there are
-    too few.
+    `kinship`: newcomers only of the judged robots' families, or of none of them. Raises ConfigError if there are too
+    few.
     """
     names, own = study.dataset_names(), draw_judged(study, seed, judged)
     newcomers = [name for name in _drawn(names, seed) if name not in own]
@@ -61,7 +63,7 @@ def draw_mixture(
 
 
 def _families() -> dict[str, tuple[str, bool]]:
-    """{robot of the suite: (its family, whether it is video alone)}."""
+    """{robot of the suite: (its family, whether it has video only)}."""
     from data_pipelines.suite.embodiments import EMBODIMENTS
 
     return {e.name: (e.family, e.video_only) for e in EMBODIMENTS}

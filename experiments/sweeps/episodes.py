@@ -1,8 +1,9 @@
-"""What does more data per robot buy, told by what is really there?
+"""What does more data per robot buy, by the amount that really exists?
 
-Question: perplexity and delta PSNR as every robot's trajectories are capped; x is how many there are then in all,
-    the sum over robots of the smaller of cap and what it has. At a quarter, half and all of the steps: where data is
-    scarce the best number of steps is smaller, and is to be chosen on other episodes than those judged.
+Question: perplexity and delta PSNR as every robot's trajectories are capped; x is the resulting total: the sum over
+    robots of the smaller of the cap and the robot's own number. It is measured at a quarter, half and all of the steps:
+    where data is scarce the best number of steps is smaller, and it should be chosen on episodes other than those
+    judged.
 Paper figure: 6, middle.
 Command: python -m experiments.sweeps.episodes --preset cpu-full
 Cost: one training run per cap and seed, with a branch for every number of steps; `--dry-run` prints it.
@@ -23,9 +24,9 @@ from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """All robots at every point, judged on all; the last point has all trajectories. Raises ConfigError without a cap
-    that takes some away, and where it is not known how many there are."""
-    # A cap that takes some away would leave more if it were one higher.
+    """All robots at every point, judged on all; the last point has all trajectories. Raises ConfigError if no cap takes
+    any trajectory away, and if it is not known how many there are."""
+    # A cap that takes some away leaves more if it is raised by one.
     cutting = [cap for cap in study.designs.caps if count_episodes(study, cap) < count_episodes(study, cap + 1)]
     require(
         bool(cutting),
@@ -59,8 +60,8 @@ def plan(study: Study) -> Sweep:
 
 
 def count_episodes(study: Study, cap: int | None) -> int:
-    """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly, of others as
-    `size_of` says. Raises ConfigError where it says nothing."""
+    """Training trajectories of all robots under a cap (None: that of the reference): exact for the suite, for others as
+    `size_of` says. Raises ConfigError if the number is unknown."""
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 

@@ -1,9 +1,9 @@
 """How much of a new robot must a trained model see, and how many robots must it know by then?
 
-Question: perplexity and delta PSNR on robots that no model was trained on, after adapting (`hma adapt`: the new
-    robots' own parameters alone are trained) with few trajectories of each, for models that know more and more
-    robots, against a new model trained on the same trajectories; after the most robots also with everything trained
-    (`hma adapt --everything`).
+Question: perplexity and delta PSNR on robots that no model was trained on, after adapting (`hma adapt`: only the new
+    robots' own parameters are trained) with few trajectories of each, for models that know more and more robots,
+    compared with a new model trained on the same trajectories. The model that knows most robots is also adapted with
+    everything trained (`hma adapt --everything`).
 Paper figure: 7, in spirit.
 Command: python -m experiments.sweeps.fewshot --preset cpu-full
 Cost: one short training run per point, curve and seed, after those of `dilution`; `--dry-run` prints it.
@@ -23,8 +23,8 @@ from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """Every model adapts to all unseen robots at once. Raises ConfigError for a study without any, or without numbers
-    of trajectories or of robots that are known."""
+    """Every model adapts to all unseen robots at once. Raises ConfigError for a study without unseen robots, or without
+    numbers of trajectories or of known robots."""
     designs, unseen = study.designs, study.unseen
     require(bool(unseen), "the axis fewshot needs robots to adapt to; set them with --set unseen=...")
     for name in ("shots", "shots_after"):

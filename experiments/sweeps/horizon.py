@@ -1,7 +1,7 @@
 """What does training for longer buy?
 
 Question: perplexity and delta PSNR of the reference model after more and more steps: decay branches of one run per
-    seed, and for the first seed alone far longer ones.
+    seed, and far longer runs for the first seed only.
 Paper figure: none.
 Command: python -m experiments.sweeps.horizon --preset cpu-full
 Cost: one run per seed, and its decay branches; `--dry-run` prints it.
@@ -16,7 +16,7 @@ from experiments.terminal.program import run_sweep
 
 
 def plan(study: Study) -> Sweep:
-    """The study's steps are the reference; those beyond are run with one seed, which the question says."""
+    """The study's number of steps is the reference; larger numbers are run with one seed, which the question states."""
     first, steps = study.seeds[0], study.train.steps
     budgets = sorted({*study.designs.budgets, steps})
 

@@ -1,17 +1,18 @@
-"""What makes the model better for as many steps?
+"""What makes the model better at the same number of steps?
 
-Question: held-out nats, PSNR and what actions decide, of the reference and with masked tokens that also hold what stood
-    there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
-    change alone, and the study's long runs, are of the first seed. The variants have `designs.ablation_steps`;
-    for the study's own number of steps all are trained too, and both changes with factors that are chained
-    (`model.chain_factors`) and with tokens that count thrice, or tenfold, where they change
-    (`train.masking.change_weight`); long runs have both, the shortest of them also with changes thrice.
+Question: held-out nats, PSNR and what actions decide, for the reference, with masked tokens that also hold the token of
+    the frame before at their position (`model.recall`), with matrices updated by Muon (`train.optimizer.matrices`), and
+    with both. Single changes, and the study's long runs, have the first seed only. The variants have
+    `designs.ablation_steps`. For the study's own number of steps all are trained too, and both changes are combined
+    with chained factors (`model.chain_factors`), and with tokens that count three or ten times where they change
+    (`train.masking.change_weight`). Long runs have both changes, the shortest of them also with tokens that count three
+    times where they change.
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
-Cost: four training runs, two of them with longer branches, per seed of `ablation_seeds`, one for each change alone and
-    for changes tenfold, the control and the long ones; `--dry-run` prints it.
-Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of fewer nats, not of more
-    dB; changes that count more of neither. What came: experiments/results/ladder/findings.md.
+Cost: per seed of `ablation_seeds` four training runs, two of them with longer branches; besides these, one for each
+    single change and for the tenfold weight, the control and the long runs; `--dry-run` prints it.
+Expected outcome: recall and Muon are ahead of the reference, both together ahead of each; chained factors give fewer
+    nats but not more dB, and weighting changes gives neither. The outcome: experiments/results/ladder/findings.md.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ LONGER = VARIANTS | {
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories for every variant, and those of `LONGER` for the study's steps, which the label
-    says, unless the variants have as many."""
+    """All datasets and trajectories for every variant. Those of `LONGER` are also trained for the study's steps, which
+    the label states, unless the variants already have that number."""
     seeds, first = study.ablation_seeds, study.ablation_seeds[0]
     sweep = make_ablation(
         study,
@@ -94,7 +95,7 @@ def plan(study: Study) -> Sweep:
             trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
             points.append(Point(len(labels), LONGER[name](trial)))
         labels.append(f"{name}, {counted(steps, 'step')}")
-    # The longest run goes on from the first seed of BEST: in that order it does not remain alone at the end.
+    # The longest run continues the first seed of BEST: in this order it is not left running alone at the end.
     points.sort(key=lambda point: point.x != sweep.labels.index(BEST))
     return replace(sweep, points=tuple(points), labels=tuple(labels))
 

@@ -1,13 +1,13 @@
 """Does the best learning rate stay where it is as the model widens?
 
-Question: held-out loss over a grid of learning rates at several widths, with muP and without. What
-    is lost at each width by taking the best rate of the base width?
+Question: held-out loss over a grid of learning rates at several widths, with muP and without. How much is lost at each
+    width by using the best rate of the base width?
 Paper figure: none (paper section 3.5 uses muP; this tests it).
 Command: python -m experiments.sweeps.lr --preset cpu
-Cost: rates x widths x 2 training runs per seed, less those that both ways share at the base width,
-    each as small as `transfer` in the study says; `--dry-run` prints it.
+Cost: rates x widths x 2 training runs per seed, less those that both parametrisations share at the base width, each as
+    small as the study's `transfer` says; `--dry-run` prints it.
 Expected outcome: with muP the optima line up and the penalty stays within the grid's resolution;
-    without it the optimum falls as width grows. An optimum at the grid's end, or not told from
+    without it the optimum falls as width grows. An optimum that is at the grid's end, or cannot be distinguished from
     it, is marked "edge".
 """
 

@@ -5,7 +5,8 @@ Question: held-out loss over learning rates at the fewest of `designs.budgets` a
 Paper figure: none.
 Command: python -m experiments.sweeps.lr_horizon --preset cpu-full
 Cost: one run per further rate and seed, with a branch at the fewest steps; `--dry-run` prints it.
-Expected outcome: the best rate falls as training gets longer, by less than the grid's step or it is said.
+Expected outcome: the best rate falls as training gets longer, by less than the grid's step; if by more, the page says
+    so.
 """
 
 from __future__ import annotations
@@ -21,8 +22,7 @@ from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """The reference trial at other rates, the study's own among them. Raises ConfigError without rates, or without
-    budgets."""
+    """The reference trial at several rates, among them the study's own. Raises ConfigError without rates or budgets."""
     rate, longest = study.train.optimizer.learning_rate, study.train.steps
     for name in ("budgets", "rate_factors"):
         require(

@@ -1,12 +1,12 @@
-"""Do newcomers with much data help robots with little, and does it matter whose kin they are?
+"""Do newcomers with much data help robots with little, and does it matter whether they are siblings?
 
 Question: perplexity and delta PSNR on five robots with eight trajectories each, drawn anew for every seed: alone,
     alone for as long as with all others, among siblings, among strangers, and among all robots.
 Paper figure: none.
 Command: python -m experiments.sweeps.newcomers --preset cpu-full
 Cost: five training runs per seed; `--dry-run` prints it.
-Expected outcome: newcomers help where the poor robots overfit alone; siblings, which share a body plan and controls,
-    more than strangers.
+Expected outcome: newcomers help where the robots with little data overfit alone; siblings, which share a body plan and
+    controls, help more than strangers.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """The judged robots see as many windows at every point, but where they are trained alone for as long as with all.
+    """The judged robots see the same number of windows at every point, except where they are trained alone for as long
+    as with all others.
 
-    Newcomers have all their trajectories. Raises ConfigError under a mixture that is not uniform, and where siblings
-    and strangers would be the same robots."""
+    Newcomers have all their trajectories. Raises ConfigError if the mixture is not uniform, and if siblings and
+    strangers would be the same robots."""
     require_uniform(study, "newcomers")
     designs, names, most = study.designs, study.dataset_names(), study.train.steps
     alone, some, everyone = designs.judged, designs.kinship, len(names)

@@ -1,6 +1,6 @@
 """Which axes there are: the names of this folder's files, and files of the user's own.
 
-An axis is a module with `plan(study) -> Sweep`. Those of the project are imported when they are asked for.
+An axis is a module with `plan(study) -> Sweep`. The project's axes are imported when they are asked for.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def is_file(axis: str) -> bool:
 
 
 def join_axes(study: Study, root: Path, before: Sequence[str], axes: Sequence[str]) -> dict[str, str]:
-    """{name: axis} of the axes that a study in `root` had `before`, whose files lie there, and of those asked for now.
-    An axis takes the place of another of its name, whatever their files are called."""
+    """{name: axis} of the axes that a study in `root` had `before` (their files are in `root`) and of those asked for
+    now. An axis replaces another of the same name, whatever their files are called."""
     had = [str(root / axis) if is_file(axis) else axis for axis in before]
     return {
         sweep.name: axis for some in (had, axes) for axis, sweep in zip(some, plan_sweeps(study, some), strict=True)
@@ -53,8 +53,8 @@ def join_axes(study: Study, root: Path, before: Sequence[str], axes: Sequence[st
 
 
 def keep_axes(axes: Mapping[str, str], root: Path) -> tuple[str, ...]:
-    """The axes, {name: axis}, as the record of a study in `root` has them. A user's file is copied there, under the
-    name of its axis, so that the report can be drawn anywhere and the trials planned again."""
+    """The `axes`, {name: axis}, as the record of a study in `root` lists them. A user's file is copied there, under the
+    name of its axis, so that the report can be drawn and the trials planned again anywhere."""
     texts = {name: Path(axis).read_bytes() for name, axis in axes.items() if is_file(axis)}
     for name, text in texts.items():
         (root / KEPT).mkdir(exist_ok=True)
@@ -63,9 +63,9 @@ def keep_axes(axes: Mapping[str, str], root: Path) -> tuple[str, ...]:
 
 
 def find_axis(axis: str, root: Path = Path()) -> Plan:
-    """The function that plans an axis, of its name or of a user's file, relative to `root`.
+    """The function that plans an axis, found by the axis's name or in a user's file (relative to `root`).
 
-    Raises ConfigError without any, and for what the user's file raises, then or when it plans.
+    Raises ConfigError if there is none, and for whatever the user's file raises, here or when it plans.
     """
     if is_file(axis):
         with naming_line(root / axis, PAGE):
@@ -80,8 +80,8 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
 
 def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
     """The sweeps along `axes` that are asked for now, of a study in `root`. Raises ConfigError as `plan_sweeps` does,
-    for a file that plans other trials each time, and for a new one without a point at its reference: of files that a
-    study keeps, earlier versions accepted such."""
+    for a file that plans different trials each time, and for a new file without a point at its reference. (A file that
+    a study keeps may lack that point, since earlier versions accepted it.)"""
     sweeps = plan_sweeps(study, axes)
     for axis, sweep in zip(axes, sweeps, strict=True):
         require(
@@ -100,8 +100,8 @@ def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
 
 
 def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[Sweep]:
-    """The sweeps along `axes`, of which files are relative to `root`. Raises ConfigError for an axis that is none, or
-    that does not fit the study."""
+    """The sweeps along `axes`; files are relative to `root`. Raises ConfigError for an axis that does not exist or does
+    not fit the study."""
     sweeps: list[Sweep] = []
     for axis in axes:
         where, sweep = f"{axis}: plan(study)", find_axis(axis, root)(study)
@@ -123,10 +123,10 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
 
 
 def _checked_trials(study: Study, sweep: Sweep, where: str) -> Sweep:
-    """A user's sweep with its trials as their processes read them: an int for a float is a float, or the same trial
-    would have two names. Raises ConfigError for a field that is not of its kind, for a point that is none, for one
-    whose trial would fail once it is trained, and for one whose number would be of other robots, or of another
-    position, than it says."""
+    """A user's sweep with its trials as their processes read them: an int in place of a float becomes a float, since
+    otherwise the same trial would have two names. Raises ConfigError for a field of a wrong type, for a point that is
+    not a Point, for one whose trial would fail once it is trained, and for one whose value would belong to other
+    robots, or to another position, than it says."""
     listed = isinstance(sweep.points, Sequence)
     require(listed, f"{where}: points must be a tuple of Point, got a {type(sweep.points).__name__}")
     _require_kinds(replace(sweep, points=()), f"{where}: the sweep")
@@ -168,7 +168,7 @@ def _checked_trials(study: Study, sweep: Sweep, where: str) -> Sweep:
     )
     places: dict[tuple[str, str, str], float] = {}
     for p in sweep.points if not sweep.labels else ():
-        trained = replace(p.trial, measure_untrained=False)  # of the reference alone
+        trained = replace(p.trial, measure_untrained=False)  # of the reference only
         x = places.setdefault((p.series, p.role, stable_hash(to_dict(trained))), p.x)
         require(
             x == p.x,
@@ -179,7 +179,7 @@ def _checked_trials(study: Study, sweep: Sweep, where: str) -> Sweep:
 
 
 def _require_kinds(given: Any, where: str) -> Any:
-    """What is `given`, as a trial's process reads it. Raises ConfigError for a field of a wrong kind."""
+    """The `given` value as a trial's process reads it. Raises ConfigError for a field of a wrong type."""
     try:
         return from_dict(type(given), json.loads(json.dumps(to_dict(given))))
     except (TypeError, ValueError) as error:  # ConfigError is a ValueError
@@ -213,8 +213,8 @@ def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str)
 
 
 def _require_fits(study: Study, trial: Trial, where: str) -> None:
-    """Raises ConfigError for a trial that a study of its settings would be refused for, and for one that is to be
-    judged on other windows than those that the study freezes."""
+    """Raises ConfigError for a trial with settings for which a study would be refused, and for one that would have to
+    be judged on windows other than those that the study freezes."""
     own = {name: getattr(trial, name) for name in ("model", "eval", "tau", "rate", "weighed")}
     try:
         replace(study, train=replace(trial.train, seed=0), **own)
@@ -232,8 +232,8 @@ def _require_fits(study: Study, trial: Trial, where: str) -> None:
 
 
 def _require_distinct(sweep: Sweep, where: str) -> None:
-    """Raises ConfigError for two points that differ in nothing that rows tell apart: their spread would be taken for
-    that of seeds."""
+    """Raises ConfigError for two points that rows of results cannot distinguish: their spread would be taken for that
+    of seeds."""
     places = Counter((p.x, p.series, p.role, p.trial.train.seed) for p in sweep.points)
     for (x, series, role, seed), count in places.items():
         at = ", ".join(filter(None, (f"{x:g}", series, role, f"seed {seed}")))

@@ -1,4 +1,4 @@
-"""What the designs over robots share: judged robots drawn for every seed, newcomers around them."""
+"""What the designs over robots share: judged robots that are drawn for every seed, and newcomers around them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, referenc
 from hma_jax.config import require
 
 UNIFORM = 100.0
-"""Temperature of a mixture from which on all robots are taken to weigh the same: 480 episodes against 8 then differ
-by 4 %."""
+"""Mixture temperature from which all robots are taken to have equal weight: at this value, weights for 480 and for 8
+episodes differ by 4 %."""
 
 
 def require_uniform(study: Study, axis: str) -> None:
-    """Raises ConfigError unless every robot has the same share of the windows, whatever others there are."""
+    """Raises ConfigError unless every robot has the same share of the windows, whichever others there are."""
     require(
         study.tau >= UNIFORM,
         f"the axis {axis} keeps the number of windows per robot fixed, which needs a uniform mixture, but tau is "
@@ -25,8 +25,8 @@ def require_uniform(study: Study, axis: str) -> None:
 
 
 def robots_trial(study: Study, seed: int, count: int, steps: int, kinship: Kinship = "any") -> Trial:
-    """The judged robots of a seed among `count`, judged alone; all robots of the study, for its own steps, are the
-    reference trial."""
+    """A trial on `count` robots that evaluates only the seed's judged robots, which are among them. With all robots of
+    the study, for its own number of steps, it is the reference trial."""
     names = study.dataset_names()
     require(
         steps >= 1,

@@ -8,8 +8,8 @@ Cost: three training runs per seed of `ablation_seeds`, and the control; `--dry-
 Expected outcome: forward is best, full between it and passive. Passive has a delta PSNR of zero
     by construction; the shuffled-action control should score as passive does.
 
-What predicts actions cannot be trained with teacher forcing. So that like is compared with like, every setting is
-trained as the release trains, whatever the study's other axes do.
+Models that predict actions cannot be trained with teacher forcing. For a fair comparison every setting is trained as in
+the release, whatever the study's other axes do.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NAMES: dict[MaskingSetting, str] = {"passive": "passive", "full": "full dynamics
 
 
 def under(setting: MaskingSetting, trial: Trial) -> Trial:
-    """`trial` trained in `setting`; what predicts actions is added where there are any to predict."""
+    """`trial` trained in `setting`; action heads are added if there are actions to predict."""
     masking = replace(trial.train.masking, setting=setting)
     model = replace(trial.model, action_heads=trial.model.action_heads or masking.predicts_actions)
     return replace(trial, model=model, train=replace(trial.train, masking=masking))

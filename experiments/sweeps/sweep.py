@@ -1,6 +1,6 @@
 """A sweep: trials along one axis of a study, and the trial that most sweeps share.
 
-Each axis is a file beside this one, and a line of `registry`.
+Each axis is a file beside this one and a line in `registry`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Point:
     x: float
     trial: Trial
     role: str = POINT
-    series: str = ""  # the curve it lies on, in a sweep of several
-    scope: tuple[str, ...] = ()  # judged here, where the robots are others for every seed; (): the sweep's
+    series: str = ""  # the curve it lies on, if the sweep has several
+    scope: tuple[str, ...] = ()  # robots judged here, if they differ between seeds; (): the sweep's
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class Sweep:
     axis: str  # label with unit
     scope: tuple[str, ...]
     points: tuple[Point, ...]
-    question: str = ""  # what it asks and how, for the page
-    gain: str = ""  # what a model may gain from along it, for the headline
-    title: str = ""  # of its section on the page; sweeps over one number share a section
+    question: str = ""  # what the sweep asks and how, for the page
+    gain: str = ""  # what a model may gain from along the axis, for the headline
+    title: str = ""  # title of its section on the page; sweeps over one number share a section
     labels: tuple[str, ...] = ()  # an axis of names: x counts into these
-    reference_x: float | None = None  # of its default: the reference trial, or one that takes its place on this axis
-    base: str = ""  # of several series, the one whose best x is transferred to the others
-    interior_minimum: bool = False  # the loss is expected to be lowest inside the axis, not at an end: no power law
+    reference_x: float | None = None  # of the default: the reference trial, or the trial that replaces it on this axis
+    base: str = ""  # the series, of several, whose best x is transferred to the others
+    interior_minimum: bool = False  # the lowest loss is expected inside the axis, not at an end: no power law
 
     @property
     def has_series(self) -> bool:
@@ -67,14 +67,14 @@ class Sweep:
 
     @property
     def beside_controls(self) -> str:
-        """The series, of several, whose trials the controls repeat on shuffled actions; '' where it is not one."""
+        """The series, of several, whose trials the controls repeat on shuffled actions; '' unless it is exactly one."""
         controls = [p.trial for p in self.points if p.role == CONTROL]
         found = {p.series for p in self.points if p.role == POINT and control_of(p.trial) in controls}
         return found.pop() if len(found) == 1 else ""
 
     @property
     def robots_vary(self) -> bool:
-        """Whether every seed is judged on robots of its own, so that their windows differ."""
+        """Whether every seed is judged on its own robots, so that the windows differ between seeds."""
         places = {(p.x, p.series, p.role) for p in self.points}
         return len({(p.x, p.series, p.role, p.scope) for p in self.points}) > len(places)
 
@@ -83,7 +83,7 @@ class Sweep:
         return self.labels[int(x)] if self.labels else ""
 
     def remark(self, point: Point) -> str:
-        """What the title of a point's trial does not say; '' where it says all."""
+        """What the title of a point's trial does not say; '' if it says everything."""
         if point.role == CONTROL or self.single_curve:
             return ""
         if self.labels:
@@ -94,8 +94,8 @@ class Sweep:
 
 
 def reference_trial(study: Study, seed: int, steps: int | None = None) -> Trial:
-    """All datasets, most trajectories, base model: the end of two axes and part of others. `steps`: others than the
-    study's, for a branch of the same run. With the study's own, the model is also judged before its first step."""
+    """All datasets, most trajectories, base model: the end of two axes and part of others. `steps`: a number other than
+    the study's, for a branch of the same run. With the study's own, the model is also judged before its first step."""
     names = study.dataset_names()
     train = study.train if steps is None else replace(study.train, steps=steps)
     return Trial(
@@ -113,14 +113,14 @@ def reference_trial(study: Study, seed: int, steps: int | None = None) -> Trial:
 
 
 def control_of(trial: Trial) -> Trial:
-    """The same, trained on the actions of other episodes: what it says of them it cannot have learned."""
+    """The same trial, trained on the actions of other episodes, so it cannot learn what actions do."""
     return replace(trial, shuffle_actions=True, measure_untrained=False)
 
 
 def limit_other_actions(study: Study, sweep: Sweep) -> Sweep:
-    """The sweep with fewer other actions per evaluation: retrieval among many sequences, half of an evaluation's cost,
-    is measured for the reference at all its steps and for its control; all others are judged under
-    `designs.other_actions` sequences, enough for action-nats."""
+    """The sweep with fewer other action sequences per evaluation. Retrieval among many sequences is half of an
+    evaluation's cost, so it is measured only for the reference, at all its numbers of steps, and for its control. All
+    other trials are judged under `designs.other_actions` sequences, which is enough for action-nats."""
     few = study.designs.other_actions
     if few is None:
         return sweep
@@ -153,15 +153,15 @@ def make_sweep(
     seeds: tuple[int, ...] | None = None,
     steps: int | None = None,
 ) -> Sweep:
-    """The sweep whose trial at x is `change(reference, x)`, for every seed, plus the control: at the reference, and
-    at the ends of a numbered axis if the study wants `end_controls`.
+    """The sweep whose trial at x is `change(reference, x)`, for every seed, plus controls: at the reference, and at the
+    ends of a numbered axis if the study sets `end_controls`.
 
-    `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError without `values` or seeds,
-    and where the study's reference trial does not stand at `reference_x`: `change` has to leave it there as it is, but
-    for whom it is judged on.
+    `seeds` are the study's unless given; `steps` are those of every trial. Raises ConfigError without `values` or
+    seeds, and if the study's reference trial is not at `reference_x`: there `change` must leave it as it is, except for
+    the robots that it is judged on.
     """
     require(len(values) > 0, f"axis {name}: values is empty, so only its control would run; give it positions")
-    values = [x.item() if isinstance(x, np.generic) else x for x in values]  # of an array: settings are JSON
+    values = [x.item() if isinstance(x, np.generic) else x for x in values]  # numpy's numbers are no JSON
     reference_x = next((x for x in values if x == reference_x), reference_x)
     seeds = study.seeds if seeds is None else seeds
     require(len(seeds) > 0, f"axis {name}: seeds is empty; give at least one, or leave it out for the study's")
@@ -228,7 +228,7 @@ def all_judged(sweeps: Sequence[Sweep]) -> set[str]:
 
 
 def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
-    """A line for every trial of `sweeps`, by id, that tells it from the others."""
+    """A line for every trial of `sweeps`, by id, that distinguishes it from the others."""
     lines: dict[str, str] = {}
     places: dict[str, str] = {}  # on an axis of numbers, off the reference
     several = len({trial.train.steps for trial in unique_trials(sweeps, provenance).values()}) > 1
@@ -246,13 +246,13 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
         for point in sweep.points:
             for source in point.trial.with_source()[:-1]:
                 add(source, "")
-    # An axis may vary what no trial's own title says.
+    # An axis may vary something that no trial's own title shows.
     alike = {line for line, count in Counter(lines.values()).items() if count > 1}
     return {id: f"{line} · {places[id]}" if line in alike and id in places else line for id, line in lines.items()}
 
 
 def all_steps(sweeps: Sequence[Sweep]) -> str:
-    """How many steps trials take, in words: '300 or 1,000 steps'; of more than three, '300 to 1,000 steps'."""
+    """How many steps trials take, in words: '300 or 1,000 steps'; for more than three numbers, '300 to 1,000 steps'."""
     *fewer, most = sorted({point.trial.train.steps for sweep in sweeps for point in sweep.points})
     if len(fewer) > 2:
         return f"{fewer[0]:,} to {counted(most, 'step')}"

@@ -1,4 +1,4 @@
-"""Do other robots' data help, when none is taken away from those that are judged?
+"""Do other robots' data help, if the judged robots keep all of theirs?
 
 Question: perplexity and delta PSNR on five robots, drawn anew for every seed, as others join the mixture, at a fixed
     number of windows on the judged robots: compute grows with the robots.
@@ -18,8 +18,8 @@ from experiments.terminal.program import run_sweep
 
 
 def plan(study: Study) -> Sweep:
-    """Steps in proportion to the robots, the study's at the last point. Under a uniform mixture each robot then sees
-    the same number of windows everywhere. Raises ConfigError under another."""
+    """Steps grow in proportion to the robots, up to the study's number at the last point. With a uniform mixture, each
+    robot then sees the same number of windows at every point. Raises ConfigError if the mixture is not uniform."""
     require_uniform(study, "transfer")
     counts = study.designs.counts
     return plan_robots(
