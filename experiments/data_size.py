@@ -1,7 +1,7 @@
-"""How many trajectories each dataset of a study has: as was counted when its tokens were made, or else as its files
-say, or else as the registry says.
+"""How many trajectories each dataset of a study has: as counted when its tokens were made, or else as its files say, or
+else as the registry says.
 
-Owns what is known of the user's datasets in this process; `preparing.sizes` finds it.
+Owns what this process knows about the sizes of the user's datasets; `preparing.sizes` finds them.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from hma_jax.config import ConfigError, require
 class DataSize:
     """The size of one dataset."""
 
-    episodes: int  # damaged and held-out ones included; 0: nothing says it
-    tokenised: int  # of these, all but those that `StoreConfig.max_train` leaves out; where that is not known, at most
-    trained: int | None = None  # trajectories to train on; None: nothing says how many are held out
-    skipped: int = 0  # left out as damaged, of those to train on or held out
-    mean_steps: float = 0.0  # native frames of an episode, as its files say; 0: they do not
+    episodes: int  # damaged and held-out ones included; 0: unknown
+    tokenised: int  # of these, all but those that `StoreConfig.max_train` leaves out; an upper bound if not known
+    trained: int | None = None  # trajectories to train on; None: it is unknown how many are held out
+    skipped: int = 0  # trajectories to train on or held out that are left out as damaged
+    mean_steps: float = 0.0  # native frames per episode, as the files say; 0: they do not say
 
 
 def make_size(spec: DatasetSpec, amount: HeldOut, episodes: int, val: int | None, mean_steps: float = 0.0) -> DataSize:
-    """The size of a dataset of so many `episodes`, `val` of them held out (None: nothing says how many), of which none
-    is damaged."""
+    """The size of a dataset with this number of `episodes`, none of them damaged, `val` of them held out (None:
+    unknown)."""
     if val is None:
         return DataSize(episodes, min(episodes, sum(amount.used(episodes, episodes, True))), mean_steps=mean_steps)
     train, val = amount.used(episodes - val, val, bool(spec.val_split))
@@ -40,24 +40,24 @@ _known: dict[str, DataSize] = {}
 
 
 def use_sizes(sizes: Mapping[str, DataSize]) -> None:
-    """For the rest of this process these are the sizes of datasets, in place of all that were used before."""
+    """Replaces the known sizes of datasets, for the rest of this process."""
     _known.clear()
     _known.update(sizes)
 
 
 def size_of(spec: DatasetSpec, held_out: HeldOut) -> DataSize:
-    """As files or tokens say, or else as the registry does."""
+    """The size as files or tokens say, or else as the registry says."""
     return _known.get(spec.name) or size_by_entry(spec, held_out)
 
 
 def size_by_entry(spec: DatasetSpec, held_out: HeldOut) -> DataSize:
-    """As the registry says, as if no episode was damaged and joined datasets were one."""
+    """The size as the registry says, assuming that no episode is damaged and that joined datasets are one."""
     unknown = not spec.episodes or spec.val_split
     return make_size(spec, held_out, spec.episodes, None if unknown else held_out.count(spec.episodes))
 
 
 def are_counted(names: Sequence[str]) -> bool:
-    """Whether files or tokens, not the registry, say the sizes of all these datasets."""
+    """Whether the sizes of all these datasets come from files or tokens, not from the registry."""
     return all(name in _known for name in names)
 
 
@@ -84,10 +84,10 @@ def count_usable(data_summary: Path) -> dict[str, int]:
 
 
 def sizes_by_tokens(data_summary: Path) -> dict[str, DataSize]:
-    """The sizes of all datasets that the file says it of; {} without the file, or for one that is damaged."""
+    """The sizes of all datasets in the file; {} without the file, or if it is damaged."""
     try:
         usable, data = count_usable(data_summary), read_data(data_summary)
-    except ConfigError:  # the study's command writes it again, and who shows it says so
+    except ConfigError:  # the study's command writes it again, and the code that shows it reports the damage
         return {}
     found = {}
     for name, facts in data.items():

@@ -75,10 +75,9 @@ CPU = Study(
     name="cpu",  # the study of the README: two cores, minutes
     suite=SuiteConfig(scale=1.0),
     store=StoreConfig(min_val=8),
-    # 30 dB on held-out frames and 26 on what changes in them; 16 tokens of 24 bits come to 25 and 22.
-    # Four factors of 16 entries are learned from half as many windows as two of 256: rollouts are as good after
-    # 2,500 steps as after 5,000, and follow actions as well. The price is a perplexity that is higher: factors
-    # count as independent.
+    # 30 dB on held-out frames and 26 on the parts that change; 16 tokens of 24 bits reach 25 and 22. Four factors of 16
+    # entries are learned from half as many windows as two of 256: rollouts are as good after 2,500 steps as after
+    # 5,000, and follow actions as well. The price is a perplexity that is higher: factors count as independent.
     tokenizer=TokenizerConfig(image_size=32, downsample=4, bits=16, factors=4),
     tokenizer_train=TokenizerTrainConfig(steps=4000, batch=32),
     model=ModelConfig(
@@ -92,8 +91,8 @@ CPU = Study(
         factor_vocab=16,
         action_heads=False,
         mup=MupConfig(base_width=48),
-        # Ten thousand windows must do where the release has millions: residual branches and
-        # stems that do not start near zero, and the chunk that leads to a frame given with it.
+        # Ten thousand windows must suffice where the release has millions. Therefore residual branches and stems do not
+        # start near zero, and each frame is given with the chunk that leads to it.
         trunk_gain=0.5,
         stem_gain=1.0,
         action_alignment="causal",
@@ -101,12 +100,12 @@ CPU = Study(
     execution=ExecutionConfig(remat="none"),
     train=TrainConfig(
         steps=2500,
-        batch=4,  # as many windows in larger batches teach less
+        batch=4,  # the same number of windows in larger batches teaches less
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
         masking=MaskingConfig(max_corrupt_rate=0.0, non_mlm_ratio=0.0),
     ),
-    # Each other sequence costs a seventh of what evaluation costs without any: three, of which a trial's evaluation
-    # takes a third longer, say whether actions are followed; the sixteen of retrieval need fifteen.
+    # Each other action sequence costs a seventh of an evaluation without any. Three make a trial's evaluation take a
+    # third longer and show whether actions are followed; retrieval among sixteen needs fifteen.
     eval=EvalConfig(windows_per_dataset=8, batch=8, other_actions=3),
     dataset_counts=(5, 20, 40),
     trajectory_counts=(4, 32, 500),
@@ -118,18 +117,19 @@ CPU = Study(
 
 CPU_FULL = replace(
     CPU,
-    name="cpu-full",  # the evidence: two cores, 17 hours; every point of three seeds, every axis with controls
-    # From 128 trajectories, so that none is learnt by heart within the long runs (docs/designs.md), to 2,000.
+    name="cpu-full",  # the evidence: two cores, 17 hours; every point with three seeds, every axis with controls
+    # From 128 to 2,000 trajectories: with at least 128, no robot's data is memorised within the long runs
+    # (docs/designs.md).
     suite=SuiteConfig(scale=4.0, fewest=128),
     trajectory_counts=(2000,),
     unseen=tuple(e.name for e in UNSEEN),
     # Teacher forcing: with the released objective, perplexity of a true past stops falling (docs/models.md).
     train=replace(CPU.train, steps=4000, masking=replace(CPU.train.masking, teacher_forcing=True)),
-    eval=replace(CPU.eval, other_actions=15),  # retrieval among sixteen, of the reference
-    tau=1000.0,  # every robot weighs the same, whatever others there are and however much each has
+    eval=replace(CPU.eval, other_actions=15),  # retrieval among sixteen, for the reference
+    tau=1000.0,  # every robot has the same weight, whichever others there are and however much data each has
     seeds=(0, 1, 2),
     widths=(16, 24, 32, 48, 64),  # over a decade of trunk parameters
-    # From the study's own rate to eight times as much: in 500 steps higher ones are best than in 4,000.
+    # From the study's own rate to eight times that: with 500 steps the best rates are higher than with 4,000.
     transfer=TransferConfig(rates=7, factor=math.sqrt(2), shift=3, widths=(16, 48, 64), datasets=10, steps=500),
     designs=DesignConfig(
         budgets=(500, 1000, 2000, 4000, 8000, 16_000), long=(32_000,), compute=(500, 1000, 2000, 4000),
@@ -142,10 +142,10 @@ CPU_FULL = replace(
 )  # fmt: skip
 
 SMALL_EPSILON = 1e-12
-"""AdamW's, with the released gains. DIFFERS: the release has 1e-8. The conditioning's matrices start near zero, one
-behind the other: the median root mean square of their gradients is 2e-10 in the first step and still 1e-8 in the 200th
-(measured at width 256 with two layers, eight robots and as many windows). With 1e-8 they would move at first at 2 % of
-the rate that muP assumes, and at half of it later."""
+"""AdamW's epsilon for the released gains. DIFFERS: the release has 1e-8. The conditioning's matrices start near zero,
+one behind the other: the median root mean square of their gradients is 2e-10 in the first step and still 1e-8 in the
+200th (measured at width 256 with two layers, eight robots and as many windows). With 1e-8 they would move at first
+at 2 % of the rate that muP assumes, and at half of it later."""
 
 ACCELERATOR = Study(
     name="accelerator",  # one GPU
@@ -174,7 +174,7 @@ ACCELERATOR = Study(
     widths=(64, 128, 256, 512),
     seeds=(0, 1, 2),
     transfer=TransferConfig(steps=4000),
-    flops_per_second=1e14,  # of an H100 at width 256 (docs/performance.md); others: time one trial and --set it
+    flops_per_second=1e14,  # of an H100 at width 256 (docs/performance.md); elsewhere, time one trial and --set it
 )
 
 PAPER = Study(
@@ -190,7 +190,7 @@ PAPER = Study(
     store=StoreConfig(val_fraction=0.01, max_val=500),
     dataset_counts=(5, 10, 20, 30, 40),
     trajectory_counts=(10, 100, 1_000, 10_000, 100_000, 1_000_000),
-    judged="drawn",  # on a random five, of this seed
+    judged="drawn",  # on five robots, drawn with this seed
     widths=(64, 128, 256, 512, 768),
     transfer=TransferConfig(widths=(64, 256, 768), steps=6000),
     tau=3.0,
@@ -209,7 +209,8 @@ CPU_CONTINUOUS = replace(
     CPU,
     name="cpu-continuous",  # the same study on latents instead of ids
     tokenizer=replace(CPU.tokenizer, quantise=False, bits=16),
-    # As released actions are hardly followed: what counts most is noise so small that the frame shows through it.
+    # With the released settings, actions are hardly followed: their loss gives most weight to noise so small that the
+    # frame shows through it.
     model=replace(
         CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=48, depth=2, weight_cap=20.0, time_shift=4.0)
     ),
@@ -218,7 +219,7 @@ CPU_CONTINUOUS = replace(
 
 CPU_FULL_CONTINUOUS = replace(
     CPU_FULL,
-    name="cpu-full-continuous",  # whether latents do as well, with what the ladder found: three seeds, a control
+    name="cpu-full-continuous",  # do latents do as well, with what the ladder found? three seeds, a control
     tokenizer=CPU_CONTINUOUS.tokenizer,
     model=replace(CPU_CONTINUOUS.model, recall=True),
     train=replace(CPU_FULL.train, steps=16_000, optimizer=replace(CPU_FULL.train.optimizer, matrices="muon")),
@@ -241,10 +242,10 @@ PLAY = replace(
         "arm_sand",
         "gripper_night",
     ),
-    # As many tokens per frame as at 32 pixels, of 24 bits each.
+    # The same number of tokens per frame as at 32 pixels, of 24 bits each.
     tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=24, factors=6, channels=128),
     tokenizer_train=TokenizerTrainConfig(steps=3000, batch=32),
-    rate=None,  # 4 to 6 Hz: half as far from frame to frame as at 2 Hz
+    rate=None,  # 4 to 6 Hz: half as much motion between frames as at 2 Hz
     model=replace(CPU.model, width=64, layers=3, heads=4, factors=6, recall=True, mup=MupConfig(base_width=48)),
     train=replace(
         CPU.train,
@@ -279,11 +280,11 @@ PRESETS = {
 
 
 ON_ACCELERATORS = {"smoke": "accelerator", "cpu": "accelerator", "cpu-full": "accelerator", "play": "play-gpu"}
-"""What takes the place of a preset that is made for a processor where there is a GPU or TPU."""
+"""The preset to use on a GPU or TPU in place of one that is made for CPUs."""
 
 
 def get_preset(name: str) -> Study:
-    """Raises ConfigError, listing the names, when there is none of that name."""
+    """The preset of this name. Raises ConfigError, listing the names, if there is none."""
     if name not in PRESETS:
         raise ConfigError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}")
     return PRESETS[name]

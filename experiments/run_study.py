@@ -39,11 +39,11 @@ from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import EXPIRES, Lock, find_held, machine
 
 POLL_SECONDS = 1.0
-"""Seconds between two checks whether a lease is over."""
+"""Seconds between two checks of whether a lease is over."""
 
 
 class TrialsFailed(Exception):
-    """The sweep went on to its end, but some trials have no result. `exit`: what the command ends with."""
+    """The sweep ran to its end, but some trials have no result. `exit`: the command's exit code."""
 
     def __init__(self, message: str, exit: Exit = Exit.FAILED):
         super().__init__(message)
@@ -63,9 +63,9 @@ def run_study(
     """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end.
 
     `again` is the command that tries failed trials once more. Raises ConfigError, before anything is done, if the
-    directory holds another study, unless `replace` allows it, or expectations that cannot be read; and before any
-    trial, if one that is finished was changed, or if trials ran other sources than today's and `accept_code` is not
-    given.
+    directory holds another study (unless `replace` allows it) or expectations that cannot be read; and, before any
+    trial runs, if a finished trial was changed, or if trials ran sources other than the present ones and `accept_code`
+    is not given.
     """
     from experiments.dry_run.notes import say_notes
     from experiments.dry_run.trainable import require_trainable
@@ -76,11 +76,11 @@ def run_study(
     if not setup.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps = plan_asked(study, axes, workspace.root)
-    sources = trial_closure()  # a later change is refused by the trials
+    sources = trial_closure()  # trials refuse to run if the sources change later
     require_trainable(study, sweeps, launcher_options)
     say_notes(setup, sweeps, launcher_options)
     await_lease(workspace)
-    # Without the place every trial would fail, once all is prepared.
+    # The launcher comes first: without it every trial would fail, after everything was prepared.
     with launcher_options.launcher(workspace.root) as launcher, workspace.locked() as lock:
         earlier = find_earlier(setup, sweeps, replace)
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
@@ -97,9 +97,9 @@ def run_study(
         trials = unique_trials(sweeps, provenance)
         require_agreement(workspace, shown, trials, sources, accept_code)
         kept = keep_axes(every, workspace.root)
-        if setup.arguments.registry:  # some axes are planned with it
+        if setup.arguments.registry:  # some axes are planned with its entries
             write_file(workspace.registry, setup.arguments.registry.read_bytes())
-        else:  # there may be that of a study that this one replaces
+        else:  # it may be left from a study that this one replaces
             workspace.registry.unlink(missing_ok=True)
         record = Record(study, setup.data, kept, whole_command(setup, kept), provenance=provenance)
         save_record(workspace, record)
@@ -113,7 +113,7 @@ def run_study(
 
 
 def _count_again(setup: StudySetup, sweeps: Sequence[Sweep]) -> Study:
-    """The study as its tokens let it be, once they are made; says which points of `sweeps` it then has not."""
+    """The study that its tokens allow, once they are made. Prints which points of `sweeps` it no longer has."""
     from experiments.dry_run.notes import say_points
 
     counted = count_again(setup)
@@ -123,14 +123,16 @@ def _count_again(setup: StudySetup, sweeps: Sequence[Sweep]) -> Study:
 
 
 def await_lease(workspace: Workspace) -> None:
-    """Waits while another machine, or this one before it was booted, holds the directory: until its lease is over, or
-    is renewed, which shows that its command still runs. So a study may be started when its machine boots."""
+    """Waits while the directory is held by another machine, or by this one from before it was rebooted: until the lease
+    is over, or is renewed, which shows that its command still runs. So a study may be started when its machine
+    boots."""
     lock, renewed = workspace.root / LOCK, 0.0
     while (holder := workspace.holder) and holder.machine != machine() and find_held(lock):
         time_renewed = lock.stat().st_mtime
         if not renewed:
             say(
-                f"{workspace.root} was in use by {holder}; waiting {EXPIRES / 60:.0f} minutes at most whether that runs still"
+                f"{workspace.root} was in use by {holder}; waiting {EXPIRES / 60:.0f} minutes at most to see whether it "
+                "still runs"
             )
             renewed = time_renewed
         if time_renewed != renewed:
@@ -139,7 +141,8 @@ def await_lease(workspace: Workspace) -> None:
 
 
 def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
-    """Names what the user preregistered of points that are in none of the `planned` sweeps, which are all of the study.
+    """Names the user's preregistered predictions for points that are in none of the `planned` sweeps, which are all
+    sweeps of the study.
 
     Raises ConfigError, as the page at the end would, for a line that cannot be read.
     """
@@ -147,12 +150,15 @@ def say_unplanned(workspace: Workspace, planned: Sequence[Sweep]) -> None:
 
     path = workspace.predictions / FILE
     if lines := find_unplanned(read_expected(path), planned):
-        say(f"note: {path.name} predicts what this study does not plan, which stays open: {few(lines)}")
+        say(
+            f"note: {path.name} predicts points that this study does not plan, so these predictions stay open: "
+            f"{few(lines)}"
+        )
 
 
 def prepare_apart(setup: StudySetup, replace: Step | None) -> Provenance:
-    """Prepares the study. Where there are accelerators, in a process of its own: JAX keeps them for the process that it
-    computes in, and the trials need them."""
+    """Prepares the study. If there are accelerators, this happens in a process of its own: JAX reserves them for the
+    process in which it computes, and the trials need them."""
     accelerators = find_accelerators()
     if accelerators is None:
         return _prepare(setup, replace)
@@ -165,7 +171,7 @@ def prepare_apart(setup: StudySetup, replace: Step | None) -> Provenance:
 def _prepare(
     setup: StudySetup, replace: Step | None, specs: Sequence[DatasetSpec] = (), accelerator: str = ""
 ) -> Provenance:
-    """`specs`: registry entries, since a new process lacks the user's own; `accelerator`: the kind that is expected."""
+    """`specs`: registry entries, since a new process lacks the user's own; `accelerator`: the expected kind."""
     require_accelerator(accelerator)
     from experiments.preparing.pipeline import prepare
 
@@ -180,9 +186,9 @@ def make_jobs(
     common: dict[str, Any],
     former: Mapping[str, Trial] = {},
 ) -> list[Job]:
-    """A job for every trial, the widest and longest first, so that no worker is left with one of them at the end. A
-    trial waits for the shorter ones that share the beginning of its training, and for its source. What it shares with
-    `former` trials is not trained again."""
+    """A job for every trial, the widest and longest first, so that none of these is left running alone at the end. A
+    trial waits for the shorter ones that share the beginning of its training, and for its source. Training that it
+    shares with `former` trials is not repeated."""
     shared = share_runs(trials, former)
     jobs = []
     for id, trial in sorted(trials.items(), key=lambda item: (-item[1].model.width, -item[1].train.steps)):
@@ -193,7 +199,7 @@ def make_jobs(
 
 
 def say_trained(jobs: Sequence[Job], former: Collection[str], workspace: Workspace) -> None:
-    """Says how many trials that are to be run begin from a checkpoint of `former` ones."""
+    """Prints how many of the trials to be run begin from a checkpoint of `former` ones."""
     missing = [job for job in jobs if not (workspace.trials / job.id / RESULT).exists()]
     count = 0
     for job in missing:
@@ -201,7 +207,7 @@ def say_trained(jobs: Sequence[Job], former: Collection[str], workspace: Workspa
         begun = newest_step(workspace.trials / job.id / RUN)
         count += not begun and latest_common(workspace.trials, before)[1] > 0
     if count:
-        what = "go on from what was trained here for other trials"
+        what = "go on from checkpoints that were trained here for other trials"
         console.print(f"{count} of {len(missing)} trials to be run {what}")
 
 
@@ -220,8 +226,9 @@ def whole_command(setup: StudySetup, axes: Sequence[str]) -> str:
 def require_agreement(
     workspace: Workspace, shown: Collection[str], requested: Collection[str], sources: Closure, accept_code: bool
 ) -> None:
-    """Raises ConfigError if a finished trial among `shown`, all trials of the study, was changed, or if they and those
-    still to be run of `requested` ran different sources and `accept_code` is not given. Both are ids."""
+    """Raises ConfigError if a finished trial was changed, or if the finished trials, and those of `requested` that are
+    still to be run, have different sources and `accept_code` is not given. `shown`: ids of all trials of the study;
+    `requested`: ids."""
     from experiments.running.trial_checks import check_finished, require_one_closure
 
     check_finished(workspace.trials, shown)
@@ -230,11 +237,11 @@ def require_agreement(
 
 
 def find_earlier(setup: StudySetup, asked: Sequence[Sweep], replace: Step | None) -> Record | None:
-    """The record of what was run here before, if the study goes on with it: its axes then have the same trials under
-    both. Where the study is replaced, the record with those of its axes that still have, or are `asked` for again.
+    """The record of what was run here before, if the study continues it: its axes then have the same trials under both.
+    If the study is replaced: the record with only those axes that still have the same trials or are `asked` for again.
 
-    Raises ConfigError for a study of other settings, whose report would be drawn over, or of other data, unless
-    `replace` allows it, and for what `require_preparable` refuses.
+    Raises ConfigError, unless `replace` allows it, for an earlier study with other settings, whose report would be
+    overwritten, or with other data; and for what `require_preparable` refuses.
     """
     from experiments.preparing.changes import require_preparable
 
@@ -257,7 +264,7 @@ def find_earlier(setup: StudySetup, asked: Sequence[Sweep], replace: Step | None
     if gone:
         paths = [short(workspace.root / axis) if is_file(axis) else axis for axis in gone]
         say(
-            f"note: the page will leave out what ran with other settings: {few(paths)}. To have it again, run "
+            f"note: the page will leave out axes that ran with other settings: {few(paths)}. To have one again, run "
             f"`{PROGRAM} sweep` for it with these settings"
         )
     return dataclasses.replace(earlier, axes=tuple(axis for axis in earlier.axes if axis not in gone))
@@ -266,7 +273,7 @@ def find_earlier(setup: StudySetup, asked: Sequence[Sweep], replace: Step | None
 def run_jobs(
     jobs: Sequence[Job], workspace: Workspace, launcher: Launcher, lock: Lock, retry_failed: bool
 ) -> dict[str, State]:
-    """Runs what is missing, visibly."""
+    """Runs the trials that are missing, and shows their progress."""
     ledger = Ledger(workspace.ledger)
     before = read_states([job.id for job in jobs], workspace.trials, ledger)
     kept = sum(state.event == FINISHED for state in before.values())
@@ -281,8 +288,8 @@ def run_jobs(
 
 
 def require_results(jobs: Sequence[Job], states: dict[str, State], again: str, accept_code: bool) -> None:
-    """Raises TrialsFailed, naming every trial without a result, and the command that tries them again: `again`, which
-    has to accept the changed code where that stopped the sweep. It leaves those that diverged as they are."""
+    """Raises TrialsFailed, naming every trial without a result and the command that tries them again: `again`, with
+    --accept-code if changed code stopped the sweep. That command leaves diverged trials as they are."""
     bad = [(job, states[job.id]) for job in jobs if states[job.id].event != FINISHED]
     if not bad:
         return
@@ -303,7 +310,8 @@ def require_results(jobs: Sequence[Job], states: dict[str, State], again: str, a
 
 
 def _without_result(job: Job, state: State, refused: bool) -> str:
-    """A trial, its state and why it has it. `refused`: another one was, after which the runner starts none."""
+    """A trial, its state and the reason. `refused`: another trial was refused, after which the runner starts no
+    more."""
     why = state.message
     if not why and refused and state.event in (MISSING, PREEMPTED):
         why = "not started, because another trial was refused"

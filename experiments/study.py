@@ -35,7 +35,7 @@ SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
 
 PROCESSOR = 1e12
-"""FLOP/s that no processor sustains: a study of at least so many for a device is for accelerators."""
+"""FLOP/s that no CPU sustains: a study with at least this many per device is for accelerators."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class StoreConfig:
     # Largest fraction of a dataset that is held out; takes precedence over min_val.
     max_val_fraction: float = HeldOut.max_val_fraction
     # Largest number of training episodes per dataset, chosen by hash as by --trajectories; others are not tokenised.
-    # Of a split that an entry holds out, at most max_val episodes are tokenised then. null: all episodes.
+    # If it is set, at most max_val episodes are tokenised of a split that an entry holds out. null: all episodes.
     max_train: int | None = later(None)
     frame_step: int | None = None  # store every N-th native frame; 1: all; null: those of the study's rate
     corrupt: Literal["raise", "skip"] = "raise"  # at a damaged record, stop with an error, or leave it out and count it
@@ -75,7 +75,7 @@ class StoreConfig:
             m >= 0 and (m < 1 or float(m).is_integer()),
             f"store.max_skipped must be a whole number of episodes or, below 1, a fraction of them, got {m:g}",
         )
-        # As tokenising asks for them, which may come hours later.
+        # Checked here as tokenising checks them, which may come hours later.
         self.held_out.check("store.")
         require(
             self.frame_step is None or self.frame_step >= 1,
@@ -89,8 +89,8 @@ class StoreConfig:
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """The grid of the axis `lr`, which asks whether the best learning rate transfers over widths; on a smaller trial if
-    so declared. The axis `transfer`, from robots to others, is set by `DesignConfig`."""
+    """The grid of the axis `lr`, which asks whether the best learning rate transfers across widths, on a smaller trial
+    if so declared. The axis `transfer` (from robots to others) is set by `DesignConfig`."""
 
     rates: int = 5  # number of learning rates per width; odd, so that one is in the middle
     factor: float = 2.0  # ratio of neighbouring learning rates
@@ -113,9 +113,9 @@ class TransferConfig:
 
 @dataclass(frozen=True)
 class DesignConfig:
-    """Designs of a study that is to be believed (axes `dilution`, `transfer`, `newcomers`, `fewshot`, `episodes`,
-    `compute`, `horizon`, `lr_horizon`); the demonstration has none of them. Fields of steps name decay branches of
-    runs that trials share (`experiments.running.shared_runs`)."""
+    """Designs of a study that is meant as evidence (axes `dilution`, `transfer`, `newcomers`, `fewshot`, `episodes`,
+    `compute`, `horizon`, `lr_horizon`); the demonstration has none of them. Fields that give numbers of steps name
+    decay branches of runs that trials share (`experiments.running.shared_runs`)."""
 
     # dilution, transfer, newcomers: number of judged robots (those that are evaluated), drawn at random for every seed.
     judged: int = 5
@@ -205,10 +205,10 @@ class Study:
         for seed in (*self.seeds, *self.ablation_seeds):
             require_seed(seed, "a seed of seeds and ablation_seeds")
         self._check_tokens()
-        # As training asks for them, which comes after data and tokenizer were made.
+        # Checked here as training checks them, which comes after data and tokenizer were made.
         check_objective(self.model, self.train.masking)
         check_micro_batches(self.train.batch, self.execution.accumulate)
-        check_decoding(self.model, self.eval.decode)  # as the evaluation would, which comes after training
+        check_decoding(self.model, self.eval.decode)  # as evaluation checks it, which comes after training
         self.eval.check_images(self.tokenizer.image_shape)
         require(
             not self.train.seed,
@@ -263,7 +263,7 @@ class Study:
 
     @property
     def for_accelerators(self) -> bool:
-        """Whether its estimates are for devices that are faster than any processor."""
+        """Whether its estimates are for devices that are faster than any CPU."""
         return self.flops_per_second >= PROCESSOR
 
     def dataset_names(self) -> tuple[str, ...]:
@@ -285,23 +285,24 @@ class Study:
 
 
 def on_user_data(study: Study, names: Sequence[str]) -> Study:
-    """The same study on the user's datasets: numbers of datasets beyond what there is are cut to it."""
+    """The same study on the user's datasets: larger numbers of datasets are reduced to the number that exists."""
     counts = tuple(sorted({min(c, len(names)) for c in study.dataset_counts} | {len(names)}))
     return replace(study, datasets=tuple(names), dataset_counts=counts, unseen=())
 
 
 def without_equal_caps(study: Study, by_entries: bool = False) -> Study:
-    """The same study, where of numbers of trajectories that no dataset has to train on only the last is left: with the
-    others a trial would be trained on the same. `by_entries`: as `most_trajectories`."""
+    """The same study without superfluous numbers of trajectories: of those that leave out no trajectory, only the last
+    is kept, since with the others a trial would be trained on the same data. `by_entries`: as in
+    `most_trajectories`."""
     *caps, last = study.trajectory_counts
     most = most_trajectories(study, by_entries) or last
     return replace(study, trajectory_counts=(*(cap for cap in caps if cap < most), last))
 
 
 def most_trajectories(study: Study, by_entries: bool = False) -> int | None:
-    """Training trajectories of the largest dataset, with those that were left out as damaged, since no other takes
-    their place in a subset; where nothing says how many are held out, with those. None where it is not known of all.
-    `by_entries`: as the registry alone says."""
+    """Training trajectories of the largest dataset. Those that were left out as damaged are counted, since no other
+    takes their place in a subset; so are held-out ones, if their number is unknown. None if the size of any dataset is
+    unknown. `by_entries`: as the registry alone says."""
     find_size = size_by_entry if by_entries else size_of
     specs = [find_spec(name) for name in study.dataset_names()]
     sizes = [spec and find_size(spec, study.store.held_out) for spec in specs]
@@ -312,7 +313,7 @@ def most_trajectories(study: Study, by_entries: bool = False) -> int | None:
 def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:
     """The same study on the tokens of a given tokenizer: what the model takes follows from it.
 
-    Raises ConfigError when one of the two is made for ids and the other for latents.
+    Raises ConfigError if one of the two is made for ids and the other for latents.
     """
     latents, wanted = tokenizer.token_channels > 0, study.model.diffusion is not None
     kinds = {True: "latents", False: "ids"}

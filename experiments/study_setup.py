@@ -1,7 +1,7 @@
-"""The arguments of a study, the study that follows from them, and the commands that give the same again.
+"""The arguments of a study, the study that follows from them, and the commands that give the same study again.
 
-A command that is printed is made of every field of `StudyArguments`, so nothing that the user gave is lost on the way
-from one command to the next. What holds for one command only (--workers, --replace) is not part of it.
+Printed commands are made from every field of `StudyArguments`, so nothing that the user gave is lost from one command
+to the next. Options that hold for one command only (--workers, --replace) are not part of them.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class StudyArguments:
         return tuple(dict.fromkeys(one.partition("=")[0].strip() for one in self.set))
 
     def words(self) -> list[str]:
-        """The arguments that give this."""
+        """These arguments as words of a command line."""
         words = []
         for field in fields(self):
             value = getattr(self, field.name)
@@ -142,17 +142,17 @@ def command(name: str, *arguments: str | Path) -> str:
 
 
 def command_words(*arguments: str | Path) -> str:
-    """Arguments as they are written in a shell; a path as short as it can be here."""
+    """Arguments as written in a shell, with paths as short as possible here."""
     return shlex.join(map(_word, arguments))
 
 
 def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> StudySetup:
-    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. Of its numbers of
-    trajectories those that would be trained on the same are left out, but for points of the study in the directory.
-    Says where the files of the data have other numbers of episodes than the registry.
+    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing. Numbers of trajectories
+    that would give the same training data are left out, except points of a study that is in the directory. Prints where
+    the data's files have numbers of episodes other than the registry's.
 
-    `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that
-    are no datasets.
+    `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that are
+    not datasets.
     """
     arguments = where.anywhere()
     study, data, workspace = get_preset(arguments.preset), arguments.data, Workspace(arguments.out)
@@ -196,24 +196,24 @@ def make_setup(where: StudyArguments, model: ModelConfig | None = None) -> Study
 
 
 def count_again(setup: StudySetup) -> StudySetup:
-    """The same on the user's data once tokens are made of it, which say how many trajectories have windows."""
+    """The same on the user's data, once its tokens are made: they say how many trajectories have windows."""
     use_sizes(sizes_by_tokens(setup.workspace.data_summary))
     asked = replace(setup.study, trajectory_counts=setup.asked_counts)
     return replace(setup, study=_without_equal_caps(asked, setup.arguments, setup.workspace))
 
 
 def _without_equal_caps(study: Study, arguments: StudyArguments, workspace: Workspace) -> Study:
-    """The same study, less the numbers of trajectories that would be trained on the same; those that the user chose are
-    left out only if the data, not the registry, say so. It keeps the numbers of the study in `workspace` if they differ
-    only in such as no dataset has to train on, or follow from the registry: its finished trials are then not run again
-    under another number, and a study that an earlier version planned goes on."""
+    """The same study without the numbers of trajectories that would give the same training data. Numbers that the user
+    chose are left out only if the data, not the registry, say so. The numbers of the study in `workspace` are kept if
+    they differ only in numbers that leave out no trajectory, or if they follow from the registry: its finished trials
+    are then not run again under another number, and a study that an earlier version planned can continue."""
     chosen, counted = "trajectory_counts" in arguments.chosen(), are_counted(study.dataset_names())
     if chosen and not counted:
         return study
     planned = without_equal_caps(study)
     try:
         earlier = find_record(workspace)
-    except ConfigError:  # who goes on with it says so
+    except ConfigError:  # the code that continues it reports this
         return planned
     if earlier is None:
         return planned
@@ -229,7 +229,7 @@ def _without_equal_caps(study: Study, arguments: StudyArguments, workspace: Work
 
 def use_entries(registry: Path | None, run: Path | None = None) -> None:
     """Adds the user's own entries to the registry, for the rest of this process: those that the study of `run` was
-    planned with, if it has any, and those of a TOML file, which take the place of others of the same name."""
+    planned with, if it has any, and those of a TOML file, which replace others of the same name."""
     if run is not None:
         use_own_entries(Workspace.of_run(run))
     if registry is not None:
@@ -239,8 +239,8 @@ def use_entries(registry: Path | None, run: Path | None = None) -> None:
 
 
 def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
-    """Says which of the datasets `names` (as their files call them) are read by the project's own entries, where the
-    user's file has entries that nothing uses: the name of one may be misspelt."""
+    """If the user's file has entries that nothing uses, prints which of the datasets `names` (as their files call them)
+    are read by the project's own entries: a name in the user's file may be misspelt."""
     if registry is None:
         return
     from data_pipelines.registry.toml_file import load_entries
@@ -257,14 +257,14 @@ def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
 
 
 def under_another_name(names: Sequence[str]) -> str:
-    """Advice for datasets that their files call `names`, where a robot of another name may be the same one."""
+    """Advice for datasets that their files call `names`, if a robot of another name may be the same one."""
     joins = json.dumps(list(names[:1]))
     return f"If {names[0]} is one of these robots, add joins = {joins} to its entry in the file of --registry"
 
 
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:
     """`<root>/<name>` for every name, or for those that its entry joins, in the first root that has it. Raises
-    ConfigError, with the names, where some are in none."""
+    ConfigError, with the names, if some are in none."""
     from data_pipelines.sources.rlds.location import locate
 
     entries = {name: find_spec(name) for name in names}
@@ -283,4 +283,4 @@ def _word(value: Any) -> str:
     if not isinstance(value, Path):
         return str(value)
     text = short(value)
-    return f"./{text}" if text.startswith("-") else text  # otherwise it reads as an option
+    return f"./{text}" if text.startswith("-") else text  # otherwise it would be read as an option

@@ -415,7 +415,7 @@ def test_axes_whose_trials_stay_the_same_stay_on_the_page_of_a_study_that_is_rep
     assert main([*wider, "--set", "train.steps=7", "--replace", "study"]) == 0
     assert load_record(Workspace(tmp_path)).axes == ("width",)
     said = " ".join(capsys.readouterr().out.split())
-    assert "the page will leave out what ran with other settings: datasets, trajectories." in said
+    assert "the page will leave out axes that ran with other settings: datasets, trajectories." in said
 
 
 def test_robots_that_any_seed_is_judged_on_need_held_out_windows(instant_trials, tmp_path, capsys, monkeypatch):

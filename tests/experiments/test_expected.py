@@ -156,8 +156,9 @@ def test_a_study_reads_what_is_expected_before_it_prepares_anything(tmp_path, mo
     assert run("width,,12,,cross_entropy,5,4,6,abc1234") == "prepares"
     said = " ".join(capsys.readouterr().out.split())
     assert (
-        f"note: {FILE} predicts what this study does not plan, which stays open: width has no point '12', but" in said
-    )
+        f"note: {FILE} predicts points that this study does not plan, so these predictions stay open: "
+        "width has no point '12', but"
+    ) in said
 
 
 @pytest.mark.parametrize(

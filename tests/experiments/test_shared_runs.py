@@ -106,7 +106,7 @@ def test_trials_are_said_to_go_on_only_from_checkpoints_that_they_can_begin_from
 
     assert said() == ""
     checkpoint(workspace.trials, "200", 160)
-    assert said() == "1 of 3 trials to be run go on from what was trained here for other trials"
+    assert said() == "1 of 3 trials to be run go on from checkpoints that were trained here for other trials"
 
 
 def test_it_says_then_what_both_ran(tmp_path):
