@@ -93,7 +93,7 @@ class Columns:
         return self._entry(name)[3]
 
     def entries(self, name: str) -> int:
-        """Length of a column, without reading it."""
+        """Number of entries of a column, without reading it."""
         return self._entry(name)[1]
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -166,7 +166,7 @@ class Column(Sequence[int]):
         return Column, (np.asarray(self),)
 
     def digest(self) -> str:
-        """SHA-256 of the entries; of a column of a file as it was written, without reading it."""
+        """SHA-256 of the entries; for a column of a file, the hash recorded when it was written, without reading it."""
         if self._lazy is not None:
             return self._lazy[0].digest(self._lazy[1])
         return hashlib.sha256(self._array.data).hexdigest()

@@ -12,8 +12,8 @@ from pathlib import Path
 from hma_jax.config import ConfigError
 
 MAX_LISTED = 6
-"""Cases that a message lists one by one; of the others it gives the number. Of a dataset that was fetched in part,
-every shard may be damaged."""
+"""Number of cases that a message lists one by one; for the others it gives only their number. If a dataset was fetched
+in part, every shard may be damaged."""
 
 ADVICE = re.compile(
     r"[.;] (?:Download|Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip'|store\.corrupt=skip)[^.;]*\.?$"
@@ -34,11 +34,12 @@ class DataError(Exception):
 
 
 class NoDatasetError(DataError, ConfigError):
-    """A location that was given and is no dataset: most often the path is misspelt."""
+    """A given location that is not a dataset: most often the path is misspelt."""
 
 
 class UnreachableError(DataError):
-    """A disk or an object store that cannot be read. The data may be intact, so no policy skips anything for it."""
+    """A disk or an object store that cannot be read. The data may be intact, so no policy skips data because of this
+    error."""
 
 
 class EpisodeError(DataError):
@@ -57,7 +58,7 @@ class EpisodeError(DataError):
 
 
 def too_many_skipped(name: str, total: int, limit: int, last: str) -> DataError:
-    """The error for a dataset of which more episodes were skipped than may be; `last`: why the last one was."""
+    """The error for a dataset of which too many episodes were skipped; `last`: why the last one was skipped."""
     return DataError(
         f"{name}: {total} episodes cannot be used, more than max_skipped={limit}. The last: {without_advice(last)} To use "
         "the others, raise the limit: --set store.max_skipped=N."

@@ -1,4 +1,4 @@
-"""Reading JSON files of unknown origin: an object, or a DataError that names the file and says what to do.
+"""Reads JSON files of unknown origin: an object, or a DataError that names the file and says what to do.
 
 Owns the limits: parsing takes many times the memory of the text, so the size of a file and the number of its
 values are checked first.
@@ -27,8 +27,8 @@ STRUCTURE = (b",", b":", b"[", b"{")
 
 
 def read_object(path: Path | UPath, *, if_missing: str, advice: str) -> dict[str, Any]:
-    """The JSON object in `path`. DataError with `if_missing` where there is no such file, and with
-    `advice` where it cannot be read."""
+    """The JSON object in `path`. Raises DataError, with `if_missing` if there is no such file, and with `advice` if it
+    cannot be read."""
     try:
         text = read_head(path, MAX_BYTES + 1)
     except FileNotFoundError:

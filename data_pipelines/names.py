@@ -1,7 +1,8 @@
 """Validation of names and relative paths read from untrusted files, before they become paths on this machine.
 
-Owns what a dataset may be called, by which file one of a token store is recognised, and what a path inside a dataset
-may look like. Only the text of a path is checked: symbolic links are followed, as download caches consist of them.
+Owns what a dataset may be called, the file by which a dataset of a token store is recognised, and what a path inside a
+dataset may look like. Only the text of a path is checked: symbolic links are followed, as download caches consist of
+them.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def snake_case(text: str) -> str:
 
 
 def made_name(text: str) -> str:
-    """A name, made from `text`, for a dataset that is written: as `snake_case`, first a letter."""
+    """A name, made from `text`, for a dataset to be written: like `snake_case`, and starting with a letter."""
     name = snake_case(text)
     return name if name[:1].isalpha() else f"dataset_{name}"
 
@@ -55,7 +56,7 @@ def truncate(text: object) -> str:
 def quote(value: object) -> str:
     """A value read from an untrusted file, for a message: on one line, of bounded length."""
     max_length = 80
-    if isinstance(value, (list, dict)):  # of any depth
+    if isinstance(value, (list, dict)):  # nested to any depth
         return f"a {type(value).__name__} of {len(value):,}"
     text = ascii(value[:max_length]) if isinstance(value, (str, bytes)) else ascii(value)
     return text if len(text) <= max_length + 8 else f"{text[:max_length]}..."

@@ -1,4 +1,4 @@
-"""Ground-truth simulators with the interface of the learned simulator, which documents it (`hma_jax.simulator`).
+"""Ground-truth simulators with the interface of the learned simulator (documented in `hma_jax.simulator`).
 
 Owns what all true simulators share; each subclass says which robots it has and opens their worlds.
 """
@@ -20,14 +20,14 @@ from hma_jax.simulator.starts import Start
 
 
 class World(Protocol):
-    """One robot's world, whose episodes are begun by a seed and advance by native actions, float32 [A]."""
+    """One robot's world. Its episodes are started from a seed and advance by native actions, float32 [A]."""
 
     def reset(self, seed: int) -> None: ...
 
     def step(self, action: np.ndarray) -> None: ...
 
     def get_state(self) -> Any:
-        """A copy of what `set_state` goes on from."""
+        """A copy of the state from which `set_state` continues."""
 
     def set_state(self, state: Any) -> None: ...
 
@@ -44,10 +44,10 @@ W = TypeVar("W", bound=World)
 
 
 class TrueSimulator(ABC, Generic[W]):
-    """B episodes of true robots, as they really go; nothing is random after the start."""
+    """B episodes of true robots; nothing is random after the start."""
 
     def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int = 64, outside: Outside = "clip"):
-        """Raises ConfigError for robots that there are not, or with other actions."""
+        """Raises ConfigError for robots that do not exist here or have other actions."""
         [episodes] = whole_numbers("episodes", [episodes])
         require_choice(outside, get_args(Outside), "outside")
         for robot in robots:
@@ -68,17 +68,17 @@ class TrueSimulator(ABC, Generic[W]):
     @staticmethod
     @abstractmethod
     def dims() -> dict[str, int]:
-        """A of every robot that there is."""
+        """{name: A} of every robot that exists."""
 
     @abstractmethod
     def open_world(self, name: str) -> W:
         """A world of this robot; it is reset before anything else."""
 
     def close_world(self, world: W) -> None:
-        """Ends a world that is not used again."""
+        """Closes a world that is not used again."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> TrueSimulator:
-        """Itself, as a learned simulator."""
+        """Returns itself, as a learned simulator does."""
         return self
 
     def __len__(self) -> int:
@@ -110,7 +110,7 @@ class TrueSimulator(ABC, Generic[W]):
             if not again:
                 self._leave(b)
             world = now[0] if again else self.open_world(start.robot)
-            self._worlds[b], self._before[b] = (world, self.robots[start.robot]), []  # to be closed, should it fail now
+            self._worlds[b], self._before[b] = (world, self.robots[start.robot]), []  # closed if this fails
             world.reset(start.seed)
             for action in start.actions:
                 world.step(action)
@@ -130,7 +130,7 @@ class TrueSimulator(ABC, Generic[W]):
         self.clipped = clipped
         for b, (world, chunk) in asked.items():
             self._before[b].append(world.get_state())
-            del self._before[b][:-HISTORY]  # as many as a learned simulator keeps
+            del self._before[b][:-HISTORY]  # the same number as a learned simulator keeps
             for action in chunk:
                 world.step(action)
         self._draw(asked)
@@ -154,7 +154,7 @@ class TrueSimulator(ABC, Generic[W]):
         return self.images
 
     def max_rewind(self, b: int) -> int:
-        """By how many frames episode b can be taken back."""
+        """Number of frames by which episode b can be rewound."""
         return len(self._before[b])
 
     def state(self, b: int) -> Any:
@@ -166,7 +166,7 @@ class TrueSimulator(ABC, Generic[W]):
         return np.array([world is not None and world[0].success() for world in self._worlds])
 
     def close(self) -> None:
-        """Ends all episodes, and gives back what draws them."""
+        """Ends all episodes, and releases their renderers."""
         for b in range(len(self)):
             self._leave(b)
 
@@ -188,6 +188,6 @@ class TrueSimulator(ABC, Generic[W]):
 
 
 def judge_by_state(simulator: TrueSimulator) -> tuple[np.ndarray, np.ndarray]:
-    """A judge of true episodes: 1 and the end where the task's goal is reached."""
+    """A judge of true episodes: success (1) and the end of the episode when the task's goal is reached."""
     done = simulator.success()
     return done.astype(float), done

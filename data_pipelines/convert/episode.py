@@ -25,7 +25,7 @@ class Conversion:
 
 
 def encode(episode: Episode, layout: Layout) -> bytes:
-    """The record of `episode`. Raises UnitError where it contradicts `layout`, naming the field."""
+    """The record of `episode`. Raises UnitError, naming the field, if it contradicts `layout`."""
     steps = len(episode.instructions)
     if not steps:
         raise UnitError(f"{episode.origin}: the episode has no steps.")
@@ -35,7 +35,7 @@ def encode(episode: Episode, layout: Layout) -> bytes:
     features = step_features(rewards, episode.instructions)
     features["episode_metadata/file_path"] = [episode.origin.encode()]
     if layout.knows_success:
-        if episode.success is None:  # a record has no third value, and nobody should take it for a failure
+        if episode.success is None:  # a record cannot say "unknown", and unknown must not be taken for failure
             raise UnitError(f"{episode.origin}: it does not say whether it succeeded, but other recordings do.")
         features["episode_metadata/success"] = np.array([episode.success], np.int64)
     for key in layout.images:

@@ -104,7 +104,7 @@ def convert(
     with ExitStack() as stack:
         stack.callback(_remove_empty, new)
         stack.enter_context(lock_output(final.with_name(f".{VERSION}"), called=final.parent))
-        if final.exists():  # made by another process meanwhile
+        if final.exists():  # another process has made it meanwhile
             return _finished(final, fingerprint, source, name)
         partial = final.with_name(f".{VERSION}.{fingerprint[:16]}.partial")
         partial.mkdir(exist_ok=True)
@@ -147,7 +147,7 @@ def _write_shards(
 
         count = write_shard(partial / _part(len(shards)), records())
         shards.append(_Shard(unit, count, size, dict(sorted(skipped.items()))))
-        sync(partial / _part(len(shards) - 1))  # the line below says that it is there
+        sync(partial / _part(len(shards) - 1))  # the journal's line below states that it exists
         journal.append(vars(shards[-1]))
     return shards
 
@@ -164,7 +164,7 @@ def _finish(
     kept = [(k, s) for k, s in enumerate(shards) if s.records]
     for to, (k, _) in enumerate(kept):
         target = partial / shard_name(name, to, len(kept))
-        if not target.exists():  # by a run that was stopped here
+        if not target.exists():  # else a run that was stopped here has moved it
             os.replace(partial / _part(k), target)
     write_info(
         partial,
@@ -175,10 +175,10 @@ def _finish(
         metadata={**metadata, RATE_KEY: source.hz, "left_out": skipped},
         module="data_pipelines.convert",
     )
-    for stray in [*partial.glob("part-*"), *partial.glob(".*")]:  # hidden files are of killed writers
+    for stray in [*partial.glob("part-*"), *partial.glob(".*")]:  # hidden files were left by killed writers
         stray.unlink(missing_ok=True)
     publish(partial, final)
-    (final / JOURNAL).unlink(missing_ok=True)  # only now: a run that finds shards without it makes all of them again
+    (final / JOURNAL).unlink(missing_ok=True)  # only now: a run that finds shards without it makes all again
     return Conversion(final, suggest_spec(source, name), episodes, len(kept), skipped)
 
 

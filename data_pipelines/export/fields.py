@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 ACTION, STATE = "action", "observation.state"
 
 STATES = ("observation/state", "observation/proprio")
-"""What sources call the robot's state; the first that there is becomes `observation.state`."""
+"""Names that sources use for the robot's state; the first that exists becomes `observation.state`."""
 
 
 @dataclass(frozen=True)
 class LeRobotFields:
     """Features by the names that LeRobot gives them.
 
-    `cameras`: the flat key of each. `vectors`: the keys that are concatenated to each, which may be sliced
-    ("steps/action[:7]"). `names`: of the values of each vector.
+    `cameras`: the flat key of each. `vectors`: for each, the keys that are concatenated to it; keys may be sliced
+    ("steps/action[:7]"). `names`: the names of each vector's values.
     """
 
     cameras: Mapping[str, str]
@@ -33,9 +33,9 @@ class LeRobotFields:
 
 
 def choose_fields(source: EpisodeSource, action: Sequence[str] = (), state: Sequence[str] = ()) -> LeRobotFields:
-    """All cameras and vectors of `source`; `action` and `state` are the keys, relative to a step, of what becomes
-    `action` and `observation.state`, where other fields of these names are left out. By default `action_fields` and one
-    of STATES.
+    """All cameras and vectors of `source`. `action` and `state`: keys, relative to a step, of the fields that become
+    `action` and `observation.state`; other fields with these names are left out. By default `action_fields` and one of
+    STATES.
 
     Raises ConfigError for unknown keys, for a source without a camera, and for two cameras of one name.
     """

@@ -1,8 +1,8 @@
 """Writes any source as a LeRobot dataset, version 3.0, resumable after every file.
 
 A file holds some episodes: their rows (`data`), the frames of each camera (`videos`), and last the table that lists
-them (`meta/episodes`). A file without that table is unfinished, and is written again. Until the last is finished, all
-lie in a hidden directory beside the dataset. `data_pipelines.sources.lerobot_meta` reads what is written here.
+them (`meta/episodes`). A file without that table is unfinished, and is written again. Until the last file is finished,
+all are in a hidden directory beside the dataset. `data_pipelines.sources.lerobot_meta` reads what is written here.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ FILE_BYTES = 2**31
 """A file ends with the episode whose pixels, before they are compressed, reach this size: a minute of work or two."""
 
 FRAME_BYTES = 2**16
-"""A smaller frame counts as one of this size, as it takes as long to write."""
+"""A smaller frame counts as one of this size, since it takes as long to write."""
 
 CHUNK = 1000
 """Files in a folder."""
@@ -95,8 +95,8 @@ def export_lerobot(
     """Writes every episode of `source` into the new directory `out`; `hz`: frames per second.
 
     With the same source and settings again it resumes, or returns at once if the dataset is finished. Damaged episodes
-    are left out where `source` was opened with corrupt='skip'. Raises EpisodeError for a damaged one otherwise,
-    DataError if none is left, ConfigError for a directory that exists and is another dataset, and without PyAV.
+    are left out if `source` was opened with corrupt='skip'; otherwise they raise EpisodeError. Raises DataError if no
+    episode is left, ConfigError if PyAV is missing and for a directory that exists and is another dataset.
     """
     require(0 < hz < math.inf, f"frames per second must be positive and finite, got {hz}")
     final = Path(out).absolute()
@@ -114,7 +114,7 @@ def export_lerobot(
         return _finished(final, settings)
     require_module("av", "writing videos")
     with lock_output(final):
-        if final.exists():  # made by another process meanwhile
+        if final.exists():  # another process has made it meanwhile
             return _finished(final, settings)
         partial = final.with_name(_partial(final.name, stable_hash(settings)[:16]))
         writer = _Writer(source, fields, partial, hz)
@@ -122,7 +122,7 @@ def export_lerobot(
         writer.finish(settings)
         publish(partial, final)
         for other in final.parent.glob(_partial(glob.escape(final.name), "[0-9a-f]" * 16)):
-            shutil.rmtree(other, ignore_errors=True)  # begun with other settings, which nothing can finish any more
+            shutil.rmtree(other, ignore_errors=True)  # begun with other settings, so nothing can finish it any more
         return _finished(final, settings)
 
 
@@ -164,7 +164,7 @@ class _Writer:
         self._tasks = {text: i for i, text in enumerate(dict.fromkeys(text for row in listed for text in row["tasks"]))}
         self._shapes: dict[str, tuple[int, ...]] = {}  # camera -> shape of its frames
         self._dtypes: dict[str, str] = {}
-        if listed:  # the first episode says which columns all have, and the sizes of frames
+        if listed:  # the first episode determines the columns of all, and the sizes of frames
             self._read(listed[0][NUMBER])
 
     def _tables(self) -> Iterator[Path]:
@@ -333,7 +333,7 @@ class _Writer:
         write_file(meta / "stats.json", to_strict_json({name: self._statistics(name) for name in features}))
         write_file(meta / "info.json", to_strict_json(info))
         left_out = sum(run.count for run in self._source.runs) - self._episodes
-        for stray in self._root.rglob(".*.tmp"):  # of killed exports
+        for stray in self._root.rglob(".*.tmp"):  # left by killed exports
             stray.unlink()
         origin = {"settings": settings, "episodes": self._episodes, "frames": self._frames, "left_out": left_out}
         write_file(self._root / ORIGIN, to_strict_json(origin))

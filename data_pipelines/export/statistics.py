@@ -1,4 +1,4 @@
-"""The statistics that a LeRobot dataset carries, of single episodes and of all: policies scale values by them."""
+"""The statistics in a LeRobot dataset, of each episode and of all: policies scale values by them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 Statistics = Mapping[str, np.ndarray]
-"""Statistics of one feature: min, max, mean, std, each of the feature's shape ([3, 1, 1] for a camera, of values from
-0 to 1), and count [1], of vectors also the QUANTILES."""
+"""Statistics of one feature: min, max, mean and std, each of the feature's shape ([3, 1, 1] for a camera, of values
+from 0 to 1), count [1], and for vectors also the QUANTILES."""
 
 COMBINED = ("min", "max", "mean", "std", "count")
 """What `combine` gives."""

@@ -22,7 +22,7 @@ INDEXED_BY_TASK = to_strict_json({
     ],
     "pandas_version": "2.2.0",
 })  # fmt: skip
-"""pandas, with which LeRobot reads the tasks, takes this column for the index."""
+"""LeRobot reads the tasks with pandas, which uses this column as the index."""
 
 
 def arrow_type(values: np.ndarray) -> pa.DataType:

@@ -10,10 +10,10 @@ from data_pipelines.export.statistics import PixelCounts, Statistics
 from data_pipelines.sources.source import SourceFrame, decode_frame
 
 SAMPLED = 128
-"""At most about so many frames of an episode are counted in the statistics of a camera."""
+"""At most about this many frames of an episode are counted in a camera's statistics."""
 
 ENCODING = {"crf": "18", "g": "2", "bf": "0"}
-"""Every second frame can be decoded alone: policies are trained on frames in random order."""
+"""Every second frame can be decoded without others: policies are trained on frames in random order."""
 
 
 class VideoWriter:
@@ -54,5 +54,5 @@ class VideoWriter:
 
 
 def pixel_format(height: int, width: int) -> str:
-    """Colours at half the size, which every player decodes, need even sizes."""
+    """Colours at half resolution, which every player decodes, need even sizes."""
     return "yuv444p" if height % 2 or width % 2 else "yuv420p"

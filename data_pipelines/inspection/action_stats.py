@@ -30,13 +30,13 @@ class DimensionFacts:
     maximum: float
     mean: float
     std: float
-    distinct: int  # different numbers, counted up to 100
-    smoothness: float  # step-to-step change over that of independent values; nan for a constant
+    distinct: int  # number of different values, counted up to 100
+    smoothness: float  # step-to-step change relative to that of independent values; nan for a constant
     not_finite: int
     quantiles: tuple[float, ...]  # at QUANTILES
     histogram: tuple[int, ...]  # values in BINS equal bins
     hint: str  # constant, end flag, switch, one of WRAPPING, absolute, delta, or nothing
-    broken: tuple[int, ...] = ()  # sampled episodes in which it is not finite at some step, from 0 on
+    broken: tuple[int, ...] = ()  # numbers, from 0, of sampled episodes with a step in which it is not finite
 
 
 def dimension_facts(episodes: Sequence[np.ndarray]) -> tuple[DimensionFacts, ...]:
@@ -64,7 +64,8 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     hint = _hint(columns, mean, std, counts[-2:].sum() / len(good), smoothness)
     extremes = float(good.min()), float(good.max())
     quantiles = tuple(np.quantile(good, QUANTILES, method="inverted_cdf").tolist())
-    # From the smallest on: between large numbers, as of nanoseconds, there may be no room for the edges of bins.
+    # Relative to the smallest value: between large numbers, such as nanoseconds, floats may be too coarse for bin
+    # edges.
     span = (0.0, extremes[1] - extremes[0]) if alive else (-1.0, 1.0)
     histogram = tuple(np.histogram(good - extremes[0], BINS, span)[0].tolist())
     bad = int((~finite).sum())
@@ -81,7 +82,7 @@ def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, 
     for unit, words in WRAPPING.items():
         if _wraps(columns, unit):
             return words
-    # Targets drift slowly about wherever the robot is; changes jump about zero.
+    # Absolute targets drift slowly around the robot's position; changes jump around zero.
     if smoothness < 0.2 or abs(mean) > 2 * std:
         return "absolute"
     return "delta" if abs(mean) < 0.5 * std else ""

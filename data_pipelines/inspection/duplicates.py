@@ -1,7 +1,7 @@
 """Finds episodes that are probably the same recording, within a split or across splits.
 
-The fingerprint is robust to recompression and resizing: thumbnails of an episode's first and last frame, and its
-actions at sixteen times. A fixed camera shows much the same in every episode, so images alone do not suffice: if
+The fingerprint is robust to recompression and resizing: thumbnails of an episode's first and last frames, and its
+actions at sixteen times. A fixed camera shows much the same in every episode, so images alone are not enough: if
 actions vary, they must match too.
 """
 
@@ -17,7 +17,7 @@ from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.model.embodiments import DEAD_STD
 
 SIDE = 16
-"""A picture is compared as SIDE x SIDE grey cells of its central square."""
+"""An image is compared as SIDE x SIDE grey cells of its central square."""
 
 SAME_PICTURE = 7.0
 """Grey levels, root mean square over the cells. The same frame of the three real samples compressed again
@@ -25,7 +25,7 @@ or at 5/8 of its size differs by at most 5.3, frames of two episodes by 18 or mo
 
 TIMES = 16
 SAME_ACTIONS = 0.02
-"""Standard deviations by which every compared action may differ."""
+"""Number of standard deviations by which every compared action may differ."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, 
     scale = rows.std(axis=(0, 1))
     alive = scale > DEAD_STD
     actions = (rows[:, :, alive] / scale[alive]).reshape(len(episodes), -1)
-    groups: dict[int, list[Fingerprint]] = {}  # by the number of the first of each
-    firsts: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # of those as long, and of as many cameras
+    groups: dict[int, list[Fingerprint]] = {}  # by the number of their first episode
+    firsts: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # by length, cameras
     for n, episode in enumerate(episodes):
         alike = firsts[episode.steps, len(episode.pictures)]
         near = (np.abs(actions[alike] - actions[n]) <= SAME_ACTIONS).all(axis=1)

@@ -39,11 +39,12 @@ if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
 MAX_ACTION_WIDTH = 256
-"""Values of a field that is taken for an action by its name; wider ones are usually embeddings or flattened images. The
-fields `action` and `actions` themselves may be wider: they may hold the actions of several steps."""
+"""Largest number of values of a field that is taken for an action because of its name; wider ones are usually
+embeddings or flattened images. The fields `action` and `actions` themselves may be wider: they may hold the actions of
+several steps."""
 
 NOT_READ = "no camera"
-"""What pictures are called that are not read as such: LeRobot's depths and grey ones, robomimic's of other names."""
+"""What images are called that are not read as such: LeRobot's depth and grey images, robomimic's under other names."""
 
 BLANK_STD = 1.5
 """Grey levels: a frame that varies less over its pixels shows nothing (JPEG noise included)."""
@@ -54,7 +55,7 @@ class FieldFacts:
     """A field of the schema, by the key under which an entry would name it."""
 
     key: str
-    kind: str  # image, depth, number, list (of them, however long), bytes (that they are kept as), text or NOT_READ
+    kind: str  # image, depth, number, list (of numbers, of any length), bytes (numbers stored so), text or NOT_READ
     shape: tuple[int | None, ...]
     dtype: str
     per_step: bool  # False: once per episode
@@ -73,11 +74,11 @@ class CameraFacts:
     """One camera over the sampled frames."""
 
     key: str
-    sizes: tuple[tuple[int, int], ...]  # (height, width), all that occur
-    frames: int  # looked at
-    blank: int  # of those, frames that show one colour
-    still: bool  # no sampled episode's frames differ
-    undecodable: int = 0  # sampled episodes in which a frame of it cannot be decoded; others are read of them
+    sizes: tuple[tuple[int, int], ...]  # (height, width): all sizes that occur
+    frames: int  # frames that were decoded
+    blank: int  # of these, frames of one colour
+    still: bool  # in every sampled episode all frames are the same
+    undecodable: int = 0  # sampled episodes in which a frame of it cannot be decoded; their other cameras are read
     reason: str = ""  # why, in the first of these
 
     @property
@@ -115,7 +116,7 @@ class Facts:
     fields: tuple[FieldFacts, ...]
     splits: tuple[SplitFacts, ...]
     split: str
-    episodes: int  # readable ones of this split
+    episodes: int  # readable episodes of this split
     sampled: int
     bytes_read: int
     steps: tuple[int, ...]  # of every sampled episode
@@ -124,7 +125,7 @@ class Facts:
     actions: tuple[ActionFacts, ...]
     damaged: dict[str, int]  # reason -> episodes
     hz: float | None = None  # native rate, where the files say it
-    stopped: bool = False  # before all that were drawn were read: they come to too many bytes
+    stopped: bool = False  # stopped before all drawn episodes were read: they have too many bytes
 
 
 @dataclass(frozen=True)
@@ -146,12 +147,12 @@ def inspect_dataset(
     max_bytes: int = 2_000_000_000,
     action_keys: Sequence[str] = (),
 ) -> Sample:
-    """Facts of one split, example episodes, and fingerprints to find duplicates by.
+    """Facts of one split, example episodes, and fingerprints by which to find duplicates.
 
-    `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
-    each camera are decoded in the first `max_examples`, two in the others. Fields of numbers count as actions
-    if they are called so, or if an entry takes them as its `action_keys`. Damaged records are counted and
-    left out. A camera that cannot be decoded in an episode is counted as such, and the others are read.
+    Reads `episodes`, drawn by hash, or fewer if they exceed `max_bytes`; `frames` of each camera are decoded in the
+    first `max_examples`, two in the others. Fields of numbers count as actions if their name says so, or if an entry
+    uses them as its `action_keys`. Damaged records are counted and left out. A camera that cannot be decoded in an
+    episode is counted, and the others are read.
 
     Raises DataError for a directory that is no dataset or has no readable episode, ConfigError for an
     unknown split.
@@ -232,7 +233,7 @@ def _field(key: str, feature: FlatFeature) -> FieldFacts:
 
 
 def _require_steps(source: EpisodeSource, fields: Sequence[FieldFacts]) -> None:
-    """Raises DataError for records without a field of a step: these are no episodes."""
+    """Raises DataError for records without any field of a step: these are not episodes."""
     if not any(f.per_step for f in fields):
         keys = ", ".join(f.key for f in fields[:MAX_LISTED])
         raise DataError(
@@ -245,7 +246,7 @@ def _require_steps(source: EpisodeSource, fields: Sequence[FieldFacts]) -> None:
 
 
 class _SampleLog:
-    """Reads episodes one by one and keeps what the facts are made of."""
+    """Reads episodes one by one and keeps what is needed for the facts."""
 
     def __init__(
         self,
@@ -293,7 +294,7 @@ class _SampleLog:
 
 
 def _named(source: EpisodeSource, i: int) -> tuple[str, int]:
-    """(split, number in it) of an episode, also where several splits are read together ("train+val")."""
+    """(split, number in it) of an episode, also if several splits are read together ("train+val")."""
     number, before = int(source.numbers[i]), Counter[str]()
     for run in source.runs:
         if number < run.count:
@@ -310,7 +311,7 @@ def _read(source: EpisodeSource, i: int, cameras: dict, numbers: Sequence[str]) 
 
 
 def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence[str]) -> int:
-    """Steps of an episode. Raises ValueError when its fields disagree."""
+    """Number of steps of an episode. Raises ValueError if its fields disagree."""
     for key in (*cameras, *numbers):
         values = record[step_key(key)]
         if len(values) and isinstance(values, np.ndarray) != (key in numbers):
@@ -331,8 +332,8 @@ def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence
 
 
 def _look(record: dict, cameras: dict[str, _CameraLog], times: Sequence[int], where: str) -> dict[str, list]:
-    """The frames at `times` of every camera that can be decoded; the logs count those that cannot. An entry takes one
-    camera, whatever is wrong with the others. Raises EpisodeError where no camera can be decoded."""
+    """The frames at `times` of every camera that can be decoded; the logs count those that cannot. One broken camera is
+    no failure, since an entry takes only one. Raises EpisodeError if no camera can be decoded."""
     looked, failures = {}, {}
     for key, log in cameras.items():
         try:
@@ -356,7 +357,7 @@ class _CameraLog:
         self.still, self.reason = True, ""
 
     def look(self, encoded: Sequence[SourceFrame], times: Sequence[int], where: str) -> list[np.ndarray]:
-        """The decoded frames at `times`, noted. Raises EpisodeError for one that cannot be decoded."""
+        """The decoded frames at `times`; records their facts. Raises EpisodeError for one that cannot be decoded."""
         images = [self._decode(encoded[t], f"{where}: step {t} of {self._key}") for t in times]
         self.sizes |= {image.shape[:2] for image in images}
         self.frames += len(images)
@@ -367,7 +368,7 @@ class _CameraLog:
         return images
 
     def fail(self, error: EpisodeError) -> None:
-        """Notes an episode in which a frame cannot be decoded."""
+        """Records an episode in which a frame cannot be decoded."""
         self.undecodable += 1
         self.reason = self.reason or without_advice(str(error))
 

@@ -1,4 +1,4 @@
-"""What a person should know of a dataset before training on it: errors and warnings, in one sentence each."""
+"""What a person should know about a dataset before training on it: errors and warnings, in one sentence each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ MISFIT = "entry does not fit"
 
 @dataclass(frozen=True)
 class Issue:
-    """`error`: the data cannot be used as they are. `warning`: they can; somebody should decide whether they should."""
+    """`error`: the data cannot be used as they are. `warning`: they can be, but somebody should decide whether they
+    should."""
 
     severity: Literal["error", "warning"]
     title: str
@@ -43,7 +44,7 @@ def find_issues(
 
 
 def chosen_actions(facts: Facts, entry: DatasetSpec | None) -> list[ActionFacts]:
-    """The action fields that the entry takes, with the values it takes of them; without an entry all there are."""
+    """The action fields that the entry uses, with the values that it uses; without an entry all fields."""
     if entry is None:
         return list(facts.actions)
     by_key = {field.key: field for field in facts.actions}
@@ -68,7 +69,7 @@ def _damaged(facts: Facts) -> list[Issue]:
 
 
 def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
-    """What the entry names and the dataset lacks."""
+    """What the entry names but the dataset lacks."""
     if entry is None:
         return []
     sizes = {field.key: len(field.dimensions) for field in facts.actions}
@@ -85,7 +86,7 @@ def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
 
 
 def _rate(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
-    """Formats that say their rate say it of the recording; another one makes another stride of it."""
+    """Files that state a rate mean the rate of the recording; with another rate the stride would be another."""
     if entry is None or facts.hz is None or same_rate(facts.hz, entry.hz):
         return []
     return [Issue("warning", "another rate", f"its files say {facts.hz:g} Hz, but {entry.hz:g} Hz are used")]
@@ -167,7 +168,7 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Issue]:
 
 
 def _first_value(key: str, entry: DatasetSpec | None) -> int:
-    """Where the values of a chosen field (see `chosen_actions`) begin in the entry's action."""
+    """Position in the entry's action at which the values of a chosen field (see `chosen_actions`) begin."""
     return 0 if entry is None else sum(entry.action_dims[: entry.action_keys.index(key)])
 
 

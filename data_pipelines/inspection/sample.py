@@ -8,14 +8,14 @@ import numpy as np
 from PIL import Image
 
 HEIGHT = 240
-"""Pixels: larger frames are shrunk to this height."""
+"""Larger frames are shrunk to this height in pixels."""
 
 
 @dataclass(frozen=True)
 class ExampleEpisode:
     """An episode for a person to look at: a few frames of every camera, and its actions as recorded."""
 
-    index: int  # its number among all that its files should have
+    index: int  # its number among all episodes that the files should have
     steps: int
     success: bool | None
     instruction: str

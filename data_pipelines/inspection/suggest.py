@@ -31,7 +31,7 @@ NO_CAMERA = (
     "none of its fields is an image of 8 bits; write pictures that are stored as plain numbers as images "
     "(docs/own_data.md, Writing RLDS)"
 )
-"""Why a dataset without one is given no entry."""
+"""Why a dataset without a camera is given no entry."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class Suggestion:
     angles: tuple[int, ...] = ()
     angle_unit: AngleUnit = "radian"
     episodes: int = 0
-    mean_steps: float = 0.0  # of those that were read
+    mean_steps: float = 0.0  # of the episodes that were read
 
     @property
     def angle_form(self) -> AngleForm:
         return "sine_cosine" if self.angles else "as_recorded"
 
     def spec(self) -> DatasetSpec:
-        """As an entry. Raises ConfigError while the rate is missing."""
+        """The suggestion as an entry. Raises ConfigError while the rate is missing."""
         return DatasetSpec(
             self.name, self.image_key, self.action_keys, self.action_dims, self.hz,
             split=self.split, video_targets=self.video_targets, version=self.version,
@@ -97,16 +97,16 @@ class WindowFacts:
 
     frames: int
     stride: int
-    native: int  # native frames of a whole window
-    needed: int  # and of the shortest
+    native: int  # native frames that a whole window spans
+    needed: int  # native frames that the shortest window spans
     whole: int  # sampled episodes with a whole window
-    long_enough: int  # with any
+    long_enough: int  # sampled episodes with any window
     per_episode: float  # windows, over the sampled episodes
     total: float  # windows of the split, estimated
 
 
 def require_own_rate(facts: Facts) -> None:
-    """Raises ConfigError if no frames could be taken at the rate that the dataset's own files say."""
+    """Raises ConfigError if the rate that the dataset's own files say cannot be used."""
     if facts.hz is not None and facts.hz > MAX_STRIDE * FRAME_RATE:
         raise ConfigError(
             f"{facts.directory}: its own files say {facts.hz:g} native frames per second (those of RLDS as {RATE_KEY} "
@@ -115,7 +115,7 @@ def require_own_rate(facts: Facts) -> None:
 
 
 def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
-    """An entry for a dataset that the registry does not know; None when it has no camera at all."""
+    """An entry for a dataset that the registry does not know; None if it has no camera at all."""
     camera, why = choose_camera(facts.cameras)
     if camera is None:
         return None
@@ -139,7 +139,7 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
 
 
 def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, str]:
-    """The camera to use, and why: one that can be decoded, shows something and does not ride on the arm."""
+    """The camera to use, and why: one that can be decoded, shows something and is not mounted on the arm."""
     if not cameras:
         return None, "there is none"
     decoded = [c for c in cameras if c.frames] or cameras
@@ -196,7 +196,7 @@ def _why_no_action(facts: Facts) -> str:
 
 
 def _choose_angles(facts: Facts, keys: Sequence[str], dims: Sequence[int]) -> tuple[tuple[int, ...], AngleUnit]:
-    """Which of the chosen values wrap, counted over all keys, and in what unit: that of most of them."""
+    """The positions (over all keys) of the chosen values that wrap, and their unit: that of most of them."""
     by_key = {a.key: a for a in facts.actions}
     hints = [
         d.hint

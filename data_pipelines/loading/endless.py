@@ -1,4 +1,4 @@
-"""Endless batches in their order, made ahead by threads."""
+"""Endless batches in order, made ahead by threads."""
 
 from __future__ import annotations
 

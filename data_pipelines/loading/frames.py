@@ -30,7 +30,7 @@ from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4
-"""Frames of a batch that come from one episode: reading its record costs more than decoding a frame."""
+"""Number of frames in a batch that come from one episode: reading its record costs more than decoding a frame."""
 
 PREFETCH_BATCHES = 8
 """Batches that are prefetched, at least one per thread."""
@@ -53,9 +53,9 @@ def make_frame_loader(
     """Endless batches of frames, uint8 [B, image_size, image_size, 3].
 
     Datasets are drawn with p ∝ episodes^(1/tau), episodes and frames within them uniformly.
-    The episodes of a split are those that the token store has under the same `held_out`. `threads` (default: as many as
-    cores, up to 8) read and decode; they change no frame.
-    Raises ConfigError and DataError as `open_source` does.
+    The episodes of a split are those that the token store has with the same `held_out`. `threads` (default: one per
+    core, up to 8) read and decode; their number changes no frame. Raises ConfigError and DataError as `open_source`
+    does.
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     require(split in ("train", "val"), f"split must be 'train' or 'val', got {split!r}")
@@ -82,7 +82,7 @@ def make_frame_loader(
 
 
 def _why_none_held_out(spec: DatasetSpec, all_held_out: np.ndarray, readable: int, amount: HeldOut) -> str:
-    """Why none of the `readable` episodes is held out; `all_held_out`: bool of every episode, readable or not."""
+    """Why none of the `readable` episodes is held out; `all_held_out`: a bool for every episode, readable or not."""
     bound = (
         f"val_fraction={amount.val_fraction:g}, min_val={amount.min_val} and max_val={amount.max_val} set how many are"
     )
@@ -94,7 +94,7 @@ def _why_none_held_out(spec: DatasetSpec, all_held_out: np.ndarray, readable: in
 
 @dataclass(frozen=True)
 class FrameLoader(Iterator[np.ndarray]):
-    """Batches one after the other, and what each is made of."""
+    """Batches one after the other, and the episodes from which each is made."""
 
     batches: _FrameBatches
     iterator: Iterator[np.ndarray]
@@ -103,12 +103,12 @@ class FrameLoader(Iterator[np.ndarray]):
         return next(self.iterator)
 
     def describe(self, step: int) -> list[str]:
-        """The episodes that batch `step` (from 0 on) takes frames of: dataset, file and episode."""
+        """The episodes whose frames are in batch `step` (from 0 on): dataset, file and episode."""
         return self.batches.describe(step)
 
     def episodes(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """(dataset, drawn episode), numbers, int64 [B] each, of every frame of batch `step`: frames of one episode are
-        not independent. Under 'skip' a damaged episode keeps its number, though another is read in its place."""
+        """(dataset, drawn episode) of every frame of batch `step`, as numbers, int64 [B] each: frames of one episode
+        are not independent. Under 'skip' a damaged episode keeps its number, though another is read in its place."""
         return self.batches.episodes(step)
 
 
@@ -122,7 +122,7 @@ class _FrameStream:
     seed: int
 
     def read(self, i: int, draws: np.ndarray) -> list[np.ndarray]:
-        """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `EpisodeSource.frames`."""
+        """One frame of the i-th drawn episode for each number of `draws` (uint64); see `EpisodeSource.frames`."""
         at = self._drawn(i)
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
@@ -180,6 +180,6 @@ class _FrameBatches:
         return np.repeat(datasets, self.group), np.repeat(np.asarray(drawn, np.int64), self.group)
 
     def _chosen(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """(dataset, how many were drawn of it before) of every group."""
+        """(dataset, number of earlier draws from it) of every group."""
         groups = self.batch // self.group
         return self.draws.at(step * groups + np.arange(groups))

@@ -36,11 +36,10 @@ def make_loader(
 ) -> Iterator[dict[str, np.ndarray]]:
     """Endless batches from step `start_step` on.
 
-    A batch: `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C]; `actions` float32
-    [B, T, U] in raw units, zero-padded; `embodiment` int32 [B], index into `table`; `real` bool [B, T],
-    False for frames that only fill up a window of a short episode. `rows` are those of the
-    global batch that are wanted, in their order: each process of several takes its own
-    (`hma_jax.runtime.rows`). Each of the `threads` prefetches PREFETCH batches.
+    A batch: `tokens` int32 [B, T, S] or, for latents, float32 [B, T, S, C]; `actions` float32 [B, T, U] in raw units,
+    zero-padded; `embodiment` int32 [B], index into `table`; `real` bool [B, T], False for frames that only fill up a
+    window of a short episode. `rows`: the wanted rows of the global batch, in their order: each of several processes
+    takes its own (`hma_jax.runtime.rows`). Each of the `threads` prefetches PREFETCH batches.
 
     Raises ConfigError for unknown datasets or rows, DataError if no episode is long enough for one window.
     """
@@ -95,7 +94,7 @@ class _WindowBatches:
         return [self._streams[d].describe(at) for d, _, at in self._chosen(step)]
 
     def _chosen(self, step: int) -> Iterator[tuple[int, int, int]]:
-        """(dataset, how many were drawn of it before, window) of every row."""
+        """(dataset, number of earlier draws from it, window) of every row."""
         dataset, draw = self._draws.at(step * self._batch + self._rows)
         window = endless_shuffle(draw, self._lengths[dataset], self._seeds[dataset])
         return zip(dataset.tolist(), draw.tolist(), window.tolist(), strict=True)
@@ -112,7 +111,7 @@ class _WindowStream:
         self.action_seed = stream_seed(config.seed, "shuffled actions", windows.name)
 
     def describe(self, at: int) -> str:
-        """Window `at` for people: where it was read from."""
+        """Where window `at` was read from, for people to read."""
         episode, start = self.windows.locate(at)
         manifest = self.store.manifest(self.windows.name)
         number = manifest.train.episodes[episode]
@@ -133,7 +132,7 @@ class _WindowStream:
             episode, start = windows.locate(self._other(at, i))
             item = self.store.episode(windows.name, "train", episode)
         actions = slicer.chunks(item.actions, start, self.action_width)
-        if self.shuffle_actions:  # the chunks of a shorter window are repeated, so that every real frame has one
+        if self.shuffle_actions:  # the chunks of a shorter window are repeated, so that every real frame has a chunk
             actions = actions[np.arange(slicer.frames) % slicer.count_real(item, start)] * row["real"][:, None]
         return row | {"actions": actions}
 
@@ -145,6 +144,6 @@ class _WindowStream:
         first, end = self.windows.episode_range(at)
         n = len(self.windows)
         others = n - (end - first)
-        if others == 0:  # a single episode: at least not the same window
+        if others == 0:  # if there is a single episode: at least not the same window
             return at if n == 1 else (at + 1 + random_below(n - 1, i, self.action_seed)) % n
         return (end + random_below(others, i, self.action_seed)) % n

@@ -1,4 +1,4 @@
-"""What a run is trained on: which windows, how often each dataset's, and the statistics of their actions."""
+"""What a run is trained on: which windows, how often those of each dataset, and the statistics of their actions."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ so that a cap on trajectories does not change the weights."""
 
 @dataclass(frozen=True)
 class LoaderConfig:
-    """What determines the order of training windows."""
+    """The settings that determine the order of training windows."""
 
     frames: int = 12  # T
     batch: int = 64  # B, global
     tau: float = 3.0  # datasets are drawn with p ∝ windows^(1/tau)
-    seed: int = 0  # of the order and of the subset of trajectories
+    seed: int = 0  # random seed of the order and of the subset of trajectories
     max_trajectories: int | None = None  # per dataset
     capped: tuple[str, ...] = ()  # datasets to which max_trajectories applies; (): all of them
-    datasets: tuple[str, ...] = ()  # empty: all of the store
+    datasets: tuple[str, ...] = ()  # empty: all datasets of the store
     shuffle_actions: bool = False  # control: actions of another episode
-    rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
+    rate: float | None = FRAME_RATE  # frame rate in Hz; None: native
     weighed: Weighed = "used"
-    order: int = ORDER_VERSION  # part of the config, so that no run is continued in another order
+    order: int = ORDER_VERSION  # part of the config, so that no run continues in another order
 
     def __post_init__(self):
         require(self.frames >= 1, f"loader.frames must be at least 1, got {self.frames}")
@@ -54,24 +54,24 @@ class LoaderConfig:
 class Drawn:
     """What is drawn of one dataset."""
 
-    trajectories: int  # that windows are drawn of: of a subset, fewer than asked where some were skipped
+    trajectories: int  # those whose windows are drawn; fewer than asked for if some of a subset were skipped
     windows: int
     share: float  # of all windows drawn
 
     def passes(self, draws: int) -> float:
-        """How often each window is seen, on average, in a training run of so many windows."""
+        """How often each window is seen, on average, in a training run that draws this many windows."""
         return self.share * draws / self.windows if self.windows else 0.0
 
 
 @dataclass(frozen=True)
 class TrainingWindows:
-    """The windows a config draws from, and how often."""
+    """The windows that a config draws from, and the weights with which it draws."""
 
     sets: dict[str, WindowSet]
     mixture: Mixture
 
     def drawn(self) -> dict[str, Drawn]:
-        """By dataset, those of which nothing is drawn too."""
+        """By dataset, including those from which nothing is drawn."""
         shares = dict(zip(self.mixture.names, self.mixture.weights, strict=True))
         return {name: Drawn(len(s.episodes), len(s), shares.get(name, 0.0)) for name, s in self.sets.items()}
 
@@ -90,13 +90,13 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
     weighed = sets
     if config.weighed == "all" and config.max_trajectories is not None:
         weighed = {name: _windows(store, name, config, None) for name in names}
-    # Nothing can be drawn of a dataset whose trajectories under the cap were all skipped, whatever else it has.
+    # Nothing can be drawn from a dataset if all of its trajectories under the cap were skipped, whatever else it has.
     counts = {name: len(weighed[name]) if len(s) else 0 for name, s in sets.items()}
     return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.why_empty() for n, s in sets.items()}))
 
 
 def training_table(store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation") -> EmbodimentTable:
-    """The table of the datasets of `config`, in their order, with statistics of exactly the trajectories used."""
+    """The table of the datasets in `config`, in their order, with statistics of exactly the trajectories used."""
     names = config.datasets or store.names
     return EmbodimentTable(tuple(training_embodiment(store, name, config, scale) for name in names))
 
@@ -104,7 +104,7 @@ def training_table(store: TokenStore, config: LoaderConfig, scale: ActionScale =
 def training_embodiment(
     store: TokenStore, name: str, config: LoaderConfig, scale: ActionScale = "deviation"
 ) -> Embodiment:
-    """One entry of it. Raises what `Manifest.embodiment` raises."""
+    """One entry of `training_table`. Raises what `Manifest.embodiment` raises."""
     manifest, used = store.manifest(name), _windows(store, name, config, config.max_trajectories).episodes
     all_of_them = not len(used) or len(used) == len(manifest.train.episodes)
     if all_of_them or not manifest.spec.action_dim:

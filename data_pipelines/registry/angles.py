@@ -19,25 +19,26 @@ TURN: dict[AngleUnit, float] = {"radian": 2 * np.pi, "degree": 360.0, "turn": 1.
 
 
 RECOGNISED: tuple[AngleUnit, ...] = ("radian", "degree")
-"""Units of wrapping angles that are found in data. (An angle in turns cannot be told from a switch.)"""
+"""Units of wrapping angles that are found in data. (An angle in turns cannot be distinguished from a switch.)"""
 
 SWITCH_SHARE = 0.8
-"""A value that takes one of two numbers in at least this share of the steps is a switch, and no angle."""
+"""A value that takes one of two numbers in at least this share of the steps is a switch, not an angle."""
 
 
 def count_jumps(actions: np.ndarray, unit: AngleUnit) -> np.ndarray:
-    """int64 [2, A]: how often each value of an episode's actions [N, A] changes by more than half a turn from a step to
-    the next, and by more than 0.9 of one."""
+    """int64 [2, A]: how often each value of an episode's actions [N, A] changes from one step to the next by more than
+    half a turn, and by more than 0.9 of a turn."""
     changes = np.abs(np.diff(actions, axis=0)) / TURN[unit]
     return np.stack([(changes > 0.5).sum(0), (changes > 0.9).sum(0)])
 
 
 def find_turns(low: np.ndarray, high: np.ndarray, jumps: np.ndarray, unit: AngleUnit) -> np.ndarray:
-    """bool [A]: which values stay within one turn, about 0 or from 0 on, and jump from one end of it to the other.
+    """bool [A]: which values stay within one turn, centred at 0 or starting at 0, and jump from one end of it to the
+    other.
 
     `low`, `high` [A]: the smallest and the largest of each value; `jumps` [2, A]: the sum of `count_jumps` over
-    episodes. Noise of that range jumps by a whole turn too, but more often by less: what wraps moves by little or by
-    nearly a whole turn.
+    episodes. Noise in that range jumps by a whole turn too, but more often by less: a wrapping value moves by a little
+    or by nearly a whole turn.
     """
     turn = TURN[unit]
     near = 0.002 * turn
@@ -48,13 +49,13 @@ def find_turns(low: np.ndarray, high: np.ndarray, jumps: np.ndarray, unit: Angle
 
 
 def angle_lines(values: Sequence[int], unit: AngleUnit) -> str:
-    """What an entry says of such values, in words."""
+    """What an entry says about such values, in words."""
     also = "" if unit == "radian" else f' and angle_unit = "{unit}"'
     return f'angles = [{", ".join(map(str, values))}] and angle_form = "sine_cosine" (or "unwrapped"){also}'
 
 
 def angle_width(width: int, angles: Sequence[int], form: AngleForm) -> int:
-    """Values of an action of `width` recorded ones, of which `angles` are given as `form`."""
+    """Number of values of an action that was recorded with `width` values, if its `angles` are given as `form`."""
     return width + (len(angles) if form == "sine_cosine" else 0)
 
 

@@ -1,4 +1,5 @@
-"""Named lists of datasets: the official release's splits (reference section 5.4), and what is published of its forty.
+"""Named lists of datasets: the official release's splits (reference section 5.4), and those of its forty datasets that
+are published.
 
 `FORTY` is ordered such that its first 5, 10 and 20 are the release's own subsets. Its list of
 thirty holds one dataset that its forty lack; the thirty of `FORTY` are 29 of those and one more.
@@ -71,7 +72,7 @@ MIXTURES: dict[str, tuple[str, ...]] = {
     "dataset20": FORTY[:20],
     "dataset30": (*FORTY[:29], f"cmu_franka_exploration_dataset{_LONG}"),
     "dataset40": FORTY,
-    # What of the forty anybody can download as RLDS, under the names that its files have (docs/sweeps.md).
+    # Datasets of the forty that anybody can download as RLDS, under the names in their files (docs/sweeps.md).
     "dataset40_published": tuple(_PUBLISHED_AS.get(name, name) for name in FORTY if name not in _NOT_AS_RLDS),
     # The thirty of the released continuous model.
     "dataset30_vae": tuple(name for name in FORTY if name not in _NOT_FOR_VAE),
@@ -79,7 +80,7 @@ MIXTURES: dict[str, tuple[str, ...]] = {
 
 
 def get_mixture(name: str) -> tuple[str, ...]:
-    """The datasets of a named mixture. ConfigError, listing the names, when there is none."""
+    """The datasets of a named mixture. Raises ConfigError, listing the names, if there is none."""
     if name not in MIXTURES:
         raise ConfigError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     return MIXTURES[name]

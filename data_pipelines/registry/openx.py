@@ -1,12 +1,12 @@
 """Open X-Embodiment: the datasets of the paper's mixture that are published as RLDS.
 
-Sources: keys, dimensions, versions and what the values mean are those of the public features
-(the tfds catalog's pages, features.json of the published directories); rates are the control
-frequencies of the Open X-Embodiment dataset sheet. What neither confirms is `unverified`.
+Sources: keys, dimensions, versions and the meaning of values are those of the public features (the tfds catalog's
+pages, features.json of the published directories); rates are the control frequencies of the Open X-Embodiment dataset
+sheet. What neither confirms is `unverified`.
 
 The official release (reference sections 5.1 and 5.4) takes the first camera by name, all action fields
 in sorted order, and a rate from a table of its own; where that goes wrong, `DIFFERS:` says how.
-Flags that end an episode are no action: in the release they are part of it wherever they exist.
+Flags that end an episode are not part of the action here; in the release they are, wherever they exist.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def openx(
     unverified: str = "",
     angles: tuple[int, ...] = (),
 ) -> DatasetSpec:
-    """An entry in short: `action` maps keys to dimensions, `image` is a field of the observation.
+    """An entry in short form: `action` maps keys to dimensions, `image` is a field of the observation.
 
     `angles`, in radians, are given as sine and cosine.
     """
@@ -132,8 +132,8 @@ OPENX = (
           "simulated cloth: picker goal and command; 32x32 images"),
     # DIFFERS: the release appends terminate_episode (7 values).
     openx("berkeley_cable_routing", 10, DELTA_POSE, "Franka: velocities; of the rotation only z moves"),
-    # DIFFERS: the release takes the next 10 actions of each of three fields (30 + 10 + 30 values), and so
-    # gives every step its future; the action of a step is the first of each.
+    # DIFFERS: the release takes the next 10 actions of each of three fields (30 + 10 + 30 values), and so gives every
+    # step its future actions; the action of a step is the first of each field.
     openx("bc_z", 10,
           {"action/future/xyz_residual[:3]": 3, "action/future/axis_angle_residual[:3]": 3,
            "action/future/target_close[:1]": 1},

@@ -1,8 +1,8 @@
-"""How many episodes each published Open-X dataset has, and how long they are where anybody says so.
+"""How many episodes each published Open-X dataset has, and how long they are, where that is published.
 
-Episodes are those of the split `train` in the dataset_info.json of the published directories, as the
-tfds catalogue shows them too. No public file says how long the episodes are; where the number of
-steps of the whole dataset is published, its mean is given.
+Episodes are those of the split `train` in the dataset_info.json of the published directories, as the tfds catalogue
+shows them too. No public file says how long the episodes are; where the number of steps of the whole dataset is
+published, the mean per episode is given.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ EPISODES: dict[str, int] = {
 }  # fmt: skip
 
 STEPS: dict[str, int] = {"fractal20220817_data": 3_786_400, "language_table": 7_045_476}
-"""Steps of all episodes together."""
+"""Number of steps of all episodes together."""
 
 
 def mean_steps(name: str) -> float:
-    """Steps per episode to a tenth; 0: nobody says."""
+    """Mean steps per episode, to a tenth; 0: unknown."""
     return round(STEPS[name] / EPISODES[name], 1) if name in STEPS else 0.0

@@ -1,8 +1,7 @@
 """Open X-Embodiment: the datasets outside the paper's mixture for which the release knows a rate.
 
-Sources as in `openx`. Of the release's table (reference section 5.4) are left out the names that
-are no RLDS dataset anybody published: 1x_humanoid, frodobot, epic_kitchen_originalres and the
-variants of robomimic.
+Sources as in `openx`. Names in the release's table (reference section 5.4) that are not published RLDS datasets are
+left out: 1x_humanoid, frodobot, epic_kitchen_originalres and the variants of robomimic.
 """
 
 from __future__ import annotations

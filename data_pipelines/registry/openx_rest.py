@@ -1,8 +1,8 @@
 """Open X-Embodiment: the datasets of the tfds catalogue that the paper's mixture and the release's rates leave out.
 
-Sources as in `openx`. Not here are those of which no camera with its action can be read step by
-step: tidybot (its action is text), vima (pictures of varying number), robot_vqa (questions and answers) and
-robo_ai_u_r5e (nothing says what its action is).
+Sources as in `openx`. Left out are datasets whose camera and action cannot be read together step by step: tidybot (its
+action is text), vima (pictures of varying number), robot_vqa (questions and answers) and robo_ai_u_r5e (nothing says
+what its action is).
 """
 
 from __future__ import annotations

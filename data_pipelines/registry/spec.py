@@ -24,7 +24,7 @@ FRAME_RATE = 2.0
 
 
 MAX_STRIDE = 1_000_000
-"""Native frames per model frame: more than a recording has, and few enough to count with."""
+"""Largest number of native frames per model frame: more than any recording has, and small enough to compute with."""
 
 
 NOT_OF_ACTIONS = (
@@ -38,13 +38,13 @@ ImageCorrection = Literal["rotate_180", "swap_red_blue"]
 
 
 def stride_of(hz: float, rate: float | None) -> int:
-    """Native frames per model frame, at least 1: of the two integers around hz / rate the one nearer in ratio.
+    """Native frames per model frame, at least 1: of the two integers around hz / rate, the one that is nearer in ratio.
 
     Frames are then as near to `rate` Hz as possible: for 5 Hz and a rate of 2 the stride is 3 (1.67 Hz, off by a
     factor of 1.2), not 2 (2.5 Hz, 1.25). Both would be equally near at sqrt(n (n + 1)), which is irrational, so there
     are no ties. `rate` None is the native rate, stride 1.
-    DIFFERS: the release floors the ratio and knows a rate for 28 of its 40 datasets only;
-    the others run at their native rate (reference sections 5.3 and 5.4).
+    DIFFERS: the release rounds the ratio down, and knows a rate for only 28 of its 40 datasets; the others run at their
+    native rate (reference sections 5.3 and 5.4).
     """
     if rate is None:
         return 1
@@ -72,12 +72,12 @@ class DatasetSpec:
 
     Keys are fields of a step as features.json names them. The action is the concatenation of
     `action_keys` in their order; `action_dims` says how many values each has. `action[:7]` takes
-    the first seven values of a field, for fields whose rest is no action. Without any key the
-    dataset is video alone; with `video_targets` False its frames are shown but never predicted.
+    the first seven values of a field, for fields whose other values are not actions. Without any key the dataset has
+    video only; with `video_targets` False its frames are shown to the model but never predicted.
 
     `angles` are the values of the action, counted from 0 over all its keys, that are angles in
     `angle_unit` and wrap; `angle_form` says how they are given (see `angles`). They are part of the
-    action's layout: tokens made with other ones are other data.
+    action's layout: tokens made with other angle settings are different data.
     """
 
     name: str
@@ -85,24 +85,24 @@ class DatasetSpec:
     action_keys: tuple[str, ...]
     action_dims: tuple[int, ...]
     hz: float  # native rate of frames and actions
-    camera: str = ""  # for people, as what `facts` leaves out
+    camera: str = ""  # for people, like all fields that `facts` leaves out
     split: str = "train"
     note: str = ""
     video_targets: bool = True
-    version: str = ""  # of tfds, for which the keys were written
-    unverified: str = ""  # which of this entry's facts no public source confirms
+    version: str = ""  # version in tfds for which the keys were written
+    unverified: str = ""  # facts of this entry that no public source confirms
     rate: float | None = later(None)  # Hz at which its frames are shown, whatever the study's rate; None: the study's
-    angles: tuple[int, ...] = later(())  # values that wrap; data, as the next two
+    angles: tuple[int, ...] = later(())  # values that wrap; part of the data, like the next two fields
     angle_form: AngleForm = later("as_recorded")
     angle_unit: AngleUnit = later("radian")
-    # For people again; 0 where nobody says.
+    # For people again; 0: unknown.
     episodes: int = later(0)  # of `split`
     median_steps: float = later(0.0)  # of an episode
     mean_steps: float = later(0.0)
     val_split: str = later("")  # the part of `split` ("train+val") that is held out; "": episodes chosen by hash
-    # What is done to every frame that is read: for a camera that hangs upside down, or colours written as BGR.
+    # Applied to every frame that is read: for a camera that is mounted upside down, or colours written as BGR.
     image_corrections: tuple[ImageCorrection, ...] = later(())
-    # Datasets, by the names in their own files, that together are this one, in this order; (): it is one by itself.
+    # Datasets, by the names in their own files, that together make up this one, in this order; (): a single dataset.
     joins: tuple[str, ...] = later(())
 
     def __post_init__(self):
@@ -168,12 +168,12 @@ class DatasetSpec:
         return stride_of(self.hz, rate if self.rate is None else self.rate)
 
     def rate_for(self, stride: int) -> float:
-        """The rate, in Hz, that gives this stride, to six digits, which are enough."""
+        """The rate, in Hz, that gives this stride, rounded to six digits, which is accurate enough."""
         return float(f"{self.hz / stride:.6g}")
 
     def check_compatible(self, robot: Embodiment, rate: float | None) -> None:
-        """Raises ConfigError, saying what to change, unless a study at `rate` Hz has the actions of a frame as this
-        `robot` of a model has them."""
+        """Raises ConfigError, saying what to change, unless a study at `rate` Hz gives each frame the same actions as
+        this `robot` of a model has."""
         name = self.name
         again = "in a file for --registry (`hma data inspect --entry` writes one), and tokenise into another --out"
         if self.action_dim != robot.action_dim:
@@ -192,8 +192,8 @@ class DatasetSpec:
         self.check_layout(robot, f", {again}")
 
     def check_layout(self, robot: Embodiment, again: str = "") -> None:
-        """Raises ConfigError unless an action's values are those that this `robot` of a model has, in their order;
-        `again`: what is to be done besides."""
+        """Raises ConfigError unless an action's values are those of this `robot` of a model, in the same order;
+        `again`: what else the user must do."""
         if robot.layout and self.action_layout() != robot.layout:  # tables of earlier versions do not say
             raise ConfigError(
                 f"{self.name}: the action has other values, or another order of them, than when the model was "
@@ -207,7 +207,7 @@ class DatasetSpec:
     def action_layout(self) -> str:
         """A hash of the meaning and order of the action values; equal for equal layouts.
 
-        Covers all fields of the entry that have another value than the default, except those of `NOT_OF_ACTIONS`.
+        Covers all fields of the entry with a value other than the default, except those in `NOT_OF_ACTIONS`.
         """
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in NOT_OF_ACTIONS}
         defaults = {f.name: f.default for f in dataclasses.fields(self)}
@@ -215,11 +215,11 @@ class DatasetSpec:
 
     @property
     def action_dim(self) -> int:
-        """Values of one native action as the model is given it."""
+        """Number of values of one native action as the model receives it."""
         return angle_width(sum(self.action_dims), self.angles, self.angle_form)
 
     def convert(self, actions: np.ndarray) -> np.ndarray:
-        """float32 [N, action_dim]: the actions of an episode [N, sum(action_dims)], as the model is given them."""
+        """float32 [N, action_dim]: the actions of an episode [N, sum(action_dims)], as the model receives them."""
         return convert_angles(actions, self.angles, self.angle_form, self.angle_unit)
 
     @property
@@ -229,7 +229,8 @@ class DatasetSpec:
         return " ".join((self.image_key, *self.image_corrections))
 
     def correct(self, images: np.ndarray) -> np.ndarray:
-        """uint8 [..., H, W, 3]: frames of its camera, after `image_corrections`; without any the array itself."""
+        """uint8 [..., H, W, 3]: frames of its camera, after `image_corrections`; without corrections, the array
+        itself."""
         if "rotate_180" in self.image_corrections:
             images = images[..., ::-1, ::-1, :]
         if "swap_red_blue" in self.image_corrections:

@@ -15,7 +15,7 @@ from data_pipelines.registry.spec import DatasetSpec
 from hma_jax.config import ConfigError, require
 
 MAX_LISTED = 12
-"""Names in a message; `hma data list` shows all."""
+"""Number of names in a message; `hma data list` shows all."""
 
 NEW_DATASET = (
     "A new dataset needs an entry, in data_pipelines/registry/own.py or in a file given with --registry: `hma data "
@@ -27,7 +27,7 @@ _registered: dict[str, DatasetSpec] = {}
 
 
 def register(specs: Iterable[DatasetSpec]) -> None:
-    """Adds entries for the rest of this process. One with a known name takes its place."""
+    """Adds entries for the rest of this process. An entry with a known name replaces the known one."""
     _registered.update({spec.name: spec for spec in specs})
 
 
@@ -38,12 +38,12 @@ def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
 
 
 def all_specs() -> tuple[DatasetSpec, ...]:
-    """Every known dataset: one's own, Open-X, then the suite in its own order."""
+    """Every known dataset: the user's own, Open-X, then the suite in its own order."""
     return tuple(_table().values())
 
 
 def get_spec(name: str) -> DatasetSpec:
-    """The entry called `name`; ConfigError with the closest names otherwise."""
+    """The entry called `name`. Raises ConfigError, with the closest names, if there is none."""
     table = _table()
     if name in table:
         return table[name]
@@ -54,7 +54,7 @@ def get_spec(name: str) -> DatasetSpec:
 
 
 def describe_unknown(name: str) -> str:
-    """What to say of a name that no entry has: the closest ones, or some."""
+    """What to say about a name that no entry has: the closest names, or some."""
     table = _table()
     names = [*table, *(part for spec in table.values() for part in spec.joins)]
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
@@ -105,7 +105,7 @@ def _groups() -> dict[str, tuple[DatasetSpec, ...]]:
 
 
 def _suite() -> tuple[DatasetSpec, ...]:
-    from data_pipelines.suite.embodiments import EMBODIMENTS  # not needed to know the real ones
+    from data_pipelines.suite.embodiments import EMBODIMENTS  # not needed for the real datasets
     from data_pipelines.suite.spec import IMAGE_KEY
 
     return tuple(

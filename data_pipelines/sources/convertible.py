@@ -1,7 +1,7 @@
 """Sources that can be converted: read unit by unit, in order, each unit giving some whole episodes.
 
-A unit is what a format reads at a time: a demonstration, an episode, a video. Owns what these formats have in
-common. (Units of measurement of actions are not meant.)
+A unit is what a format reads at a time: a demonstration, an episode, a video (not a unit of measurement). Owns what
+these formats have in common.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Skipped:
 
 
 class ConvertibleSource(Protocol):
-    """An opened source. Its settings and `units` determine every byte that is written."""
+    """An opened source. Every byte that is written follows from its settings and `units`."""
 
     layout: Layout
     hz: float
@@ -85,7 +85,7 @@ class ConvertibleSource(Protocol):
     units: Sequence[str]
 
     def identity(self) -> dict[str, Any]:
-        """JSON values that differ for another source or other settings."""
+        """JSON values that are different for another source or other settings."""
         ...
 
     def read(self, unit: int) -> Iterator[Episode | Skipped]:
@@ -94,7 +94,8 @@ class ConvertibleSource(Protocol):
 
 
 def require_module(name: str, needed_by: str = "this format") -> ModuleType:
-    """An optional library of the extra `convert`; ConfigError that says what needs it and how to get it."""
+    """An optional library of the extra `convert`. Raises ConfigError, saying what needs it and how to install it, if it
+    is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -105,7 +106,7 @@ def require_module(name: str, needed_by: str = "this format") -> ModuleType:
 
 
 def choose(wanted: Sequence[str], available: Sequence[str], what: str, where: str) -> tuple[str, ...]:
-    """`wanted`, or all that are available if none is wanted; ConfigError for one that is not available."""
+    """`wanted`, or all that are available if none is given. Raises ConfigError for one that is not available."""
     missing = [name for name in wanted if name not in available]
     if missing:
         raise ConfigError(

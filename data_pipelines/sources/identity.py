@@ -1,7 +1,7 @@
 """Names of episodes that do not depend on other episodes: the file's name, and the position in the file.
 
-Owns names as numbers. Splits and subsets hash them, so that an episode stays in its split when others are damaged,
-missing or skipped.
+Owns these names and the numbers made from them. Splits and subsets hash the numbers, so an episode stays in its split
+if others are damaged, missing or skipped.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from data_pipelines.errors import DataError
 class EpisodeRun:
     """The episodes at positions `first`, ..., `first + count - 1` of one file, readable or not."""
 
-    file: str  # its name, without a directory; in a joined dataset that of the part and a slash before it
+    file: str  # its name without a directory; in a joined dataset preceded by the part's name and a slash
     first: int
     count: int
-    split: str = ""  # of the files', where several are read together ("train+val")
+    split: str = ""  # the files' split, if several are read together ("train+val")
 
 
 def runs_of_parts(runs: Sequence[EpisodeRun]) -> dict[str, list[EpisodeRun]]:
-    """The runs of each part of a joined dataset, in order, as they are named in the part alone. Those of a dataset that
-    is not joined belong to ''."""
+    """The runs of each part of a joined dataset, in order, with the names that they have in the part alone. Runs of a
+    dataset that is not joined belong to ''."""
     parts: dict[str, list[EpisodeRun]] = {}
     for run in runs:
         part, _, file = run.file.rpartition("/")
@@ -38,7 +38,7 @@ def runs_of_parts(runs: Sequence[EpisodeRun]) -> dict[str, list[EpisodeRun]]:
 def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:
     """uint64 per episode: the first 8 bytes of the SHA-256 of the file's name, plus the position in the file.
 
-    Raises DataError for two episodes of one name.
+    Raises DataError for two episodes with the same name.
     """
     pieces = [np.zeros(0, np.uint64)]
     for run in runs:

@@ -1,6 +1,6 @@
 """Several datasets as one `EpisodeSource`: the recordings of one robot in several directories, of any formats.
 
-Owns what holds for all parts together: the order of their episodes, their names, the limit of damaged ones. An episode
+Owns what holds for all parts together: the order and names of their episodes, and the limit on damaged ones. An episode
 is named by its part and by its name there, so that it keeps its name whatever else is joined.
 """
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parts:
-    """Where the parts of a joined dataset lie, in the order of its entry."""
+    """Locations of the parts of a joined dataset, in the order of its entry."""
 
-    name: str  # of the joined dataset
+    name: str  # name of the joined dataset
     places: tuple[Location, ...]
 
 
@@ -95,7 +95,7 @@ class JoinedSource(EpisodeSource):
         return part.record(own, keys)
 
     def check_keys(self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None) -> None:
-        """As `EpisodeSource.check_keys`, of every part."""
+        """Like `EpisodeSource.check_keys`, for every part."""
         for n, part in enumerate(self.parts):
             try:
                 part.check_keys(image_key, action_keys, action_dims)
@@ -109,13 +109,13 @@ class JoinedSource(EpisodeSource):
                 ) from error
 
     def without_location(self, reason: str) -> str:
-        """With the name of the part in place of where it lies."""
+        """`reason` with the name of the part in place of its location."""
         for part in sorted(self.parts, key=lambda part: len(str(part.location)), reverse=True):
             reason = reason.replace(str(part.location), part.name) if part.location.name else reason
         return reason
 
     def _part(self, i: int) -> tuple[EpisodeSource, int]:
-        """The part that episode `i` is in, and its position there."""
+        """The part that contains episode `i`, and the episode's position there."""
         if not 0 <= i < len(self):
             raise IndexError(f"{self.name}: episode {i} of {len(self)}")
         k = int(np.searchsorted(self._ends, i, side="right"))

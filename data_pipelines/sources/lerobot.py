@@ -3,8 +3,8 @@
 Row t of an episode was recorded at t / fps seconds; its camera frame is the one that the video
 shows at the row's timestamp (plus, in 3.0, the time at which the episode begins in its file).
 Cameras become `observation/<name>`, other numeric features vectors: `observation/<name>`, `action`
-or whatever they are called; texts follow `task_index`. Success is the last `next.success`, where there is one.
-Depth and grey cameras are not read; `unsupported_images` lists them with their shapes.
+or their own names; texts follow `task_index`. Success is the last `next.success`, where there is one. Depth and grey
+cameras are not read; `unsupported_images` lists them with their shapes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
 PICTURES = ("video", "image")
 NO_VECTORS = {"index", "episode_index", "frame_index", "task_index", "timestamp", *STEP_FIELDS}
-"""Features that count rows, and names that steps have for something else."""
+"""Features that count rows, and names that steps use for something else."""
 
 EPISODE, TIME, TASK, SUCCESS, REWARD = "episode_index", "timestamp", "task_index", "next.success", "next.reward"
 
@@ -82,14 +82,14 @@ class LeRobotSource:
             "files": sizes,
             "cameras": list(self.cameras),
             "short_side": self.short_side,
-            # Conversions by earlier versions lack or do not count these, so they are other ones.
+            # Earlier versions' conversions lack or do not count these, so their identity is different.
             **({"others": others} if others else {}),
             **({"lost": self._lost} if self._lost else {}),
         }
 
     @property
     def _lost(self) -> int:
-        """Episodes that the meta folder does not list, though it should."""
+        """Episodes that the meta folder should list but does not."""
         return self.meta.stated - len(self.units) if self.meta.lost_why else 0
 
     def read(self, unit: int) -> Iterator[Episode | Skipped]:
@@ -115,14 +115,14 @@ class LeRobotSource:
         )
 
     def rows(self, entry: EpisodeEntry, columns: Iterable[str]) -> Any:
-        """The episode's rows, in order: when, and those of `columns` that the file has."""
+        """The episode's rows, in order: their times, and those of `columns` that the file has."""
         with _as_units():
             first, count = self._locate(entry, columns := list(columns))
             available = self._tables.columns(entry.data)
             return self._tables.read(entry.data, [TIME, *(n for n in columns if n in available)], first, count)
 
     def image(self, entry: EpisodeEntry, camera: str, n: int, where: str) -> bytes:
-        """Frame `n` of a camera whose images the table holds or names."""
+        """Frame `n` of a camera whose images are in the table or in files that it names."""
         with _as_units():
             first, _ = self._locate(entry, ())
             self._check_camera(entry, camera, where)
@@ -131,7 +131,7 @@ class LeRobotSource:
 
     @property
     def loaded(self) -> int:
-        """Bytes of tables that were read so far, of whole groups of rows."""
+        """Bytes of tables that were read so far; whole row groups are read."""
         return self._tables.loaded
 
     def _locate(self, entry: EpisodeEntry, columns: Sequence[str]) -> tuple[int, int]:
@@ -200,7 +200,7 @@ class LeRobotSource:
         return rows.reshape(len(rows), -1)
 
     def success(self, table: Any, where: str) -> bool | None:
-        """Success by the episode's last row; None where it does not say."""
+        """Success as the episode's last row says; None if it does not say."""
         if SUCCESS not in table.column_names:
             return None
         last = self.numbers(table, SUCCESS, where)[-1]
@@ -219,7 +219,8 @@ class LeRobotSource:
 
 @contextmanager
 def _as_units() -> Iterator[None]:
-    """A file that is missing or damaged is damage of the episode that is read; one that cannot be read is not."""
+    """A missing or damaged file counts as damage of the episode that is being read; a file that cannot be read does
+    not."""
     try:
         yield
     except (UnreachableError, UnitError):
@@ -239,7 +240,7 @@ def _is_vector(key: str, feature: dict[str, Any]) -> bool:
 
 
 def _check_names(features: Mapping[str, dict[str, Any]], path: Path) -> None:
-    """Raises DataError for two features that would be called the same, so that one would hide the other."""
+    """Raises DataError for two features that would get the same name, so that one would hide the other."""
     named: dict[str, str] = {}
     for key, feature in features.items():
         if not _is_camera(feature) and not _is_vector(key, feature):

@@ -39,7 +39,7 @@ from data_pipelines.sources.video import open_video
 from hma_jax.config import require
 
 LISTINGS = 16
-"""Folders that are listed at a time."""
+"""Number of folders that are listed at a time."""
 
 
 class LeRobotDataset(EpisodeSource):
@@ -74,7 +74,7 @@ class LeRobotDataset(EpisodeSource):
         self._vectors = {step_key(k): name for k, name in self._read.vectors.items()}
         self.features = self._read.layout.flat_features(self._read.unsupported_images)
         listed = np.asarray([e.index for e in self._entries], np.int64)
-        if meta.lost_why:  # the lost ones are named too, so that every other one stays where it is in the hold-out
+        if meta.lost_why:  # lost ones are named too: the hold-out of the others stays the same
             self.runs, self._numbers = (EpisodeRun("episodes", 0, meta.stated),), listed
             self.count_skipped(meta.lost_why, meta.stated - len(listed))
         else:
@@ -96,8 +96,8 @@ class LeRobotDataset(EpisodeSource):
         return self._read.hz
 
     def fingerprint(self) -> str:
-        """Hash over what is read of the meta folder, with the statistics of single episodes, and all files' names and
-        sizes. Texts and statistics of the whole dataset may change."""
+        """Hash over what is read from the meta folder, including statistics of single episodes, and over the names and
+        sizes of all files. Texts and statistics of the whole dataset may change without changing it."""
         return self._fingerprint
 
     @functools.cached_property
@@ -105,7 +105,7 @@ class LeRobotDataset(EpisodeSource):
         return self._with_sizes(hash_episodes(self.location, self._read.meta))
 
     def former_fingerprint(self) -> str:
-        """Over all files of the meta folder."""
+        """The hash of earlier versions: over all files of the meta folder."""
         return self._with_sizes(hash_meta(self.location))
 
     def _with_sizes(self, digest: Any) -> str:
@@ -125,7 +125,7 @@ class LeRobotDataset(EpisodeSource):
         return self._open(i, image_key, action_keys, with_success=self._read.layout.knows_success)
 
     def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
-        """As `EpisodeSource.frames`; those of a video are read without the episode's table."""
+        """Like `EpisodeSource.frames`; frames of a video are read without the episode's table."""
         with self._open(i, image_key, (), with_success=False) as episode:
             return episode.images(choose)
 
@@ -248,7 +248,7 @@ def _runs(numbers: np.ndarray) -> tuple[EpisodeRun, ...]:
 
 
 def _sizes(paths: Sequence[Path]) -> dict[Path, int]:
-    """0 for one that is missing: its episodes cannot be read, as reading them says. Folders are listed at a time, since
+    """0 for a missing file: its episodes cannot be read, and reading them reports it. Whole folders are listed, since
     on a network drive asking for each file takes minutes."""
     folders = sorted({path.parent for path in paths})
     with ThreadPoolExecutor(LISTINGS, "sizes") as pool:

@@ -29,13 +29,14 @@ MAX_COUNT = 10**9
 """Largest accepted episode index, episode length, chunk or task index, and number of values of a feature."""
 
 MAX_LOST = 10**6
-"""How many episodes may be missing from the list: each is named, in 8 bytes, so that the others stay where they are in
-the hold-out."""
+"""How many episodes may be missing from the list: each is named, in 8 bytes, so that the others keep their place in or
+out of the hold-out."""
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode: its number, its length, its table, and per camera a video and where it begins."""
+    """One episode: its number, its length, its table, and for each camera a video and the time at which the episode
+    begins."""
 
     index: int
     length: int
@@ -48,7 +49,7 @@ class EpisodeEntry:
 class LeRobotMeta:
     """`features` as info.json has them; `tasks` by task_index.
 
-    `stated`: the number of episodes that info.json says. `lost_why`: the message if fewer are listed, else "".
+    `stated`: the number of episodes according to info.json. `lost_why`: the message if fewer are listed, else "".
     `may_lose`: whether the listed numbers show which ones are lost, and these are at most MAX_LOST.
     """
 
@@ -81,8 +82,8 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def read_meta(root: Path) -> LeRobotMeta:
-    """Raises DataError, naming file and field, for what is missing, damaged or of another version. What was read is
-    kept while no file of the folder changes: a command opens a dataset several times."""
+    """Reads the meta folder. Raises DataError, naming file and field, for what is missing, damaged or of another
+    version. The result is cached until a file of the folder changes: a command opens a dataset several times."""
     files = retry(root, lambda: [(p, p.stat()) for p in sorted((root / "meta").rglob("*")) if p.is_file()])
     return _read_meta(root, tuple((path, stat.st_mtime_ns, stat.st_size) for path, stat in files))
 
@@ -120,7 +121,7 @@ def _read_meta(root: Path, stamp: tuple[tuple[Path, int, int], ...]) -> LeRobotM
 
 
 def hash_meta(root: Path) -> hashlib._Hash:
-    """SHA-256, to be added to, of the names and contents of all files of the meta folder.
+    """SHA-256, to which more can be added, of the names and contents of all files of the meta folder.
 
     Hidden ones are left out: file managers and editors write them (.DS_Store, .info.json.swp).
     """
@@ -133,9 +134,9 @@ def hash_meta(root: Path) -> hashlib._Hash:
 
 
 def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
-    """SHA-256, to be added to, of what is read of the meta folder: the rate, the features, and of every episode its
-    place, its length and its statistics, which no reader needs but which change with its actions and images. Where
-    single episodes have none, those of the whole dataset stand for them."""
+    """SHA-256, to which more can be added, of what is read from the meta folder: the rate, the features, and for every
+    episode its place, length and statistics. No reader needs the statistics, but they change with the episode's actions
+    and images. If single episodes have none, those of the whole dataset are used."""
 
     def place(path: Path) -> str:
         return path.relative_to(root).as_posix()
@@ -183,7 +184,7 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
     columns += [column for group in fields.values() for column in group]
     entries = []
     for path in sorted(folder.glob("*/*.parquet")):
-        table = read_table(path, [*columns, "tasks"])  # beside them stand statistics, which take far more
+        table = read_table(path, [*columns, "tasks"])  # the same tables hold statistics, which take far more memory
         missing = [c for c in columns if c not in table.column_names]
         if missing:
             raise DataError(f"{path}: no column {quote(missing[0])}. {ADVICE}")
@@ -226,7 +227,7 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
 def _rows(table: Any, path: Path) -> list[dict[str, Any]]:
     try:
         return table.to_pylist()
-    except ValueError as error:  # texts that are none; of pyarrow's errors most are ValueErrors too
+    except ValueError as error:  # texts that are not text; most of pyarrow's errors are ValueErrors too
         raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
 
 
@@ -249,7 +250,7 @@ def _format_path(root: Path, info: dict[str, Any], field: str, **values: Any) ->
 
 
 def _check_info(info: dict[str, Any], path: Path) -> None:
-    """Raises DataError for a field of info.json of the wrong kind."""
+    """Raises DataError for a field of info.json that has the wrong type."""
     fps, features = info["fps"], info["features"]
     if type(fps) not in (int, float) or not 0 < fps <= MAX_COUNT:
         raise DataError(f"{path}: fps is {quote(fps)}, not a rate. {ADVICE}")

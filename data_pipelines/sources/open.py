@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 
 class Format(NamedTuple):
-    """How a format is read: its episodes; its name, its rate in Hz and its size (None: not said) without a look at
-    these."""
+    """How a format is read: its episodes; and, without reading these, its name, its rate in Hz and its size (None: not
+    stated)."""
 
     source: Callable[..., EpisodeSource]
     name: Callable[[Location], str]
@@ -58,7 +58,7 @@ HDF5 = (".hdf5", ".h5")
 def find_format(location: str | Location) -> str:
     """One of FORMATS, by the files at `location`; 'rlds' for every other URL.
 
-    Raises as `resolve_version` for a path on a disk that is no dataset, and says what may have been meant.
+    For a path on a disk that is not a dataset, raises as `resolve_version` does, and says what may have been meant.
     """
     place = locate(location)
     found = _signs(place)
@@ -84,7 +84,7 @@ def find_format(location: str | Location) -> str:
 
 
 def _signs(place: Location) -> str:
-    """The format that the files at `place` have signs of, 'rlds' if there are none."""
+    """The format that the files at `place` show signs of; 'rlds' if there are none."""
     if place.suffix in HDF5 and (is_remote(place) or place.is_file()):
         return "robomimic"
     return "lerobot" if (place / "meta" / "info.json").is_file() else "rlds"
@@ -99,7 +99,7 @@ def _holds_tokens(place: Path) -> bool:
 
 
 def _meant(place: Path) -> str:
-    """The end of a message about a path that is no dataset: what to give instead, or what is missing there."""
+    """The end of a message about a path that is not a dataset: what to give instead, or what is missing there."""
     try:
         if not place.is_dir():
             others = [p.name for p in place.parent.iterdir() if p.name != place.name]
@@ -142,7 +142,7 @@ def open_source(
     """
     if isinstance(location, Parts):
         files = OpenFiles() if files is None else files
-        own = sys.maxsize  # the limit is of all parts together
+        own = sys.maxsize  # the limit applies to all parts together
         parts = [open_source(p, split, corrupt=corrupt, max_skipped=own, files=files) for p in location.places]
         return JoinedSource(location.name, parts, corrupt, max_skipped)
     source = FORMATS[find_format(location)].source
@@ -151,20 +151,22 @@ def open_source(
 
 
 def read_rate(location: Location | Parts) -> float | None:
-    """Native frames per second, as the files of a dataset say, or those of the first of `Parts` that do; None where
-    none does. No episode is looked for, which may take hours. Raises DataError for a location that is no dataset."""
+    """Native frames per second, as stated by the files of a dataset, or of the first of `Parts` that states it; None if
+    none does. Does not search for episodes, which may take hours. Raises DataError for a location that is not a
+    dataset."""
     places = location.places if isinstance(location, Parts) else (location,)
     rates = (FORMATS[find_format(place)].hz(place) for place in places)
     return next((hz for hz in rates if hz is not None), None)
 
 
 def read_size(location: str | Location, split: str) -> SourceSize | None:
-    """The size of one split of the dataset at `location`, or of several as "train+val"; None where its files do not say
-    it. Raises DataError for a location that is no dataset and for damaged metadata, ConfigError for a library that is
-    missing."""
+    """The size of one split of the dataset at `location`, or of several ("train+val"); None if its files do not state
+    it. Raises DataError for a location that is not a dataset and for damaged metadata, ConfigError for a missing
+    library."""
     return FORMATS[find_format(location)].size(locate(location), split)
 
 
 def source_name(location: str | Location) -> str:
-    """The name of the dataset at `location`, by which the registry knows it. Raises DataError for none."""
+    """The name of the dataset at `location`, by which the registry knows it. Raises DataError if there is no
+    dataset."""
     return FORMATS[find_format(location)].name(locate(location))

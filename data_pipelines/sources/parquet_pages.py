@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 MAX_UNCOMPRESSED = 32 * 2**20
-"""Bytes of any page, uncompressed. Writers aim at 1 MB, but check the size after every thousand rows only."""
+"""Largest number of bytes of a page, uncompressed. Writers aim at 1 MB, but check the size after every thousand rows
+only."""
 
 MAX_COMPRESSION_RATIO = 8
 """A page may exceed MAX_UNCOMPRESSED up to this ratio to its compressed size: a thousand images hardly compress."""

@@ -1,4 +1,4 @@
-"""Rows of Parquet files, of which only the columns and row groups are read that hold what is asked for.
+"""Rows of Parquet files. Only the columns and row groups that hold what is asked for are read.
 
 Owns the cache of decoded columns. A row group is the smallest part of a column that can be read; writers make one
 per episode, per hundred images or per file.
@@ -116,7 +116,7 @@ class ParquetRows:
 
 
 def read_table(path: Path, columns: Collection[str]) -> Any:
-    """All rows of a file, as a pyarrow table of those of `columns` that it has. Raises what `ParquetRows` does."""
+    """All rows of a file, as a pyarrow table with those of `columns` that it has. Raises what `ParquetRows` raises."""
     from pyarrow import parquet
 
     def read() -> Any:
@@ -125,7 +125,7 @@ def read_table(path: Path, columns: Collection[str]) -> Any:
             check_pages(file, [chunk for group in groups for name in columns for chunk in group.columns.get(name, ())])
         with parquet.ParquetFile(path) as file:
             table = file.read(columns=list(columns))
-        table.column_names  # noqa: B018  that they are text is found out here
+        table.column_names  # noqa: B018  fails here if they are not text
         return table
 
     return _reading(path, read)

@@ -1,13 +1,12 @@
 """Robomimic demonstrations: one HDF5 file of `data/demo_*`, with camera images.
 
-Per demonstration of N steps: `actions` [N, A], `obs/<camera>_image` uint8 [N, H, W, 3] before each
-action (where none has that ending, as in LIBERO's files, `obs/<camera>` of that kind), other `obs/*`
-as vectors, `states` of the simulator, `rewards` and `dones` [N].
-`mask/<key>` names demonstrations, such as the training ones (`train`, `valid`). The rate is the
-environment's `control_freq`: 20 Hz for every task that was published.
-DIFFERS: the release takes states only, renders them at 128 pixels, calls the rate 6 Hz, and has a
-held-out split of one task (reference sections 5.4 and 5.5); here episodes keep their images, state
-and rate, and the held-out ones are drawn by hash.
+Per demonstration of N steps: `actions` [N, A], `obs/<camera>_image` uint8 [N, H, W, 3] before each action (if none has
+that ending, as in LIBERO's files, `obs/<camera>` of that shape), other `obs/*` as vectors, `states` of the simulator,
+`rewards` and `dones` [N]. `mask/<key>` names demonstrations, such as the training ones (`train`, `valid`). The rate is
+the environment's `control_freq`: 20 Hz for every published task.
+DIFFERS: the release uses only states, renders them at 128 pixels, calls the rate 6 Hz, and has a held-out split of one
+task (reference sections 5.4 and 5.5); here episodes keep their images, state and rate, and the held-out ones are drawn
+by hash.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ ADVICE = (
 
 
 DAMAGE_ERRORS = (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError)
-"""What h5py raises for a damaged file; AttributeError for a group in place of an array, or the reverse."""
+"""What h5py raises for a damaged file; AttributeError: for a group in place of an array, or the reverse."""
 
 
 class RobomimicSource:
@@ -60,7 +59,7 @@ class RobomimicSource:
         self.path, self.short_side = Path(path), settings.short_side
         with self.open() as file, damage_as(str(path), DataError):
             self.task, self.recorded_hz = _environment(self.path, file)
-            self.masks = _demonstrations(self.path, file, settings.filter_key)  # of each demonstration
+            self.masks = _demonstrations(self.path, file, settings.filter_key)  # the mask of each demonstration
             self.units = list(self.masks)
             self.layout, self.cameras, self.ending, self.unsupported_images = self._read_layout(
                 file["data"][self.units[0]], settings.camera
@@ -81,14 +80,14 @@ class RobomimicSource:
 
     @functools.cached_property
     def content(self) -> str:
-        """Hash over the name, actions and first image of each camera of every demonstration. The file's size does not
-        suffice: images rendered again from the same states take as many bytes."""
+        """Hash over the name, actions and first image of each camera of every demonstration. The file's size is not
+        enough: images rendered again from the same states take the same number of bytes."""
         digest = hashlib.sha256()
         with self.open() as file:
             for name in self.units:
                 digest.update(f"{name}:".encode())
                 where = f"{self.path}: data/{name}"
-                with suppress(UnitError), damage_as(where):  # reading the demonstration says what is wrong
+                with suppress(UnitError), damage_as(where):  # reading the demonstration reports what is wrong
                     rows = read_rows(file["data"][name], "actions", where)
                     digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
                     for camera in self.cameras:
@@ -134,10 +133,10 @@ class RobomimicSource:
     def _read_layout(
         self, demo: Any, wanted: tuple[str, ...]
     ) -> tuple[Layout, tuple[str, ...], str, dict[str, tuple[int, ...]]]:
-        """(fields, cameras, the ending of their fields' names, unsupported images with their shapes: those of other
+        """(fields, cameras, the ending of their fields' names, unsupported images with their shapes: those with other
         names, and depth images)."""
         where = f"{self.path}: {demo.name.lstrip('/')}"
-        obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # groups are none of robomimic's
+        obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # robomimic writes no groups here
         ending = "_image" if any(k.endswith("_image") for k in obs) else ""
         available = sorted(k.removesuffix(ending) for k in obs if k.endswith("_image"))
         if not ending:  # as in LIBERO's files, agentview_rgb
@@ -155,7 +154,7 @@ class RobomimicSource:
         for key in sorted(obs):
             if np.dtype(obs[key].dtype).kind == "f" and obs[key].ndim <= 2:
                 vectors[f"observation/{key}"] = int(np.prod(obs[key].shape[1:]))
-        states = demo.get("states")  # of other programs' files a group
+        states = demo.get("states")  # a group in other programs' files
         if getattr(states, "ndim", 0) == 2 and states.shape[1]:
             vectors["observation/sim_state"] = int(states.shape[1])
         images = {f"observation/{c}": image_field(None, None) for c in cameras}
@@ -166,14 +165,14 @@ class RobomimicSource:
 
 
 def read_environment(path: Path) -> tuple[str, float | None]:
-    """(task, Hz or None), without a look at the demonstrations. Raises DataError for another file."""
+    """(task, Hz or None), without reading the demonstrations. Raises DataError for a file of another kind."""
     with _open_file(path) as file, damage_as(str(path), DataError):
         return _environment(path, file)
 
 
 def read_totals(path: Path, split: str) -> tuple[int, int | None]:
-    """(demonstrations of `split`, steps of all of them or None), without a look at them. Raises DataError for another
-    file, ConfigError for an unknown mask."""
+    """(number of demonstrations in `split`, their total steps or None), without reading them. Raises DataError for a
+    file of another kind, ConfigError for an unknown mask."""
     with _open_file(path) as file, damage_as(str(path), DataError):
         whole = split == "train"
         steps = file["data"].attrs.get("total") if whole else None
@@ -203,8 +202,8 @@ def _open_file(path: Path) -> Any:
 
 @contextmanager
 def damage_as(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
-    """Raises `DAMAGE_ERRORS` of the block as `kind`, those of a failing disk as UnreachableError. Only for blocks that
-    read the file: errors of a caller would be taken for damage."""
+    """Raises `DAMAGE_ERRORS` of the block as `kind`, and errors of a failing disk as UnreachableError. Use it only for
+    blocks that read the file: other errors would be taken for damage."""
     try:
         yield
     except (DataError, ConfigError):
@@ -238,8 +237,8 @@ def read_rows(demo: Any, key: str, where: str, rows: slice = slice(None)) -> np.
 def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | None:
     """Whether a demonstration reached its goal; None if the file does not say.
 
-    By its rewards where it has them: `dones` also marks the end of a failed demonstration when a
-    file was extracted with `--done_mode 1` or 2.
+    By its rewards if it has them: `dones` also marks the end of a failed demonstration if the file was extracted with
+    `--done_mode 1` or 2.
     """
     if rewards is not None:
         return bool(np.max(rewards, initial=0) >= SUCCESS_REWARD)
@@ -255,14 +254,14 @@ def _env_args(path: Path, text: Any) -> dict[str, Any]:
         return {}
     try:
         args = json.loads(text)
-    except (ValueError, TypeError) as error:  # the latter of an attribute that is no text
+    except (ValueError, TypeError) as error:  # the latter for an attribute that is not text
         message = f"{path}: the attribute env_args of 'data' is not JSON ({error}). Download the file again."
         raise DataError(message) from error
     return args if isinstance(args, dict) else {}
 
 
 def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
-    """Hz, as `env_args` says it, None where it does not; DataError for what is none."""
+    """Hz, as `env_args` says; None if it does not say. Raises DataError for a value that is not a rate."""
     kwargs = args.get("env_kwargs")
     rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
     if rate is None:
@@ -276,7 +275,7 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
 
 
 def _demonstrations(path: Path, file: Any, filter_key: str | None) -> dict[str, str]:
-    """Names in the order of their numbers, each with the one of the masks `filter_key` that names it, or ""."""
+    """Names in the order of their numbers, each with the mask among `filter_key` that contains it, or ""."""
     numbered = re.compile(r"demo_\d+").fullmatch
     names = [name for name in file["data"] if numbered(name)]
     others = [] if filter_key else [name for name in file["data"] if not numbered(name)]

@@ -37,8 +37,8 @@ BLOCK = 16
 
 
 class RobomimicDataset(EpisodeSource):
-    """The demonstrations of a robomimic HDF5 file: all of them as split `train`, or those of a mask,
-    or of several (`train+valid`).
+    """The demonstrations of a robomimic HDF5 file: all of them as split `train`, or those of one mask or of several
+    (`train+valid`).
 
     Raises DataError for a file of another layout or without images, ConfigError for an unknown mask.
     """
@@ -72,14 +72,14 @@ class RobomimicDataset(EpisodeSource):
 
     @property
     def hz(self) -> float | None:
-        return self._read.recorded_hz  # None if the file does not say it, not CONTROL_RATE
+        return self._read.recorded_hz  # None, not CONTROL_RATE, if the file does not say it
 
     def fingerprint(self) -> str:
-        """Hash over the file's size and, of every demonstration, what `RobomimicSource.content` says."""
+        """Hash over the file's size and, for every demonstration, what `RobomimicSource.content` covers."""
         return hashlib.sha256(f"{self._bytes};{self._read.content}".encode()).hexdigest()[:16]
 
     def sizes(self) -> np.ndarray:
-        """int64 [episodes]: each one's share of the file, by its length."""
+        """int64 [episodes]: each episode's share of the file's bytes, by its length."""
         lengths = np.maximum(self._lengths, 0).astype(np.int64)
         return np.maximum(lengths * self._bytes // max(int(lengths.sum()), 1), 1)
 
@@ -154,7 +154,7 @@ class RobomimicDataset(EpisodeSource):
 
 
 class _Frames(Sequence[SourceFrame]):
-    """Frames of an array of a demonstration, while its file is open. Not thread-safe."""
+    """Frames of one array of a demonstration, while its file is open. Not thread-safe."""
 
     def __init__(self, demo: Any, key: str, where: str):
         array = demo.get(key)

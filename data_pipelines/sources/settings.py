@@ -1,4 +1,4 @@
-"""What a conversion may choose, per format. Needs no library, so that the command line can read it."""
+"""The options of a conversion, for each format. Needs no library, so that the command line can read it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HUMAN_SHORT_SIDE = 256
 """Pixels of the shorter side of frames of human video: what the release's tokenizers see."""
 
 UNSET = arg(help_behavior_hint="")
-"""For an option whose text says what happens without it."""
+"""For an option whose help text says what happens without it."""
 
 Cameras = Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET]
 
@@ -37,7 +37,7 @@ class RobomimicSettings:
     """Shrink images to this shorter side."""
 
     def check(self) -> None:
-        """Raises ConfigError for what cannot work."""
+        """Raises ConfigError for invalid settings."""
         _check_side(self.short_side)
         require(self.hz is None or 0 < self.hz < math.inf, f"hz must be positive and finite, got {self.hz}")
 
@@ -52,7 +52,7 @@ class LeRobotSettings:
     """Shrink images to this shorter side."""
 
     def check(self) -> None:
-        """Raises ConfigError for what cannot work."""
+        """Raises ConfigError for invalid settings."""
         _check_side(self.short_side)
 
 
@@ -68,7 +68,7 @@ class EpicKitchensSettings:
     """Shrink frames to this shorter side."""
 
     def check(self) -> None:
-        """Raises ConfigError for what cannot work."""
+        """Raises ConfigError for invalid settings."""
         _check_side(self.short_side)
         require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
 
@@ -85,7 +85,7 @@ class Ego4dSettings:
     """Shrink frames to this shorter side."""
 
     def check(self) -> None:
-        """Raises ConfigError for what cannot work."""
+        """Raises ConfigError for invalid settings."""
         _check_side(self.short_side)
         require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
         require(self.max_gap > 0, f"max_gap must be positive, got {self.max_gap}")
@@ -105,6 +105,6 @@ class EgoExo4dSettings:
     """Shrink frames to this shorter side."""
 
     def check(self) -> None:
-        """Raises ConfigError for what cannot work."""
+        """Raises ConfigError for invalid settings."""
         _check_side(self.short_side)
         require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")

@@ -1,4 +1,5 @@
-"""How many episodes a dataset has, and how long they are, by its metadata: no episode is read or looked for."""
+"""How many episodes a dataset has, and how long they are, according to its metadata: no episode is read or searched
+for."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ class SourceSize:
 
 
 def rlds_size(location: Location, split: str) -> SourceSize | None:
-    """None where one of the splits is missing, or all are empty. Raises DataError for damaged metadata."""
+    """None if one of the splits is missing, or all are empty. Raises DataError for damaged metadata."""
     directory, parts = schema.resolve_version(location), split.split("+")
     splits = schema.read_info(directory).splits
     if not all(part in splits for part in parts):
@@ -33,7 +34,7 @@ def rlds_size(location: Location, split: str) -> SourceSize | None:
 
 
 def lerobot_size(root: Location, split: str) -> SourceSize | None:
-    """None where info.json does not say it. Raises DataError for a damaged one."""
+    """None if info.json does not state it. Raises DataError for a damaged info.json."""
     info = read_info(root)
     return _of_totals(info.get("total_episodes"), info.get("total_frames"))
 

@@ -38,7 +38,7 @@ SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
 
 NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
-"""Names of flags that say where an episode begins or ends, which some datasets store beside the action."""
+"""Names of flags for the beginning or end of an episode, which some datasets store beside the action."""
 
 REWARD_KEY = "steps/reward"
 """Optional: the reward of each step's action, whose effect the next frame shows."""
@@ -59,7 +59,7 @@ def count_skippable(limit: float, episodes: int) -> int:
 
 
 SourceFrame = bytes | np.ndarray
-"""A frame as its source gives it: encoded bytes, or uint8 [H, W, 3] where frames are not encoded singly (videos)."""
+"""A frame as its source gives it: encoded bytes, or uint8 [H, W, 3] if frames are not encoded one by one (videos)."""
 
 
 @dataclass(frozen=True)
@@ -104,25 +104,25 @@ class OpenEpisode:
 
 
 class EpisodeSource(ABC):
-    """Random access to the episodes of one split, of which there are `len(source)`. Thread-safe; pickles.
+    """Random access to the `len(source)` episodes of one split. Thread-safe; can be pickled.
 
     `location`: where it lies. `features`: the fields of a step by their flat key, `steps/...`.
     `runs`: the names of all its episodes, readable or not (see `identity`).
 
-    Damage: with corrupt="raise" every damaged part is an error. With "skip", the episodes that can be read are
-    listed, `skip` accepts unusable ones, and all that are left out are counted in `skipped`; more than
-    `max_skipped` of them (below 1: more than this share of `runs`) raise DataError. A location that cannot be
-    read at all is not damage: it raises UnreachableError under both policies.
+    Damage: with corrupt="raise" every damaged part is an error. With "skip", only readable episodes are listed, `skip`
+    accepts unusable ones, and all episodes that are left out are counted in `skipped`; more than `max_skipped` of them
+    (below 1: more than this share of `runs`) raise DataError. A location that cannot be read at all is not damage: it
+    raises UnreachableError under both policies.
     """
 
     name: str
     version: str
     split: str
     location: Location
-    schema: Location  # the file that says which fields there are
+    schema: Location  # the file that describes the fields
     features: Mapping[str, FlatFeature]
     runs: tuple[EpisodeRun, ...]
-    files: int  # that hold its episodes
+    files: int  # number of files that hold its episodes
 
     def __init__(self, corrupt: Corrupt, max_skipped: float):
         require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
@@ -150,12 +150,12 @@ class EpisodeSource(ABC):
         """Hash of the contents, independent of the location."""
 
     def former_fingerprint(self) -> str:
-        """What `fingerprint` was by earlier versions, over task texts too."""
+        """The fingerprint of earlier versions, which also covered task texts."""
         return self.fingerprint()
 
     def fingerprint_as(self, recorded: str) -> str:
-        """`recorded` where that is the former fingerprint of these contents, otherwise the fingerprint. So what was
-        made by earlier versions stays in use."""
+        """`recorded` if that is the former fingerprint of these contents, otherwise the fingerprint. So what earlier
+        versions made stays valid."""
         own = self.fingerprint()
         return recorded if recorded and recorded != own and recorded == self.former_fingerprint() else own
 
@@ -183,7 +183,7 @@ class EpisodeSource(ABC):
     @abstractmethod
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         """Fields of episode `i` by flat key, with all its cameras: numbers as arrays, texts as lists of
-        bytes, images as sequences of `SourceFrame`. What the episode lacks is absent. Raises EpisodeError."""
+        bytes, images as sequences of `SourceFrame`. Fields that the episode lacks are absent. Raises EpisodeError."""
 
     @property
     def hz(self) -> float | None:
@@ -203,7 +203,7 @@ class EpisodeSource(ABC):
             return RawEpisode(images, episode.actions, episode.success)
 
     def frames(self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]) -> list[np.ndarray]:
-        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers. They are those that
+        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers. The frames are the same as
         `open_episode` decodes."""
         with self.open_episode(i, image_key, ()) as episode:
             return episode.images(choose)
@@ -213,7 +213,7 @@ class EpisodeSource(ABC):
         check_fields(self.name, self.schema, self.features, image_key, action_keys, action_dims)
 
     def without_location(self, reason: str) -> str:
-        """The message without the dataset's location, so that what is made of it does not depend on where it lies."""
+        """The message without the dataset's location, so that results do not depend on where the dataset is stored."""
         place, name = str(self.location), self.location.name
         inside = reason.replace(f"{place}/", "")
         return inside.replace(place, name) if name else inside  # "." has none
@@ -236,12 +236,12 @@ class EpisodeSource(ABC):
 
 
 def same_rate(hz: float, other: float) -> bool:
-    """Whether two rates are the same number, of which one may have been printed and typed again (six digits)."""
+    """Whether two rates are the same number, even if one of them was printed and typed again (six digits)."""
     return math.isclose(hz, other, rel_tol=1e-5)
 
 
 def vector_sizes(features: Mapping[str, FlatFeature]) -> dict[str, int]:
-    """How many values a step has in each vector that is an action or was observed, by flat key. Besides them sources
+    """Number of values per step in each vector that is an action or an observation, by flat key. Besides these, sources
     have flags, rewards, and texts as code points or embeddings."""
     return {
         key: f.size
@@ -252,15 +252,15 @@ def vector_sizes(features: Mapping[str, FlatFeature]) -> dict[str, int]:
 
 
 def action_fields(keys: Collection[str]) -> list[str]:
-    """Which of a step's fields `keys` are its action, by their names: `action`, or else `actions`, as other programs
-    call it in LeRobot datasets, or else all `action/...` but flags (NO_ACTION)."""
+    """Which of a step's fields `keys` are its action, by their names: `action`, or else `actions` (its name in some
+    LeRobot datasets), or else all `action/...` except flags (NO_ACTION)."""
     one = [key for key in ("action", "actions") if key in keys][:1]
     return one or [key for key in keys if key.startswith("action/") and not NO_ACTION.search(key)]
 
 
 def find_instructions(record: Mapping[str, Any], steps: int) -> list[str]:
-    """The text of every step in a record that was read with INSTRUCTION_KEYS; "" where it has none. One text alone is
-    that of all steps."""
+    """The text of every step in a record that was read with INSTRUCTION_KEYS; "" if it has none. A single text applies
+    to all steps."""
     for key in INSTRUCTION_KEYS:
         values = record.get(key, ())
         if len(values) and isinstance(values[0], bytes):
@@ -268,14 +268,14 @@ def find_instructions(record: Mapping[str, Any], steps: int) -> list[str]:
             return texts if len(texts) == steps else texts[:1] * steps
     points = record.get(CODE_POINTS_KEY, ())
     if isinstance(points, np.ndarray) and points.dtype.kind in "iu" and steps and points.size % steps == 0:
-        if ((points == 0) | ((points >= ord(" ")) & (points <= ord("~")))).all():  # other numbers are ids of words
+        if ((points == 0) | ((points >= ord(" ")) & (points <= ord("~")))).all():  # other numbers are word ids
             return ["".join(map(chr, row[row > 0])) for row in points.reshape(steps, -1)]
     return [""] * steps
 
 
 def find_success(record: Mapping[str, Any]) -> bool | None:
-    """Whether the episode reached its goal, by a record that was read with SUCCESS_KEY; None where it has no such flag:
-    a text, "False" too, says nothing here."""
+    """Whether the episode reached its goal, by a record that was read with SUCCESS_KEY; None if it has no such flag: a
+    text, even "False", does not count."""
     success = record.get(SUCCESS_KEY)
     return bool(success[0]) if isinstance(success, np.ndarray) and len(success) == 1 else None
 
@@ -283,7 +283,7 @@ def find_success(record: Mapping[str, Any]) -> bool | None:
 def decode_frame(frame: SourceFrame, unusable: Callable[[str], Exception]) -> np.ndarray:
     """uint8 [H, W, 3] of a frame as its source holds it.
 
-    Raises what `unusable` makes of a reason, for bytes that are no image.
+    Raises what `unusable` makes of a reason, for bytes that are not an image.
     """
     if isinstance(frame, np.ndarray):
         return frame
@@ -302,13 +302,13 @@ def join_actions(
 ) -> np.ndarray:
     """float32 [steps, A]: the fields `keys` of a record (flat, possibly sliced), concatenated.
 
-    Raises what `unusable` makes of a reason, for fields of another length and values that are not finite.
+    Raises what `unusable` makes of a reason, for fields of another length and for values that are not finite.
     """
 
     def refuse(what: str) -> EpisodeError:
         return unusable(f"{what}. Repair the episode, or read with corrupt='skip'.")
 
-    columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
+    columns = [np.zeros((steps, 0), np.float32)]  # nothing else in a dataset without actions
     for key in keys:
         field, part = field_slice(key)
         values, size = record.get(field, []), features[field].size

@@ -37,7 +37,7 @@ def shrink(image: np.ndarray, short_side: int | None) -> np.ndarray:
 
 
 def stored_jpeg(data: bytes, short_side: int | None, where: str) -> bytes:
-    """The bytes to store of an encoded image: unchanged if it is a JPEG that is small enough, otherwise a new JPEG.
+    """The bytes to store for an encoded image: unchanged if it is a JPEG that is small enough, otherwise a new JPEG.
 
     Raises UnitError, naming `where`, if the bytes are no image.
     """
@@ -50,7 +50,7 @@ def stored_jpeg(data: bytes, short_side: int | None, where: str) -> bytes:
 
 
 MIN_FRAME_BYTES = 4
-"""A frame takes at least this many bytes of a video file: the entry for its size in the file's index."""
+"""Least number of bytes that a frame takes in a video file: the entry for its size in the file's index."""
 
 
 class Video:
@@ -133,7 +133,7 @@ def _is_io_error(error: Exception) -> bool:
 
 @contextmanager
 def open_video(path: Path, hz: float = 0.0) -> Iterator[Video]:
-    """`hz` as of Video. Raises UnitError for a file that is missing or no video."""
+    """`hz` as in Video. Raises UnitError for a file that is missing or not a video."""
     av = require_module("av")
 
     def opened() -> Any:

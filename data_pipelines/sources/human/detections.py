@@ -1,8 +1,8 @@
-"""Hand detections as EPIC-KITCHENS-100 publishes them: per video a pickled list of protobuf messages.
+"""Hand detections as EPIC-KITCHENS-100 publishes them: for each video a pickled list of protobuf messages.
 
-Owns reading that file without trusting it: a pickle is a program, and this reader refuses every
-name that it asks for, so that it can make lists and bytes and nothing else. The message is the
-published `types.proto` (epic-kitchens-100-hand-object-bboxes), of which only hands are declared.
+Owns reading that file without trusting it: a pickle is a program, and this reader refuses to look up any name for it,
+so it can make only lists and bytes. The message is the published `types.proto` (epic-kitchens-100-hand-object-bboxes),
+of which only hands are declared.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class _Refusing(pickle.Unpickler):
 def read_hands(path: Path, min_score: float) -> np.ndarray:
     """float64 [N, 4]: centres of the best left and right hand of frames 1..N, NaN where there is none.
 
-    A hand counts from `min_score` on. Raises UnitError, naming the record, for anything else than
-    N messages in the order of their frames.
+    A hand counts if its score is at least `min_score`. Raises UnitError, naming the record, for anything other than N
+    messages in the order of their frames.
     """
     rows = []
     for record, message in enumerate(_messages(path)):

@@ -4,10 +4,10 @@ A narrated action comes with up to seven annotated frames (three at half-second 
 then pre-condition, contact, point of no return, post-condition), each with boxes in pixels of the
 full-scale video. The action is where the centres of both hands are in the next frame.
 
-Rule across actions: all frames with both hands of one annotated interval are put in the order of
-time, whichever action they belong to; a pause longer than `max_gap` seconds ends an episode. As
-annotated frames are not evenly spaced, an episode is sampled at 2 Hz from its first one: frames
-from the video at these times, positions interpolated linearly between annotated frames.
+Rule across actions: all frames of one annotated interval that show both hands are ordered by time, whichever action
+they belong to; a pause longer than `max_gap` seconds ends an episode. As annotated frames are not evenly spaced, an
+episode is sampled at 2 Hz from its first one: frames from the video at these times, positions interpolated linearly
+between annotated frames.
 
 DIFFERS: from the release (reference sections 5.4 and 5.5) in these points:
 * it calls annotated frames an even 1 Hz and joins four actions whatever time lies between them;
@@ -44,7 +44,7 @@ HANDS = ("left_hand", "right_hand")
 
 
 class Ego4dSource:
-    """`videos` holds `<video_uid>.mp4`; annotated videos that are not there are no units.
+    """`videos` holds `<video_uid>.mp4`; annotated videos that are missing there do not count as units.
 
     Raises DataError for annotations of another layout, or if no video is there.
     """

@@ -5,8 +5,8 @@ of which the first has `annotation2D[<camera>][left_wrist | right_wrist]` with x
 the camera's full resolution. Videos: `takes/<take_name>/frame_aligned_videos/<camera>.mp4`, or their
 downscaled copies (`downscaled/448`). `takes.json` joins the two. The action is where both wrists are
 in the next frame. A clip must span at least 300 labelled frames, 10 s.
-DIFFERS: the release keeps clips that are shorter than that, so that next to nothing is left, and calls
-the dataset by another name than its table of rates does (reference sections 5.4 and 5.5).
+DIFFERS: the release keeps clips that are shorter than that instead, so almost nothing is left, and uses another name
+for the dataset than its table of rates does (reference sections 5.4 and 5.5).
 """
 
 from __future__ import annotations

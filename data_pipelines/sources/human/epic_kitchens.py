@@ -6,8 +6,8 @@ centres until the next kept frame. The state is where they are.
 
 Rates: frames of the first recording (videos P01_01 .. P99_99) were extracted at 60 per second,
 whatever the camera's rate, those of the extension (P01_101 ..) at 50, as the published frame counts
-and durations show; two videos were first extracted at 60 by mistake and are told by their counts.
-Every 6th and every 5th frame is kept, so that all videos become 10 Hz.
+and durations show; two videos were first extracted at 60 by mistake and are recognised by their counts. Every 6th and
+every 5th frame is kept, so that all videos become 10 Hz.
 
 DIFFERS: from the release (reference sections 5.4 and 5.5) in these points:
 * it calls the rate 30 Hz; here it is the true one;

@@ -2,9 +2,9 @@
 
 A position row is [left x, left y, right x, right y] as fractions of the image's width and height,
 from its top left corner; NaN where a hand is not seen. An episode is a run of frames, evenly
-spaced in time, in each of which both hands are seen; nothing is joined over a gap. Its state is
-the row of the frame, its action is made of this row and the next one, so that the last frame of
-a run is a target only. Long runs are cut into equal pieces without losing a step.
+spaced in time, in each of which both hands are seen; nothing is joined over a gap. Its state is the row of the frame,
+its action is made from this row and the next one, so the last frame of a run is only a target. Long runs are cut into
+equal pieces without losing a step.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def cut_episodes(
     max_steps: int,
     origin: Callable[[int], str],
 ) -> Iterator[Episode | Skipped]:
-    """The episodes of [N, 4] positions of evenly spaced frames; `origin` names one by its first row."""
+    """The episodes in [N, 4] positions of evenly spaced frames; `origin` names an episode by its first row."""
     found = runs(both_seen(positions))
     if not found:
         yield Skipped(NONE)

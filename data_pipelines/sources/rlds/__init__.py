@@ -1,1 +1,1 @@
-"""RLDS, read and written without TensorFlow: shards, records, features, images, wherever they lie."""
+"""RLDS, read and written without TensorFlow: shards, records, features, images, on a disk or in an object store."""

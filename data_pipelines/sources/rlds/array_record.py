@@ -52,7 +52,7 @@ def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
 
 @contextmanager
 def open_record(path: Location, offset: int, length: int) -> Iterator[bytes]:
-    """Record number `offset`, for the time of a `with`, as `tfrecord.open_record`. `length` is not used."""
+    """Record number `offset`, within a `with` block, like `tfrecord.open_record`. `length` is not used."""
     del length
     try:
         payload = _reader(path).read(offset, offset + 1)[0]  # given a list, the library would go through all records

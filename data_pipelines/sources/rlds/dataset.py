@@ -52,13 +52,13 @@ class RldsDataset(EpisodeSource):
     """The episodes of one split of an RLDS directory, or of several one after the other ("train+val"); its shards
     are TFRecord or ArrayRecord files.
 
-    `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, then the
-    newest version is taken. Shards are indexed once, for all later starts (see `index`).
+    `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, in which case the newest version
+    is used. Shards are indexed once, for all later starts (see `index`).
 
-    Several datasets may share `files`, so that the number of open files does not grow with theirs.
+    Several datasets may share `files`, so that the number of open files does not grow with the number of datasets.
 
-    Raises DataError for a directory that is no dataset, missing or damaged shards and a
-    record count that contradicts dataset_info.json; ConfigError for an unknown split.
+    Raises DataError for a directory that is not a dataset, for missing or damaged shards, and for a record count that
+    contradicts dataset_info.json; ConfigError for an unknown split.
     """
 
     def __init__(
@@ -181,7 +181,8 @@ class RldsDataset(EpisodeSource):
             yield parse_record(payload, path, offset, keys, lazy)
 
     def _check_shards(self, expected: Sequence[int]) -> None:
-        """Raises DataError for missing, damaged or contradictory shards, or counts their episodes as skipped."""
+        """Raises DataError for missing, damaged or contradictory shards, or (under 'skip') counts their episodes as
+        skipped."""
         for path, shard, count in zip(self._paths, self._index.shards, expected, strict=True):
             problem = None
             if shard.missing:

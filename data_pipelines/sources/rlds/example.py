@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Feature = np.ndarray | Sequence[bytes]
 
 MAX_FEATURES = 10_000
-"""Features of a record: one of a few bytes in the file takes hundreds in memory."""
+"""Largest number of features of a record: a feature of a few bytes in the file takes hundreds in memory."""
 
 BATCH = 2**16
 """Bytes of varints that are decoded at a time, which takes fifty times as much memory."""

@@ -19,7 +19,7 @@ MAX_FIELDS = 4096
 MAX_DEPTH = 32
 MAX_KEY_LENGTH = 512
 MAX_NUMBERS = 2**28
-"""Values of one field in one step: 1 GiB of float32."""
+"""Largest number of values of one field in one step: 1 GiB of float32."""
 
 NUMBERS = ("bool", "float16", "float32", "float64") + tuple(
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
@@ -38,7 +38,7 @@ _FORMS = {
     "text": ("TextFeature", "Text"),
     "translation": ("TranslationFeature", "Translation", "TranslationVariableLanguages"),
 }
-"""Form of a field: its key in the message, and the last parts of the names of classes that have this form."""
+"""Form of a field: its key in the message, and the last parts of the class names with this form."""
 
 _FORM_OF = {name: form for form, names in _FORMS.items() for name in names}
 
@@ -56,14 +56,14 @@ class FlatFeature:
 
     @property
     def camera(self) -> bool:
-        """Whether it is an image of colours or of grey values; tfds stores depths as images of other types."""
+        """Whether it is a colour or grey image; tfds stores depth as images of other types."""
         return self.image and self.dtype == "uint8"
 
 
 def parse_features(schema: Any) -> dict[str, FlatFeature]:
     """Fields by the flat key under which a record holds them, as `steps/observation/image`.
 
-    Raises ValueError, naming the field, for what is no schema or beyond the bounds of this module.
+    Raises ValueError, naming the field, for anything that is not a schema or exceeds this module's limits.
     """
     found: dict[str, FlatFeature] = {}
     for key, feature in _fields(schema, "", 0):
@@ -105,8 +105,8 @@ def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[t
 
 
 def _in_lists(feature: FlatFeature) -> FlatFeature:
-    """A field of which each step has a list of variable length. A record stores it under other keys than the field's
-    own (tfds calls it ragged), so that it cannot be read per step."""
+    """A field of which each step has a list of variable length. A record stores it under keys other than the field's
+    own (tfds calls it ragged), so it cannot be read per step."""
     return FlatFeature(False, 0, (None, *feature.shape), feature.dtype)
 
 

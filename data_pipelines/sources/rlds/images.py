@@ -16,14 +16,15 @@ BY_PILLOW = {"PNG": b"\x89PNG\r\n\x1a\n", "WebP": b"RIFF", "BMP": b"BM"}
 """Formats that Pillow decodes, and the bytes that they begin with."""
 
 MAX_PIXELS = 2**25
-"""Pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can claim billions."""
+"""Largest number of pixels of an image that is decoded: more than 8K video has. A damaged header of a few bytes can
+claim billions."""
 
 MAX_THREADS = 8
 """Threads that decode frames, unless a user asks for more."""
 
 
 def decoding_threads() -> int:
-    """As many as there are cores, up to MAX_THREADS: decoding is outside the interpreter's lock."""
+    """One per core, up to MAX_THREADS: decoding runs outside the interpreter's lock."""
     return min(usable_cores(), MAX_THREADS)
 
 
@@ -31,9 +32,9 @@ def decode_image(data: bytes) -> np.ndarray:
     """uint8 [H, W, 3] from JPEG, PNG, WebP or BMP bytes (grey images become RGB, alpha is dropped).
 
     The fast DCT is the default of TensorFlow's decoder, so pixels equal those of RLDS pipelines built on
-    TensorFlow. Every image is decoded at its own size: libjpeg could shrink one at half the cost, but by another filter
-    than `fit_image`, and a tokenizer would be trained on other frames than it encodes.
-    Raises ValueError if the bytes are no image, one of more than MAX_PIXELS, or one of depths.
+    TensorFlow. Every image is decoded at its own size: libjpeg could shrink it while decoding at half the cost, but
+    with another filter than `fit_image`, and a tokenizer would then be trained on frames other than those that it
+    encodes. Raises ValueError if the bytes are not an image, have more than MAX_PIXELS, or are a depth image.
     """
     if data.startswith(JPEG_MAGIC):
         _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
@@ -44,7 +45,7 @@ def decode_image(data: bytes) -> np.ndarray:
             if image.mode.startswith("I"):  # made RGB, nearly all of them would be white
                 raise ValueError(f"{len(data)} bytes of 16-bit grey values, such as depths, which are not an image")
             return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last one is for broken PNG chunks
         format = next((name for name, magic in BY_PILLOW.items() if data.startswith(magic)), None)
         what = f"of a damaged {format} image" if format else "that are no JPEG, PNG, WebP or BMP image"
         raise ValueError(f"{len(data)} bytes {what}") from error

@@ -1,11 +1,10 @@
 """The index of a split: offsets, lengths and checksums of all records, computed once and cached in a file.
 
-Owns that file. It lies in a cache directory, as datasets may be read-only: `$HMA_CACHE_DIR/index`, by
-default `~/.cache/hma-jax/index`. It is valid for the shards' names, sizes and modification times (for remote ones
-ETags or another version stamp), so a start lists the directory and reads no shard; only shards that changed are
-scanned again.
+Owns that file. It is in a cache directory, since datasets may be read-only: `$HMA_CACHE_DIR/index`, by default
+`~/.cache/hma-jax/index`. It is valid for the shards' names, sizes and modification times (for remote ones ETags or
+another version stamp), so a start lists the directory and reads no shard; only shards that changed are scanned again.
 
-On each host one process makes it while the others wait for it.
+On each host, one process makes the index while the others wait for it.
 """
 
 from __future__ import annotations
@@ -40,8 +39,8 @@ SAVE_EVERY = 60.0
 """Seconds of scanning after which the index so far is saved, in case the process is killed."""
 
 MIN_AGE = 2.0
-"""Seconds between a shard's last change and its scan for the shard's time to be trusted: a change right after the scan
-could have the same time."""
+"""A shard's modification time is trusted only if this many seconds passed between it and the scan: a change right after
+the scan could have the same time."""
 
 COLUMNS = {"offsets": np.int64, "lengths": np.int64, "checksums": np.uint32}
 
@@ -54,11 +53,11 @@ class Shard:
 
     name: str
     size: int  # bytes
-    stamp: str  # of this version of the file; "": unknown, it is scanned at every start
+    stamp: str  # version of the file; "": unknown, so it is scanned at every start
     records: int
     digest: str
     missing: bool = False
-    damage_at: int = -1  # where the scan stopped; -1: at the file's end
+    damage_at: int = -1  # byte at which the scan stopped; -1: at the file's end
     damage: str = ""
 
 
@@ -114,7 +113,7 @@ def load_index(directory: Location, split: str, shards: Sequence[Location], scan
     if known is not None and _is_current(known, shards, listing):
         return known
     with exclusive_lock(path):
-        known = read_index(path)  # another process may have made it meanwhile
+        known = read_index(path)  # another process may have made it in the meantime
         if known is not None and _is_current(known, shards, listing):
             return known
         return _make(path, shards, listing, known, scan)
@@ -170,7 +169,7 @@ def _make(
 def _scan(
     shards: Sequence[Location], scan: Scan
 ) -> Iterator[tuple[Location, tuple[ShardIndex, CorruptRecordError | None] | DataError]]:
-    """Each shard with its index, or with the error of its scan; after an error no further scans are started."""
+    """Yields each shard with its index, or with the error of its scan; after an error no further scans are started."""
     failed = False
 
     def found(shard: Location):

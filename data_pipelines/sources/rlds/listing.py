@@ -1,6 +1,6 @@
 """The files of a directory with their sizes and version stamps, without opening any.
 
-Owns what stands for a version: the modification time on a disk, an ETag or the like in an object store.
+Owns what identifies a file's version: the modification time on a disk, an ETag or similar in an object store.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Locations of dataset files: paths on a disk, or URLs of any object store that fsspec supports.
 
-Owns the difference between the two, which no other module sees: a location has the methods of `pathlib.Path`
-either way, and any range of its bytes can be read without the others. Remote locations (gs://, s3://,
-memory://, ...) are `upath.UPath` objects, of the extra `remote`.
+Owns the difference between the two, which no other module sees: either way a location has the methods of
+`pathlib.Path`, and any range of its bytes can be read without the rest. Remote locations (gs://, s3://, memory://, ...)
+are `upath.UPath` objects, of the extra `remote`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ PERMANENT_ERRORS = (PermissionError, IsADirectoryError, NotADirectoryError)
 """Errors that retrying does not cure."""
 
 MAX_OPEN_FILES = 128
-"""Files that `OpenFiles` keeps open by default: half of the smallest usual limit of open files per process."""
+"""Number of files that `OpenFiles` keeps open by default: half of the smallest usual limit of open files per
+process."""
 
 
 CHUNK = 4 * 2**20
@@ -58,7 +59,7 @@ class RandomAccessFile(Protocol):
 
 
 def locate(text: str | Path | UPath) -> Location:
-    """The location of a path or URL. Raises ConfigError if it is remote and cannot be opened so."""
+    """The location of a path or URL. Raises ConfigError if it is a URL that cannot be opened."""
     if not isinstance(text, str):
         return text
     if not is_remote(text):
@@ -109,7 +110,7 @@ def open_random_access(location: Location) -> Iterator[RandomAccessFile]:
 def read_head(location: Location, max_bytes: int) -> bytes:
     """The first bytes of a file, up to `max_bytes`.
 
-    Raises FileNotFoundError if there is none, UnreachableError where the disk or the store fails.
+    Raises FileNotFoundError if there is none, UnreachableError if the disk or the store fails.
     """
     if is_remote(location):
         return _RemoteFile(location).read(0, max_bytes)
@@ -122,9 +123,9 @@ def read_head(location: Location, max_bytes: int) -> bytes:
 
 
 def read_through(path: Path) -> None:
-    """Reads a file to its end, which tells a disk that fails from contents that are damaged.
+    """Reads a file to its end, to distinguish a failing disk from damaged contents.
 
-    Raises FileNotFoundError if there is none, UnreachableError where the disk fails.
+    Raises FileNotFoundError if there is none, UnreachableError if the disk fails.
     """
 
     def read() -> None:
@@ -171,8 +172,8 @@ class Descriptor:
 class DiskFile(Descriptor):
     """A file on a disk, closed by `close` or when it is garbage-collected.
 
-    After a failed read the file is reopened and read again, as a network disk needs it after ESTALE. Raises
-    DataError if the file is missing or was replaced since it was opened.
+    After a failed read the file is reopened and read again, which a network disk needs after ESTALE. Raises DataError
+    if the file is missing or was replaced since it was opened.
     """
 
     def __init__(self, path: Path):
@@ -204,7 +205,7 @@ class DiskFile(Descriptor):
                 message = f"{self._path}: the file was replaced while it was being read. Run the same command again."
                 raise DataError(message)
             data = os.pread(fd, length, offset)
-            os.dup2(fd, self._fd, inheritable=False)  # for all threads, which know the descriptor by its number
+            os.dup2(fd, self._fd, inheritable=False)  # for all threads, which use the descriptor by its number
             return data
         finally:
             os.close(fd)
@@ -248,8 +249,8 @@ def exists(location: Location, kind: Literal["file", "directory"]) -> bool:
 
 
 def is_io_error(error: Exception) -> bool:
-    """Whether a library's error is one of reading the file, not of its contents."""
-    match = re.search(r"errno\s*[=:]?\s*(\d+)", str(error), re.IGNORECASE)  # HDF5 has it in its message only
+    """Whether a library's error came from reading the file, not from its contents."""
+    match = re.search(r"errno\s*[=:]?\s*(\d+)", str(error), re.IGNORECASE)  # HDF5 gives it only in its message
     number = getattr(error, "errno", None) or (int(match[1]) if match else 0)
     return isinstance(error, PermissionError) or number in IO_ERRNOS
 

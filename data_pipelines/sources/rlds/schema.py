@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 INFO, FEATURES, METADATA = "dataset_info.json", "features.json", "metadata.json"
 RATE_KEY = "hz"
-"""The key of metadata.json under which writers of this package say native frames per second."""
+"""The key of metadata.json under which this package's writers store native frames per second."""
 
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 """tfds's default template of shard names."""
@@ -37,7 +37,7 @@ DATASETS = (
     "the directory of an RLDS dataset, <name> or <name>/<version> as tfds wrote it, the root of a LeRobot dataset, or a "
     "robomimic .hdf5 file"
 )
-"""What a location may be, for messages: RLDS is what others are taken for."""
+"""What a location may be, for messages: a location of no other format is taken for RLDS."""
 
 ADVICE = "Restore the file as tfds wrote it."
 
@@ -47,17 +47,17 @@ FILE_FORMATS = ("tfrecord", "array_record")
 
 @dataclass(frozen=True)
 class SplitInfo:
-    """What dataset_info.json says of one split."""
+    """What dataset_info.json says about one split."""
 
     name: str
     shard_lengths: tuple[int, ...]  # records in each shard
     bytes: int
-    template: str  # of the shards' names
+    template: str  # template of the shards' names
 
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """What dataset_info.json says of a dataset."""
+    """What dataset_info.json says about a dataset."""
 
     name: str
     version: str
@@ -98,8 +98,8 @@ class SplitMetadata:
 def resolve_version(directory: str | Location) -> Location:
     """The version directory: `directory` itself or its newest version.
 
-    Raises NoDatasetError for a location that is no dataset; another DataError where its disk may only not be mounted:
-    its parent is missing, or it is empty.
+    Raises NoDatasetError for a location that is not a dataset; another DataError if perhaps only its disk is not
+    mounted: its parent is missing, or it is empty.
     """
     directory = locate(directory)
     if not exists(directory, "directory"):
@@ -124,7 +124,7 @@ def _has_info(directory: Location) -> bool:
 
 
 def dataset_name(directory: str | Location) -> str:
-    """The dataset's name in dataset_info.json. Raises DataError for a directory that is no RLDS dataset."""
+    """The dataset's name in dataset_info.json. Raises DataError for a directory that is not an RLDS dataset."""
     return read_info(resolve_version(directory)).name
 
 
@@ -161,7 +161,7 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
 
 
 def of_a_part(split: str) -> str:
-    """The end of a message that refuses `split`: what to do where it is a part of one, such as "train[:5]"; ''
+    """The end of a message that refuses `split`: what to do if it is a part of a split, such as "train[:5]"; ''
     otherwise."""
     whole, _, part = split.partition("[")
     if not part:
@@ -203,9 +203,9 @@ def read_info(directory: Location) -> DatasetInfo:
 
 
 def read_rate(directory: Location) -> float | None:
-    """Native frames per second, as metadata.json says (`RATE_KEY`). None where it holds no rate, is missing or is no
-    JSON: nothing else is read from it, and others may keep anything there. UnreachableError where the disk or the store
-    fails."""
+    """Native frames per second, as metadata.json says (`RATE_KEY`). None if it holds no rate, is missing or is not
+    JSON: nothing else is read from it, and other programs may keep anything there. Raises UnreachableError if the disk
+    or the store fails."""
     path = directory / METADATA
     if not exists(path, "file"):
         return None
@@ -248,7 +248,7 @@ def _count(value: Any, what: str) -> int:
 
 
 def field_slice(key: str) -> tuple[str, slice]:
-    """The field of an action key, and which of its values: `action[:7]` is ("action", slice(0, 7))."""
+    """The field of an action key, and the slice of its values: `action[:7]` is ("action", slice(0, 7))."""
     match = re.fullmatch(r"(.+)\[(\d{0,9}):(\d{0,9})\]", key)
     if not match:
         return key, slice(0, None)

@@ -1,4 +1,4 @@
-"""A cache of the number of steps of each episode, which is known only after its record was read.
+"""A cache of each episode's number of steps, which is known only after its record was read.
 
 Owns a file beside the index (see `index`). It may be deleted at any time.
 """
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 def known_mean_steps(directory: Location, split: str, episodes: int) -> float:
-    """Mean steps of the episodes whose records were read before, on this machine; 0 if there are none, or if the index
-    is of another number of `episodes`. No shard is looked at."""
+    """Mean number of steps of the episodes whose records were read before on this machine; 0 if there are none, or if
+    the index has another number of `episodes`. Reads no shard."""
     path = index_path(directory, split)
     index = read_index(path)
     if index is None or len(index) != episodes:

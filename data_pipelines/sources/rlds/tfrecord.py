@@ -3,11 +3,10 @@
 Owns the framing and its checksums. Does not know what is inside a record (see `example`).
 
 A record is: length (uint64), checksum of the length (uint32), payload, checksum of the
-payload (uint32), all little-endian. As lengths are known from the headers, a scan that skips
-payloads gives the offset of every record, and any record then takes one read. Records of
-hundreds of megabytes are never held in memory as a whole: their checksum is computed in pieces, and
-bytes are read on access. Nothing here keeps a file open beyond a call or a `with`; callers that read
-small parts again and again pass an open file (see `location.OpenFiles`).
+payload (uint32), all little-endian. Since the headers give the lengths, a scan that skips payloads finds the offset of
+every record, and reading any record then takes one read. Records of hundreds of megabytes are never held in memory as a
+whole: their checksum is computed in pieces, and bytes are read on access. Nothing here keeps a file open beyond a call
+or a `with`; callers that read small parts again and again pass an open file (see `location.OpenFiles`).
 """
 
 from __future__ import annotations
@@ -134,7 +133,7 @@ def read_record(path: Location, offset: int, length: int) -> bytes:
 
 
 def read_parts(file: RandomAccessFile, path: Location, offset: int, spans: Iterable[tuple[int, int]]) -> list[bytes]:
-    """Bytes [start, end) of the payload of a record that was verified before, of an open file.
+    """Bytes [start, end) of the payload of a record in an open file; the record was verified before.
 
     Raises CorruptRecordError, which names `path`, if the file has become shorter.
     """
@@ -143,7 +142,7 @@ def read_parts(file: RandomAccessFile, path: Location, offset: int, spans: Itera
 
 @contextmanager
 def open_record(path: Location, offset: int, length: int) -> Iterator[bytes | FileView]:
-    """The verified payload of a record, for the time of a `with`, in bounded memory.
+    """The verified payload of a record, within a `with` block, in bounded memory.
 
     Up to MAX_WHOLE_READ bytes it is read at once. A larger payload is verified in pieces and given as a view that reads
     on access; from a remote store it passes through an unnamed temporary file, so that every byte is fetched
@@ -225,7 +224,7 @@ def _copy_to_disk(file: RandomAccessFile, path: Location, offset: int, length: i
             copy.flush()
             closing.pop_all()
             return crc, copy
-    except OSError as error:  # here and not in the caller, who may be writing files of its own
+    except OSError as error:  # caught here, not in the caller, which may be writing files of its own
         where = tempfile.tempdir or "the temporary directory"
         raise UnreachableError(
             f"{where}: the record at byte {offset} of {path}, {length} bytes, cannot be kept there while it is read "
@@ -261,5 +260,5 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
 
 
 def payload_bytes(path: Path, records: int) -> int:
-    """Bytes of the payloads of a file of so many records: what tfds counts as its size."""
+    """Bytes of the payloads of a file with this number of records: what tfds counts as its size."""
     return path.stat().st_size - (HEADER + FOOTER) * records

@@ -21,7 +21,7 @@ VERSION = "1.0.0"
 JPEG_QUALITY = 95
 
 SHARD_FRAMES = 4000
-"""About this many native frames go into one shard."""
+"""Approximate number of native frames in one shard."""
 
 IMAGE, TEXT = "image", "text"
 
@@ -79,7 +79,7 @@ def shard_name(dataset: str, index: int, count: int, split: str = "train") -> st
 
 
 Split = tuple[Sequence[int], int]
-"""What was written of a split: records in each shard, and bytes of all payloads."""
+"""What was written for a split: records in each shard, and bytes of all payloads."""
 
 
 def write_shards(
@@ -90,8 +90,8 @@ def write_shards(
     frames: int,
     records: Callable[[int, int], Iterable[bytes]],
 ) -> Split:
-    """The shards of a split: `records(first, end)` gives those of some of its `episodes`, which have so many native
-    `frames` in all."""
+    """Writes the shards of a split. `records(first, end)` gives the records of some of its `episodes`, which have
+    `frames` native frames in all."""
     shards = max(1, min(len(episodes), round(frames / SHARD_FRAMES)))
     bounds = np.linspace(episodes.start, episodes.stop, shards + 1).astype(int).tolist()
     lengths, size = [], 0
@@ -104,7 +104,7 @@ def write_shards(
 
 def build_features(step: Mapping[str, Field], episode: Mapping[str, Field]) -> Any:
     """The tfds features of episodes; keys such as `observation/image` nest at each slash."""
-    # Costs over a second and is needed only where a dataset is finished.
+    # The import takes over a second, and is needed only when a dataset is finished.
     from tensorflow_datasets import features as tf
 
     def leaf(field: Field) -> Any:
@@ -136,8 +136,8 @@ def write_info(
     metadata: Mapping[str, Any],
     module: str,
 ) -> None:
-    """features.json, dataset_info.json and metadata.json, by tfds itself; `metadata` is what metadata.json shall hold,
-    `module` what made the dataset."""
+    """Writes features.json, dataset_info.json and metadata.json with tfds itself. `metadata`: the contents of
+    metadata.json; `module`: what made the dataset."""
     import tensorflow_datasets as tfds
     from tensorflow_datasets.core.dataset_info import DatasetIdentity
 
