@@ -17,7 +17,7 @@ from pathlib import Path
 from hma_jax.runtime.locks import Held, Lock, exclusive, find_held
 
 MIN_WAIT, MAX_WAIT = 0.1, 5.0
-"""Seconds between two checks whether another process has finished; each wait is 1.5 times the one before."""
+"""Seconds between two checks of whether another process has finished; each wait is 1.5 times the one before."""
 
 
 class OutputLock:
@@ -81,7 +81,7 @@ def find_held_lock(directory: Path) -> Held | None:
 
 
 def backoff() -> Iterator[float]:
-    """Seconds to wait before each further check: exponential backoff, without an end."""
+    """Seconds to wait before each further check: endless exponential backoff."""
     pause = MIN_WAIT
     while True:
         yield pause

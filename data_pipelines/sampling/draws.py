@@ -2,9 +2,9 @@
 
 The number of draws of each dataset before a block follows from the weights and the block's number alone. The
 difference between two such counts is what the block holds, in an order shuffled by a hash of (seed, block). So every
-draw of a dataset has a running number: its shuffled order visits each window once per epoch, which independent draws
-would not, and counts deviate from their expectation by a few at most, which matters for datasets of small weight.
-Any position takes the computation of one block.
+draw of a dataset has a running number, and two things follow that independent draws lack: its shuffled order visits
+each window once per epoch, and counts deviate from their expectation by a few at most, which matters for datasets of
+small weight. Finding any position requires computing one block.
 DIFFERS: the release draws datasets and windows with replacement, the same in every epoch (reference section 4.3).
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from data_pipelines.sampling.order import hash64, stream_seed
 
 BLOCK = 512
-"""Draws per block: several batches of most sizes, so that batches vary nearly as with independent draws."""
+"""Draws per block: several batches of most sizes, so that batches vary nearly as much as with independent draws."""
 
 _BITS = 48
 """Bits of a share as a fixed-point number: weights are exact to 1e-14, and all arithmetic is in integers."""
@@ -39,8 +39,8 @@ class Draws:
     def counts(self, block: int) -> np.ndarray:
         """int64 [D]: draws of each dataset before `block`; their sum is block x BLOCK.
 
-        Each dataset takes its share of the draws that those before it left, rounded with an offset of its own. Both
-        numbers never decrease from block to block, so that no block has a negative count.
+        Each dataset takes its share of the draws that the datasets before it left over, rounded with an offset of its
+        own. Neither number ever decreases from block to block, so no block has a negative count.
         """
         left, counts = block * BLOCK, []
         for share, offset in zip(self._shares, self._offsets, strict=True):
@@ -49,7 +49,7 @@ class Draws:
         return np.asarray(counts, np.int64)
 
     def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(dataset, which of its draws this is), both int64 like `positions`, int64 [N]."""
+        """(dataset, number of the draw within it), both int64 like `positions`, int64 [N]."""
         blocks, slots = np.divmod(np.asarray(positions, np.int64), BLOCK)
         dataset, number = np.empty_like(blocks), np.empty_like(blocks)
         for block in np.unique(blocks).tolist():
@@ -59,7 +59,7 @@ class Draws:
         return dataset, number
 
     def _block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """(dataset, which of its draws this is) for all positions of a block."""
+        """(dataset, number of the draw within it) for all positions of a block."""
         before = self.counts(block)
         here = self.counts(block + 1) - before
         shuffled = np.argsort(hash64(np.arange(BLOCK), hash64(block, self._seed)), kind="stable")

@@ -30,7 +30,7 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float) -> np.ndarra
     require(tau > 0, f"the mixture temperature tau must be positive, got {tau}")
     counts = np.asarray(counts, np.float64)
     powers = (counts / counts.sum()) ** (1.0 / tau)
-    if not powers.any():  # tau is so small that even the largest is too small for a number
+    if not powers.any():  # tau is so small that even the largest weight underflows
         powers = (counts == counts.max()).astype(np.float64)
     return powers / powers.sum()
 
@@ -38,7 +38,7 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float) -> np.ndarra
 def make_mixture(counts: Mapping[str, int], tau: float, reasons: Mapping[str, str]) -> Mixture:
     """The mixture of the datasets in `counts` (name -> examples).
 
-    Those with none are left out; `reasons` say why. If none remains: DataError with all the reasons.
+    Datasets without examples are left out; `reasons` say why. Raises DataError, with all the reasons, if none remains.
     """
     dropped = {n: reasons[n] for n, c in counts.items() if c == 0}
     if len(dropped) == len(counts):

@@ -46,8 +46,8 @@ def permute(index: np.ndarray | int, n: np.ndarray | int, key: np.ndarray | int)
     """int64: entry `index` (below `n`) of the permutation of 0..n-1 that `key` (uint64) names.
 
     An alternating Feistel cipher over the next power of two: each round hashes one half of the bits into
-    the other. What comes out at `n` or above is enciphered again until it lies below (cycle-walking), which
-    takes less than two passes on average. No size is a special case.
+    the other. A result of `n` or more is enciphered again until it is below `n` (cycle-walking), which takes less than
+    two passes on average. No size is a special case.
     """
     x, n, key = np.broadcast_arrays(*(np.asarray(a).astype(np.uint64) for a in (index, n, key)))
     shape, x, n, key = x.shape, x.flatten(), n.ravel(), key.ravel()
@@ -87,5 +87,5 @@ def endless_shuffle(position: np.ndarray | int, n: np.ndarray | int, seed: np.nd
 
 
 def random_below(limit: int, position: int, seed: int) -> int:
-    """A number in 0..limit-1 that depends on (position, seed) alone."""
+    """A number in 0..limit-1 that depends only on (position, seed)."""
     return int(hash64(position, seed)) % limit

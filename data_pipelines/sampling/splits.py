@@ -2,8 +2,8 @@
 
 Neighbouring episodes of a robot dataset share a scene, a task or a day, so its first 5 % are not a representative
 sample. Choosing by a hash of (dataset, episode) is random, needs no file, and is the same for everybody who reads the
-dataset. The hash is of the episode's name (`sources.identity`), and the choice is among all episodes that the dataset
-should have, so that damaged ones do not change the split of the others.
+dataset. The hash is of the episode's name (`sources.identity`), and the choice is made among all episodes that the
+dataset should have, so that damaged ones do not change the split of the others.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from hma_jax.config.base import later
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How many episodes of a dataset are held out, and at most trained on, as the settings of a study and of a token
-    store call it."""
+    """How many episodes of a dataset are held out, and how many at most are trained on. The fields have the names of
+    the settings of studies and token stores."""
 
     val_fraction: float = 0.05  # of all episodes
     min_val: int = 2
     max_val: int = 200
     max_val_fraction: float = 0.25  # takes precedence over min_val
-    # Of those that are not held out; None: all. With it max_val also bounds a split that the entry holds out.
+    # Largest number of episodes to train on; None: all. If set, max_val also bounds a split that the entry holds out.
     max_train: int | None = later(None)
 
     def count(self, episodes: int) -> int:
@@ -42,7 +42,7 @@ class HeldOut:
         return min(max(round(self.val_fraction * episodes), self.min_val), self.max_val, most, episodes // 2)
 
     def check(self, group: str = "") -> None:
-        """Raises ConfigError, which names the setting and its `group`, for bounds that `count` cannot take."""
+        """Raises ConfigError, naming the setting and its `group`, for bounds that `count` cannot use."""
         fraction, low, high, most = self.val_fraction, self.min_val, self.max_val, self.max_val_fraction
         require(0 <= fraction < 1, f"{group}val_fraction must lie in [0, 1), got {fraction:g}")
         require(0 <= low <= high, f"{group}min_val must lie between 0 and {group}max_val, {high}, got {low}")
@@ -59,11 +59,11 @@ class HeldOut:
 
 
 def held_out_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: HeldOut) -> np.ndarray:
-    """bool [episodes that `runs` name], True for validation: the split that the dataset's entry names for that,
-    whatever its size, or else as `held_out` chooses. Raises ConfigError if there is no such split.
+    """bool [episodes that `runs` name], True for validation: the split that the dataset's entry names for this,
+    whatever its size, or else the choice of `held_out`. Raises ConfigError if there is no such split.
 
-    Of a joined dataset, `held_out` chooses in each part as if that were a dataset by itself: what is held out of a part
-    is new to a model that was trained on the part alone, or joined with others.
+    In a joined dataset, `held_out` chooses in each part as if it were a dataset on its own: what is held out of a part
+    is new to every model, whether it was trained on that part alone or joined with others.
     """
     if not spec.val_split:
         parts = runs_of_parts(runs).items()
@@ -80,11 +80,12 @@ def held_out_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: Hel
 
 def used_episodes(spec: DatasetSpec, runs: Sequence[EpisodeRun], amount: HeldOut) -> tuple[np.ndarray, np.ndarray]:
     """(bool, bool) [episodes that `runs` name], True for those to train on, and for those held out. Without
-    `amount.max_train` each episode is one of both.
+    `amount.max_train` each episode is one or the other.
 
-    With it, those to train on are what a run that is limited to as many trajectories draws with seed 0, if all are long
-    enough for a window. Who is held out stays the same; of a split that the entry names at most `amount.max_val` are
-    used, so that a part of a large dataset does not bring all of that with it. Raises what `held_out_episodes` does.
+    With it, those to train on are the ones that a run limited to the same number of trajectories draws with seed 0, if
+    all are long enough for a window. The held-out ones stay the same; of a split that the entry names, at most
+    `amount.max_val` are used, so that using a part of a large dataset does not require all of that split. Raises what
+    `held_out_episodes` does.
     """
     val = held_out_episodes(spec, runs, amount)
     train = ~val
@@ -108,7 +109,7 @@ def held_out(dataset: str, ids: np.ndarray, amount: HeldOut) -> np.ndarray:
 def subset(
     dataset: str, ids: np.ndarray, members: np.ndarray, present: np.ndarray, count: int | None, salt: str
 ) -> np.ndarray:
-    """Positions in `present`, ascending, of those of `count` drawn episodes that are present.
+    """Draws `count` episodes, and returns the positions in `present`, ascending, of those that are present.
 
     `members`: bool per entry of `ids`, the episodes to draw from; `present`: numbers of those that were not skipped. A
     skipped episode that is drawn is not replaced by another.

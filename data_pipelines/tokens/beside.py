@@ -1,6 +1,6 @@
-"""Arrays that stand beside a part's file of records: what is asked for more often than the records, and is far smaller.
+"""Arrays that stand beside a part's file of records: far smaller than the records, and needed more often.
 
-Owns their files. Stores of earlier versions lack some; whoever reads then reads the records.
+Owns their files. Stores of earlier versions lack some; readers then read the records.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ def write_beside(part: Path, kind: str, rows: np.ndarray, scratch: Path) -> None
 def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, otherwise: str) -> np.ndarray | None:
     """[rows, ...] of `dtype`; None if there is no such file beside `part`.
 
-    `of` says what of ("the actions of 12 steps") and `otherwise` what is done without the file, for messages. Raises
-    DataError for a damaged file, UnreachableError where the disk fails.
+    For messages, `of` says what the rows are ("the actions of 12 steps") and `otherwise` what is done without the file.
+    Raises DataError for a damaged file, UnreachableError if the disk fails.
     """
     path = beside(part, kind)
     try:
-        data = retry(path, path.read_bytes)  # numpy takes a disk that fails in the middle for a file that ends there
+        data = retry(path, path.read_bytes)  # numpy mistakes a disk that fails in the middle for a file that ends there
     except FileNotFoundError:
         return None
     try:
         found = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
+    except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last one for a damaged header
         raise DataError(f"{path}: {of} cannot be read ({error}). Remove the file, and {otherwise}.") from error
     if found.ndim != 2 or len(found) != rows or found.dtype != dtype:
         raise DataError(f"{path}: {found.dtype} {list(found.shape)} cannot be {of}. Remove the file, and {otherwise}.")

@@ -3,9 +3,9 @@
 Owns the work directory, what survives a crash, and publishing. `part_maker` decides who makes which part; the caller
 gives its contents: episodes of any source (`tokenize_job`) or folders of the release (`import_tokens`).
 
-Parts gather in the work directory `<store>/.<name>.<hash of the plan>`, which neither readers nor jobs with another
-plan use. Every process takes the next part that is neither finished nor locked by another process (lock files are in
-`<work directory>.claims`, see `publishing`), so that processes may start, end and be killed at any time: a dead
+Parts are collected in the work directory `<store>/.<name>.<hash of the plan>`, which neither readers nor jobs with
+another plan use. Every process takes the next part that is neither finished nor locked by another process (lock files
+are in `<work directory>.claims`, see `publishing`), so that processes may start, end and be killed at any time: a dead
 process holds no lock. When the last part is finished, the process that gets the lock for publishing adds the manifest
 and renames the directory to `<store>/<name>`.
 """
@@ -36,13 +36,13 @@ from hma_jax.runtime.files import IO_ERRNOS
 from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
-"""Bytes of records in one part, which is the most work that a killed process loses."""
+"""Bytes of records in one part: the most work that a killed process loses."""
 
 FORMERLY_NAMED = frozenset(
     "rate angles angle_form angle_unit episodes median_steps mean_steps val_split image_corrections joins "
     "max_val_fraction action_quantiles runs recipe".split()
 )
-"""Fields that earlier versions hashed with any value; a field that is added is none of them."""
+"""Fields that earlier versions hashed whatever their value. Fields that are added later are not among them."""
 
 
 def write_dataset(
@@ -60,21 +60,20 @@ def write_dataset(
     """Makes the missing parts of `<store_root>/<plan.spec.name>` that no other process makes, and publishes it.
 
     `plan`: the manifest without statistics and splits. `parts` cover the source in order, as
-    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or SkippedEpisodes
-    for one that cannot be used; equal parts must give equal items. `skipped` are episodes that are
-    in no part. An existing dataset that was made from the same source in the same way is kept; one
-    made otherwise is refused or, with `overwrite`, removed.
+    `cut_parts` cuts them. `make(part)` yields a part's episodes in order of their index, or SkippedEpisodes for one
+    that cannot be used; equal parts must yield equal items. `skipped` are episodes that are in no part. An existing
+    dataset that was made from the same source in the same way is kept; one that was made differently is refused or,
+    with `overwrite`, removed.
 
-    Parts that other processes are making are waited for, and made here if those die; without
-    `wait` None is returned instead of the manifest. Raises ConfigError for another dataset in its
-    place, or one that other processes are making there, and a directory that cannot be written;
-    DataError for more than `max_skipped` skipped episodes, those that other processes skipped included, or no
-    training episode at all; and what `make` raises.
+    Waits for parts that other processes are making, and makes them here if those processes die; without `wait`, returns
+    None instead of the manifest. Raises ConfigError for another dataset in its place, for one that other processes are
+    making there, and for a directory that cannot be written; DataError for more than `max_skipped` skipped episodes
+    (including those that other processes skipped) or no training episode at all; and what `make` raises.
     """
     root = Path(store_root)
     final = root / plan.spec.name
     try:
-        if overwrite or _published(final, plan) is None:  # a finished one is in nobody's way
+        if overwrite or _published(final, plan) is None:  # a finished one blocks nobody
             others = _find_others(root, plan, parts)
             if overwrite:
                 _remove_others(final, plan, others)
@@ -103,9 +102,9 @@ def write_dataset(
 
 
 def differences(store_root: str | Path, plan: Manifest) -> list[str]:
-    """What differs between the existing dataset of this name and the plan, one line per field.
+    """The differences between the existing dataset of this name and the plan, one line per field.
 
-    Empty if nothing does, or there is no such dataset. Raises DataError if it cannot be read, such as one of an older
+    Empty if there are none, or no such dataset. Raises DataError if it cannot be read, such as one of an older
     format.
     """
     final = Path(store_root) / plan.spec.name
@@ -113,7 +112,7 @@ def differences(store_root: str | Path, plan: Manifest) -> list[str]:
 
 
 def recorded_source(store_root: str | Path, name: str) -> str:
-    """The fingerprint of what the existing dataset of this name was made from; "" without one that can be read."""
+    """The fingerprint of what the existing dataset of this name was made from; "" if there is none that can be read."""
     final = Path(store_root) / name
     try:
         return load_manifest(final / FILE).source if final.exists() else ""
@@ -141,7 +140,8 @@ def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
 
 
 def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
-    """Where the parts of a plan are made: where an earlier version began to, if it did."""
+    """The directory in which the parts of a plan are made: the one that an earlier version began with, if there is
+    one."""
     hashes = (stable_hash(identity_of([plan, list(parts)], named))[:12] for named in ((), FORMERLY_NAMED))
     work, former = (root / f".{plan.spec.name}.{hash}" for hash in hashes)
     return former if former.exists() else work
@@ -231,13 +231,13 @@ def _changes(existing: Manifest, plan: Manifest) -> list[str]:
     inputs = ("spec", "tokenizer", "settings", "source", "recipe")
     counts, asked = existing.episodes_of_parts, plan.settings
     own = replace(asked, max_val_fraction=existing.settings.max_val_fraction)
-    if all(own.held_out.count(n) == asked.held_out.count(n) for n in counts):  # another limit changes nothing here
+    if all(own.held_out.count(n) == asked.held_out.count(n) for n in counts):  # a different limit changes nothing here
         plan = replace(plan, settings=own)
     return [line for name in inputs for line in diff(getattr(existing, name), getattr(plan, name), name)]
 
 
 def _find_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> list[Path]:
-    """Work directories that jobs with other plans left of a dataset of this name.
+    """Work directories that jobs with other plans left for a dataset of this name.
 
     Raises Held if a living process is making one.
     """
@@ -248,7 +248,7 @@ def _find_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> list[Path
     for other in others:
         try:
             held = find_held_lock(locks_of(other))
-        except PermissionError:  # another user's, who keeps its work to itself
+        except PermissionError:  # another user's, whose work cannot be read
             continue
         if held:
             raise Held(
@@ -260,7 +260,7 @@ def _find_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> list[Path
 
 
 def _remove_others(final: Path, plan: Manifest, others: Sequence[Path]) -> None:
-    """A dataset of this name that was made otherwise, and what unfinished jobs left of it."""
+    """Removes a dataset of this name that was made differently, and what unfinished jobs left of it."""
     if final.exists():
         try:
             outdated = bool(_changes(load_manifest(final / FILE), plan))

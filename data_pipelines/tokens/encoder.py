@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 
 class Encoder:
-    """Takes frames and gives their tokens in the same order. Devices encode while the next batch is collected: at least
-    `batch` frames, in calls of the tokenizer that are full."""
+    """Takes frames and returns their tokens in the same order. Devices encode while the next batch is collected: at
+    least `batch` frames, so that every call of the tokenizer is full."""
 
     def __init__(self, tokenizer: Tokenizer, batch: int):
         self._tokenizer = tokenizer
@@ -25,7 +25,7 @@ class Encoder:
         self._under_way: Future | None = None
         self._pool = ThreadPoolExecutor(1, "encode")
         self.ready = 0
-        """Frames whose tokens can be taken."""
+        """Number of frames whose tokens can be taken."""
 
     def __enter__(self) -> Encoder:
         return self
@@ -45,7 +45,7 @@ class Encoder:
         self._collect()
 
     def take(self, count: int) -> np.ndarray:
-        """The tokens of the next `count` frames, one at least, which are ready."""
+        """The tokens of the next `count` frames (at least one), which must be ready."""
         taken, missing = [], count
         while missing:
             piece = self._tokens.popleft()

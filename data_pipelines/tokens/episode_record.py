@@ -23,7 +23,7 @@ HEADER = 10  # int32 entries; a multiple of the widest item's alignment
 class StoredEpisode:
     """One episode. Every array is a read-only view into the record's bytes."""
 
-    episode: int  # number in the source split, damaged ones counted
+    episode: int  # number in the source split, counting damaged ones
     success: bool | None
     tokens: np.ndarray  # uint16 or uint32 [F, S] or float16 [F, S, C], every frame_step-th native frame
     actions: np.ndarray  # float32 [N, A], native rate, raw units
@@ -51,7 +51,7 @@ def encode_episode(item: StoredEpisode) -> bytes:
     ]
     if item.frames is not None:
         parts.append(np.ascontiguousarray(item.frames, np.uint8))
-    return b"".join(parts)  # which copies them once
+    return b"".join(parts)  # this copies them once
 
 
 def decode_episode(data: bytes) -> StoredEpisode:

@@ -56,13 +56,12 @@ def import_tokens(
 ) -> Manifest:
     """Reads a pair of folders into `<store_root>/<name>` and returns the manifest.
 
-    The rate is `hz`, else that of the registry's entry `name`; the folders' own is refused, as the
-    release's table is wrong for many. Latents become tokens of `patch` x `patch` cells.
-    `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz frames).
-    With `tokenizer`, which must be the one that made the tokens, validation frames are decoded and kept.
-    A dataset that the store has already, made of the same folders in the same way, is left as it is.
-    Raises ConfigError for folders that do not belong together or a store that cannot be
-    written, DataError for damaged ones.
+    The rate is `hz`, or else that of the registry's entry `name`; the folders' own rate is not used, since the
+    release's table is wrong for many. Latents become tokens of `patch` x `patch` cells. `frame_step`: one of this many
+    native frames is stored; by default the stride (the 2 Hz frames). With `tokenizer`, which must be the one that made
+    the tokens, validation frames are decoded and kept. A dataset that the store already has, made from the same folders
+    in the same way, is left as it is. Raises ConfigError for folders that do not belong together or a store that cannot
+    be written, DataError for damaged ones.
     """
     folders = {"train": open_folder(train), "val": open_folder(val)}
     plan = _plan(folders, name, hz, patch, frame_step, tokenizer)
@@ -115,7 +114,7 @@ def _plan(
         f"(metadata.json says {train.metadata.get('hz')!r}, but this comes from a table that is wrong for many "
         "datasets)",
     )
-    # Where these frames came from is not known here, so the keys say no more than what they are.
+    # The origin of these frames is unknown here, so the keys say only what they are.
     spec = DatasetSpec(name, "video", ("actions",), (train.actions.shape[1],), float(rate))
     frame_step = spec.stride if frame_step is None else frame_step
     require(
@@ -136,8 +135,8 @@ def _plan(
 
 
 def _facts(folder: ReleaseFolder, patch: int) -> TokenizerFacts:
-    """Ids of a vocabulary that is no power of 512 have one factor. ConfigError for a grid that the patch does not
-    divide."""
+    """Ids of a vocabulary that is not a power of 512 have one factor. Raises ConfigError for a grid that the patch does
+    not divide."""
     side, vocab = folder.video.shape[-1], folder.vocab_size
     pixels = PIXELS.get(str(folder.metadata.get("encoder_type")))
     image_size = side * pixels if pixels else IMAGE_SIZE
@@ -158,7 +157,7 @@ def _episode(
     patch: int,
     decode: Callable[[np.ndarray], np.ndarray] | None,
 ) -> StoredEpisode:
-    """Episode `episode` of a folder, as `number` of the dataset. DataError for values out of range."""
+    """Episode `episode` of a folder, as number `number` of the dataset. Raises DataError for values out of range."""
     start, stop = folder.bounds[episode : episode + 2]
     tokens = _tokens(folder, start, stop, plan.frame_step, patch)
     actions = np.asarray(folder.actions[start:stop])
@@ -184,7 +183,7 @@ def _tokens(folder: ReleaseFolder, start: int, stop: int, step: int, patch: int)
         raise DataError(f"{folder.path / 'video.bin'}: latents of frames {start} to {stop - 1} are not finite.")
     frames, channels, side, _ = part.shape
     grid = side // patch
-    # As the models read a patch: cells row by row, channels of a cell together.
+    # In the order in which the models read a patch: cells row by row, channels of a cell together.
     cells = part.reshape(frames, channels, grid, patch, grid, patch).transpose(0, 2, 4, 3, 5, 1)
     scaled = cells.astype(np.float32) * np.float32(LATENT_SCALE)
     return scaled.reshape(frames, grid**2, patch**2 * channels).astype(np.float16)
@@ -201,7 +200,8 @@ def _fingerprint(folders: dict[str, ReleaseFolder]) -> str:
 
 
 def pair_folders(folders: Sequence[Path]) -> list[tuple[str, Path, Path]]:
-    """(name, train, val) of folders called `<name>_train` and `<name>_val`; ConfigError without a mate."""
+    """(name, train, val) of folders called `<name>_train` and `<name>_val`. Raises ConfigError if one of a pair is
+    missing."""
     stems: dict[Path, dict[str, Path]] = {}
     for folder in folders:
         stem, _, split = folder.name.rpartition("_")

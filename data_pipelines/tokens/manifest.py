@@ -1,8 +1,8 @@
 """The manifest of one tokenised dataset: what it was made from, how, and what it holds.
 
-Owns its two files: `manifest.json`, and `episodes.columns` with the columns that have an entry per episode, which
-are read on use. A manifest holds no path and no time, so tokenising the same data in the same way gives the same
-manifest, and its hash identifies the data of a run.
+Owns its two files: `manifest.json`, and `episodes.columns` with the columns that have an entry per episode; columns are
+read when they are used. A manifest holds no path and no time, so tokenising the same data in the same way gives the
+same manifest, and its hash identifies the data of a run.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ EPISODE_COLUMNS = ("episodes", "steps")
 """Columns of `SplitFacts` with an entry per episode: up to millions, so no code loops over them."""
 
 RECIPE_VERSION = 1
-"""Raise it when a change to the code alters what `tokenize_job` stores of the same source: tokens of an older version
-are then refused where new ones are asked for."""
+"""Raise it when a change to the code alters what `tokenize_job` stores for the same source: tokens of an older version
+are then refused if new ones are asked for."""
 
 FORMAT_VERSION, READABLE_FORMATS = 3, (2, 3)
-"""The version of the store's layout, and those that can be read. Version 1 had one file per split, 2 the columns as
-JSON."""
+"""The version of the store's layout, and the versions that can be read. Version 1 had one file per split; version 2
+stored the columns as JSON."""
 
 
 @dataclass(frozen=True)
 class TokenizerFacts:
-    """Which tokenizer, and the shape of what it makes."""
+    """Which tokenizer was used, and the shape of its tokens."""
 
     identity: str  # hash of its configuration and weights
     image_size: int
     grid: int
     tokens: int  # S
-    vocab_size: int  # 0, as the next two, where tokens are latents
+    vocab_size: int  # 0, like the next two, if tokens are latents
     factors: int  # Q
     factor_vocab: int  # V
     channels: int = 0  # C of latents; 0: tokens are ids
@@ -61,15 +61,15 @@ class TokenizerFacts:
 
 @dataclass(frozen=True)
 class JobSettings:
-    """What a tokenising job may choose. Equal settings on equal input give equal stores."""
+    """The settings of a tokenising job. Equal settings on equal input give equal stores."""
 
     val_fraction: float = HeldOut.val_fraction
     min_val: int = HeldOut.min_val
     max_val: int = HeldOut.max_val
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
-    max_val_fraction: float = later(0.5)  # limits min_val too; new stores take that of `HeldOut`
-    max_train: int | None = later(None)  # where that leaves episodes out
+    max_val_fraction: float = later(0.5)  # limits min_val too; new stores use the value of `HeldOut`
+    max_train: int | None = later(None)  # set only if it leaves episodes out
 
     def __post_init__(self):
         self.held_out.check()
@@ -88,7 +88,7 @@ class JobSettings:
 class SplitFacts:
     """The episodes of one split, in store order."""
 
-    episodes: Sequence[int] = ()  # number in the source, damaged ones counted
+    episodes: Sequence[int] = ()  # number in the source, counting damaged ones
     steps: Sequence[int] = ()  # native frames N
     content: str = ""  # hash over all records
     parts: tuple[int, ...] = ()  # episodes in each part; there is no file for 0
@@ -123,7 +123,7 @@ class Manifest:
     settings: JobSettings
     source: str  # fingerprint of the shards
     source_version: str
-    action_mean: tuple[float, ...]  # over native actions of the train split, raw units
+    action_mean: tuple[float, ...]  # statistics over native actions of the train split, raw units
     action_std: tuple[float, ...]
     train: SplitFacts
     val: SplitFacts
@@ -137,7 +137,8 @@ class Manifest:
     format: int = FORMAT_VERSION
 
     def stride_at(self, rate: float | None) -> int:
-        """Native frames per model frame at `rate` Hz (None: native). ConfigError if such frames are not stored."""
+        """Native frames per model frame at `rate` Hz (None: native). Raises ConfigError if such frames are not
+        stored."""
         stride = self.spec.stride_at(rate)
         own = rate if self.spec.rate is None else self.spec.rate
         require(
@@ -155,17 +156,17 @@ class Manifest:
 
     @property
     def skipped_count(self) -> int:
-        """Episodes left out."""
+        """Number of episodes left out."""
         return sum(entry.episodes for entry in self.skipped)
 
     @property
     def left_out(self) -> int:
-        """Episodes of the source that `settings.max_train` leaves out."""
+        """Number of episodes of the source that `settings.max_train` leaves out."""
         return sum(self.episodes_of_parts) - len(self.train.episodes) - len(self.val.episodes) - self.skipped_count
 
     @property
     def episodes_of_parts(self) -> list[int]:
-        """How many episodes the source has, left out and skipped ones counted; of a joined dataset, each part of it."""
+        """How many episodes the source has, including left out and skipped ones; for a joined dataset, of each part."""
         if self.runs:
             return [sum(run.count for run in own) for own in runs_of_parts(self.runs).values()]
         return [len(self.train.episodes) + len(self.val.episodes) + self.skipped_count]
@@ -186,11 +187,12 @@ class Manifest:
         scale: ActionScale = "deviation",
         action_range: ActionRange | None = None,
     ) -> Embodiment:
-        """The model's view of this dataset's actions at `rate`. `moments` and `action_range` are of the trajectories
-        that are used; by default of the whole train split.
+        """The model's view of this dataset's actions at `rate`. `moments` and `action_range` are those of the
+        trajectories that are used; by default, of the whole train split.
 
-        By `quantiles`, a value that from 1 % to 99 % is one number, or one and its rounding (`DEAD_STD`), and yet
-        varies is measured by its extremes. Raises DataError for a manifest of a version that kept no quantiles.
+        With the scale `quantiles`, a value that varies, but is the same number up to rounding (`DEAD_STD`) from its 1 %
+        to its 99 % quantile, is scaled by its extremes. Raises DataError for a manifest of a version that kept no
+        quantiles.
         """
         return self._embodiment(self.stride_at(rate), moments, scale, action_range)
 
@@ -240,7 +242,7 @@ class Manifest:
         return stable_hash([self._facts(), list(self._digests().values())])
 
     def _facts(self) -> dict[str, Any]:
-        """All but the episode columns, as plain JSON: equal for stores that are equal but for their version."""
+        """All except the episode columns, as plain JSON: equal for stores that differ only in their version."""
         return identity_of(self._without_episodes())
 
     def _columns(self) -> dict[str, Column]:

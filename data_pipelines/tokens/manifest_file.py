@@ -1,4 +1,4 @@
-"""Reading a manifest from its files, of the current format or the previous one."""
+"""Reads a manifest from its files, in the current format or the previous one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hma_jax.config.json import from_dict
 def load_manifest(path: Path) -> Manifest:
     """Reads a manifest of the current format, or of the previous one, whose columns are in its JSON.
 
-    Raises DataError if it is missing, damaged or of another format, UnreachableError where the disk fails.
+    Raises DataError if it is missing, damaged or of another format, UnreachableError if the disk fails.
     """
     advice = "Remove the dataset from the store and tokenise it again."
     try:
@@ -56,7 +56,7 @@ def _from_json(path: Path, values: dict[str, Any]) -> EpisodeColumns:
 
 
 def _from_file(path: Path, values: dict[str, Any]) -> EpisodeColumns:
-    """The columns beside a manifest, which says what they are."""
+    """The columns in the file beside a manifest, which describes them."""
     stated = values.pop("columns")
     file = path.with_name(COLUMNS_FILE)
     columns = retry(file, lambda: Columns(file))

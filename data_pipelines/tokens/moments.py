@@ -1,4 +1,4 @@
-"""Moments of actions, computed part by part; the bits of the result do not depend on the processes that did it."""
+"""Moments of actions, computed part by part; the result is the same to the bit whichever processes computed it."""
 
 from __future__ import annotations
 

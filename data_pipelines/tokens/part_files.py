@@ -1,7 +1,7 @@
 """One part of a dataset in the token store: its files, and the facts file that marks it as complete.
 
 Owns how a part is written, validated and described. A part holds a range of the source's episodes. The ranges depend
-on the source alone, so that any number of processes, killed and restarted at will, make the same files.
+only on the source, so any number of processes, killed and restarted at will, make the same files.
 
     <dataset>/train-00003-of-00120.array_record   its training episodes, if any
     <dataset>/train-00003-of-00120.moments.npy    statistics of the actions of each of these
@@ -34,7 +34,7 @@ from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 
 ACTIONS = "actions"
-"""The file beside a part whose records hold frames, with the native actions of its episodes one after the other."""
+"""The file beside a part whose records hold frames: the native actions of its episodes, one after the other."""
 
 FACTS = "parts"
 """Directory of the facts of all parts."""
@@ -45,7 +45,8 @@ PartItem = tuple[str, StoredEpisode] | SkippedEpisodes
 
 @dataclass(frozen=True)
 class Part:
-    """Part `number` of `count`: of the episodes that are read of the source, those from `first` to before `end`."""
+    """Part `number` of `count`: of the source's episodes that are read, those from `first` up to but not including
+    `end`."""
 
     number: int
     count: int
@@ -127,7 +128,8 @@ def write_part(
 def read_part(directory: Path, part: Part) -> PartFacts | None:
     """The facts of a finished part; None if it is missing, or its files do not have the sizes they were written with.
 
-    Sizes suffice to detect what a crash or a full disk leaves behind, and numbers of rows of what stands beside.
+    Sizes are enough to detect what a crash or a full disk leaves behind; for the arrays beside the records, numbers of
+    rows.
     """
     try:
         facts = from_dict(PartFacts, json.loads(_facts_path(directory, part).read_text()))
@@ -142,15 +144,15 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
 
 
 def read_actions(part: Path, steps: int) -> np.ndarray | None:
-    """float32 [steps, A]: the native actions of a part's episodes; None where they stand in the records alone. Raises
-    as `read_beside`."""
+    """float32 [steps, A]: the native actions of a part's episodes; None if only the records have them. Raises what
+    `read_beside` raises."""
     of = f"the actions of {steps} steps"
     return read_beside(part, ACTIONS, steps, np.float32, of, "they are read with the frames")
 
 
 def _reads_beside(path: Path, split: str, own: PartSplit) -> bool:
-    """Whether what stands beside the records at `path` is that of these episodes. A part of an earlier version lacks
-    the actions, and is as good without."""
+    """Whether the arrays beside the records at `path` belong to these episodes. A part of an earlier version lacks the
+    actions, and is valid without them."""
     try:
         read_actions(path, sum(own.steps))
         return split != "train" or read_moments(path, len(own.episodes)) is not None

@@ -18,10 +18,10 @@ from data_pipelines.tokens.part_files import FACTS, Part, PartItem, read_part, w
 from hma_jax.runtime.locks import Held
 
 Progress = Callable[[int, int], None]
-"""Called with the episodes done, by whichever process, and all of them."""
+"""Called with the number of episodes done, by any process, and the number of all."""
 
 Make = Callable[[Part], Iterable[PartItem]]
-"""Gives what a part is made of, in order; equal parts give equal items."""
+"""Yields what a part is made of, in order; equal parts yield equal items."""
 
 
 def locks_of(work: Path) -> Path:
@@ -31,13 +31,13 @@ def locks_of(work: Path) -> Path:
 
 @dataclass
 class PartMaker:
-    """What this process knows of the parts in the directory `work`."""
+    """What this process knows about the parts in the directory `work`."""
 
     work: Path
-    final: Path  # where the dataset will be
+    final: Path  # the dataset's final directory
     plan: Manifest
     parts: Sequence[Part]
-    skipped: tuple[SkippedEpisodes, ...]  # in no part
+    skipped: tuple[SkippedEpisodes, ...]  # episodes in no part
     max_skipped: int
     _done: dict[int, tuple[SkippedEpisodes, ...]] = field(default_factory=dict)  # per finished part: what was skipped
 
@@ -46,7 +46,7 @@ class PartMaker:
         return all(self._is_finished(part) for part in self.parts)
 
     def forget(self, part: Part) -> None:
-        """For a part that turned out damaged: the next look finds it missing."""
+        """For a part that turned out damaged: the next check finds it missing."""
         self._done.pop(part.number, None)
 
     def make_free_parts(self, make: Make, progress: Progress | None) -> None:
@@ -91,12 +91,12 @@ class PartMaker:
         except FileNotFoundError:
             if not lock.lost():
                 raise
-            return  # this process had been stopped for so long that another host took the part over
+            return  # this process was stopped for so long that another host took the part over
         self._done[part.number] = facts.lost
 
     def _is_finished(self, part: Part) -> bool:
-        """Whether a part is finished, by whichever process. One with skipped episodes is not where none may be skipped:
-        made again, it raises the error."""
+        """Whether a part is finished, by any process. A part with skipped episodes does not count if none may be
+        skipped: when it is made again, it raises the error."""
         if part.number not in self._done:
             facts = read_part(self.work, part)
             if facts is None or (facts.lost and not self.max_skipped):

@@ -37,7 +37,7 @@ class Begin:
 
 @dataclass(frozen=True)
 class End:
-    """All frames of episode `index` were given; or it is unusable, and those that were given must be discarded."""
+    """All frames of episode `index` were given; or it is unusable, and the frames that were given must be discarded."""
 
     index: int
     error: EpisodeError | None = None
@@ -58,7 +58,7 @@ def frames_ahead(
 ) -> Iterator[Item]:
     """The frames of `episodes`, one after the other: Begin, `fit(frame)` of every frame_step-th, End.
 
-    `fit` gives arrays of `frame_bytes`. An EpisodeError of `fit` or of decoding ends that episode only; any other
+    `fit` returns arrays of `frame_bytes`. An EpisodeError in `fit` or in decoding ends only that episode; any other
     error is raised here. Close the iterator to stop the threads.
     """
     reader = _Reader(episodes, open_episode, fit, frame_bytes, frame_step, threads)

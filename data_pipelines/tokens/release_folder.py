@@ -54,18 +54,18 @@ class ReleaseFolder:
 
     @property
     def encoder(self) -> str:
-        """What made the tokens, as far as the folder says."""
+        """The encoder that made the tokens, as far as the folder says."""
         kind, of = self.metadata.get("encoder_type"), self.metadata.get("encoder_name_or_path")
         words = " ".join(str(word) for word in (kind, Path(str(of)).name if of else None) if word)
         return f"{words or 'unknown encoder'} (release folder)"
 
     def __len__(self) -> int:
-        """Episodes."""
+        """Number of episodes."""
         return len(self.bounds) - 1
 
 
 def open_folder(path: str | Path) -> ReleaseFolder:
-    """Raises DataError, naming the file and the sizes, where the files do not fit each other."""
+    """Opens a folder. Raises DataError, naming the file and the sizes, if its files do not fit each other."""
     path = Path(path)
     meta = _metadata(path / "metadata.json")
     frames, shape, dtype = _video_shape(path, meta)
@@ -108,7 +108,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def _video_shape(path: Path, meta: dict[str, Any]) -> tuple[int, tuple[int, ...], np.dtype]:
-    """(N, shape, dtype). Raw images are refused: they are no tokens."""
+    """(N, shape, dtype). Raw images are refused: they are not tokens."""
     frames, grid, channels = meta["num_images"], (meta["h"], meta["w"]), meta.get("latent_channels")
     dtype = np.dtype(meta.get("token_dtype", "float16" if channels else "uint32"))
     if grid[0] != grid[1]:

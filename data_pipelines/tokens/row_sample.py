@@ -1,9 +1,9 @@
 """Quantiles of actions that are computed part by part: exact for few rows, from a random sample for many.
 
 A row is the action of one step. The sample is the bottom-k sample by hash: the `ROWS` rows whose (episode, step) has
-the smallest hashes. It depends on the rows alone, not on the parts, their order or which process merged them. Up to
-`ROWS` rows the quantiles are exact. Beyond, the value given as the p-quantile is that of a share p ± sqrt(p (1 - p)
-/ ROWS) of the rows (one standard deviation): 0.16 points at 1 % and 99 %, 0.78 at the median.
+the smallest hashes. It depends only on the rows, not on the parts, their order or which process merged them. Up to
+`ROWS` rows the quantiles are exact. Beyond that, the value given as the p-quantile is the quantile of a share p ±
+sqrt(p (1 - p) / ROWS) of the rows (one standard deviation): 0.16 points at 1 % and 99 %, 0.78 at the median.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ ROWS = 4096
 """Largest number of rows that a dataset's quantiles are computed from."""
 
 QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
-"""The quantiles that a manifest stores, and an inspection shows."""
+"""The quantiles that a manifest stores and an inspection shows."""
 
 MAX_STEPS = np.uint64(2**32)
-"""Steps of an episode, so that episode * MAX_STEPS + step is unique."""
+"""Largest number of steps of an episode, so that episode * MAX_STEPS + step is unique."""
 
 SEED = stream_seed("quantiles")
 
 
 PIECE = 2**22
-"""Rows whose hashes are in memory at a time."""
+"""Number of rows whose hashes are in memory at a time."""
 
 
 @dataclass(frozen=True)
 class ActionRange:
     """The range of each action value: `quantiles`, one row per `QUANTILES`, and the smallest and the largest value. All
-    are () without rows; `low` and `high` also where the quantiles of every value that varies do (`quantiles_vary`)."""
+    are () without rows; `low` and `high` also if every value that varies has quantiles that vary (`quantiles_vary`)."""
 
     quantiles: tuple[tuple[float, ...], ...] = ()
     low: tuple[float, ...] = ()
@@ -65,7 +65,7 @@ class RowSample:
     def quantiles(self) -> tuple[tuple[float, ...], ...]:
         """For each of `QUANTILES` the values of all columns; () without rows.
 
-        A value that occurs: the smallest that at least so large a share of the rows does not exceed.
+        Each is a value that occurs: the smallest one that at least this share of the rows does not exceed.
         """
         values = np.sort(self.arrays()[1], axis=0)
         if not values.size:
@@ -84,11 +84,11 @@ class RowSampler:
         self._count = 0
 
     def add(self, rows: np.ndarray, episode: int) -> None:
-        """The actions [N, A] of episode `episode` of the dataset, which comes once."""
+        """Adds the actions [N, A] of episode `episode` of the dataset; each episode is added once."""
         self._put(_hashes(np.array([episode]), np.array([len(rows)])), np.asarray(rows, np.float32))
 
     def add_sample(self, sample: RowSample) -> None:
-        """What another sampler kept, of other episodes."""
+        """Adds what another sampler kept, of other episodes."""
         self._put(*sample.arrays())
 
     def sample(self) -> RowSample:
@@ -115,7 +115,7 @@ class RowSampler:
 
 
 def _hashes(episodes: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """uint64 of every row of `episodes`, which have so many `steps`, one after the other."""
+    """uint64 for every row of `episodes`, one after the other; `steps`: the number of rows of each."""
     first = np.cumsum(steps) - steps
     step = np.arange(int(steps.sum()), dtype=np.uint64) - np.repeat(first.astype(np.uint64), steps)
     return hash64(np.repeat(episodes.astype(np.uint64), steps) * MAX_STEPS + step, SEED)
@@ -137,7 +137,7 @@ def sampled_episodes(episodes: np.ndarray, steps: np.ndarray, limit: int = ROWS)
 
 
 def merge_samples(samples: Iterable[RowSample]) -> RowSample:
-    """A sample of all rows together; they are of different episodes. The result does not depend on order or
+    """A sample of all rows together; the samples are of different episodes. The result does not depend on order or
     grouping."""
     sampler = RowSampler()
     for sample in samples:
@@ -146,7 +146,8 @@ def merge_samples(samples: Iterable[RowSample]) -> RowSample:
 
 
 def rows_of_part(parts: int) -> int:
-    """Rows to keep of one of `parts` parts: eight times its even share, so that all parts together stay small.
+    """Number of rows to keep of one of `parts` parts: eight times its even share, so that all parts together stay
+    small.
 
     The parts have about as many bytes each. One with more than eight times its share of the dataset's
     rows would be under-represented.

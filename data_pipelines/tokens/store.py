@@ -33,17 +33,17 @@ from hma_jax.model.embodiments import DEAD_STD, EmbodimentTable
 _File = tuple[str, str, int]  # dataset, split, part
 
 MAX_OPEN_FILES = 512
-"""Files kept open, at most half of those that the process may open. Opening one again takes about as long as two
-windows: mixed from 40 datasets of one part each, 72 thousand frames are read per second on one core, of 25 parts each
-44 thousand.
+"""Files kept open, at most half of those that the process may open. Opening one again takes about as long as reading
+two windows: from a mixture of 40 datasets, one core reads 72 thousand frames per second with one part each, and 44
+thousand with 25 parts each.
 """
 
 
 class TokenStore:
     """Opens every dataset under `root`. Thread-safe; pickles (files are reopened).
 
-    Raises DataError if `root` is no store, a manifest is damaged, or a dataset lies under another name than its own;
-    later also where a dataset was replaced or removed meanwhile.
+    Raises DataError if `root` is not a store, a manifest is damaged, or a dataset is in a directory of another name;
+    later also if a dataset was replaced or removed meanwhile.
     """
 
     def __init__(self, root: str | Path):
@@ -53,7 +53,7 @@ class TokenStore:
         found = sorted(p.parent for p in self.root.glob(f"*/{FILE}") if not p.parent.name.startswith("."))
         if not found:
             raise DataError(f"{self.root}: the token store is empty. Tokenise datasets into it first.")
-        # Before their contents: what is replaced in between is noticed.
+        # Read before the contents, so that a replacement in between is noticed.
         self._stamps = {directory.name: _stamp(directory / FILE) for directory in found}
         self._manifests = {directory.name: load_manifest(directory / FILE) for directory in found}
         for directory, manifest in zip(found, self._manifests.values(), strict=True):
@@ -90,14 +90,14 @@ class TokenStore:
         return EmbodimentTable(tuple(self.manifest(name).embodiment(rate, scale=scale) for name in names))
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
-        """Episode `i` of a split, in store order. Raises DataError for a damaged record, UnreachableError where the
-        disk fails."""
+        """Episode `i` of a split, in store order. Raises DataError for a damaged record, UnreachableError if the disk
+        fails."""
         part, at = self._locate(name, split, i)
         try:
             return self._read(name, split, part, at)
         except (DataError, OSError):
-            # The library's errors do not tell damage from a disk that failed. What fails again is damage, if the file
-            # can be read; if it is missing, the second error says so.
+            # The library's errors do not distinguish damage from a failed disk. If reading fails again although the
+            # file can be read, it is damage; if the file is missing, the second error says so.
             with self._lock:
                 self._readers.pop((name, split, part), None)
             with suppress(FileNotFoundError):
@@ -107,7 +107,7 @@ class TokenStore:
     def _read(self, name: str, split: str, part: int, at: int) -> StoredEpisode:
         reader = self._reader(name, split, part)
         try:
-            # A range: the same for a list of records takes time that grows with all records of the file.
+            # A range, since reading a list of records takes time that grows with all records of the file.
             return decode_episode(reader.read(at, at + 1)[0])
         except (RuntimeError, ValueError) as error:
             path = self._path(name, split, part)
@@ -116,8 +116,8 @@ class TokenStore:
             ) from error
 
     def actions(self, name: str, split: str, i: int) -> np.ndarray:
-        """float32 [N, A], a copy: the native actions of episode `i` of a split, without its frames where they stand
-        beside them. Raises as `episode`."""
+        """float32 [N, A], a copy: the native actions of episode `i` of a split, without reading its frames if a file
+        beside the records has them. Raises as `episode` does."""
         part, at = self._locate(name, split, i)
         facts = self.manifest(name).split(split)
         with self._checking_not_replaced(name):
@@ -129,10 +129,10 @@ class TokenStore:
         return np.array(kept[first : first + steps[at]])
 
     def action_range(self, name: str, episodes: Sequence[int]) -> ActionRange:
-        """The range of the actions of these training episodes alone (positions in the store).
+        """The range of the actions of these training episodes only (positions in the store).
 
-        Reads the episodes that the quantiles are computed from, and all of them if some value changes but its
-        quantiles do not. Raises DataError for a damaged record.
+        Reads the episodes from which the quantiles are computed, and all of them if some value varies but its quantiles
+        do not. Raises DataError for a damaged record.
         """
         facts, episodes = self.manifest(name).train, np.asarray(episodes, np.int64)
         numbers, steps = (np.asarray(column, np.int64)[episodes] for column in (facts.episodes, facts.steps))
@@ -152,10 +152,10 @@ class TokenStore:
         return ActionRange(quantiles, tuple(low.tolist()), tuple(high.tolist()))
 
     def action_moments(self, name: str, episodes: np.ndarray) -> Moments:
-        """Statistics of the actions of these training episodes alone (int [N], positions in the store).
+        """Statistics of the actions of these training episodes only (int [N], positions in the store).
 
-        Reads what stands beside each part, and the episodes themselves in a store of earlier versions, which
-        gives the same bits. Raises as `episode`.
+        Reads the arrays beside each part or, in a store of earlier versions, the episodes themselves, which gives the
+        same bits. Raises as `episode`.
         """
         rows, ends = [], self._ends[name, "train"]
         episodes = np.sort(episodes)
@@ -214,7 +214,7 @@ class TokenStore:
     def _open(self, name: str, split: str, part: int) -> array_record_module.ArrayRecordReader:
         path, expected = self._path(name, split, part), self.manifest(name).split(split).parts[part]
         advice = f"Remove {path.parent} and tokenise the dataset again."
-        try:  # a missing file is to the library one without records
+        try:  # the library takes a missing file for one without records
             reader = array_record_module.ArrayRecordReader(str(path), options=READ_OPTIONS)
         except RuntimeError as error:
             raise DataError(f"{path}: not a readable ArrayRecord file ({error}). {advice}") from error
@@ -248,7 +248,7 @@ class TokenStore:
 
     @contextmanager
     def _checking_not_replaced(self, name: str) -> Iterator[None]:
-        """For what is read meanwhile: damaged or not, it may be that of a dataset which replaced this one."""
+        """Checks what is read in the block: damaged or not, it may come from a dataset that replaced this one."""
         try:
             yield
         finally:
@@ -263,7 +263,7 @@ class TokenStore:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Size and time of change of a file, None without one. Raises UnreachableError."""
+    """Size and modification time of a file; None if there is none. Raises UnreachableError."""
     try:
         status = retry(path, lambda: os.stat(path))
     except FileNotFoundError:

@@ -1,11 +1,11 @@
 """Tokenises the episodes of any source into one dataset of the token store.
 
-Owns what is stored of an episode: which are held out, which frames are kept, how frames of many episodes are encoded
+Owns what is stored of the episodes: which are held out, which frames are kept, how frames of many episodes are encoded
 in batches of equal size. Prefetching is in `read_ahead`; parts, restarts, several processes and publishing are in
 `dataset_writer`.
 DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written, and everything after
-it is misaligned (reference section 5.1). Here an episode is stored completely, or recorded as skipped with its file
-and offset.
+it is misaligned (reference section 5.1). Here an episode is stored completely, or recorded as skipped with its file and
+offset.
 """
 
 from __future__ import annotations
@@ -73,17 +73,17 @@ def tokenize_dataset(
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
     `frame_step`: native frames per stored frame; by default the stride at `rate` Hz (None: native), which it must
-    divide. 1 stores all frames and serves every rate. At least `batch` images are encoded at a time (as many as fill
-    the devices), `threads` (default: as many as cores, up to 8) decode. If the store already has this dataset, made
-    from the same shards in the same way, nothing is done. Any number of processes may run the same call, start and be
-    killed at any time: each makes parts that no other one makes. `progress(done, total)` counts the episodes of all
-    processes; `warn` is told of values of the action that look like wrapping angles, in the parts that this process
-    makes. With `wait` it waits for the parts of other processes; without, it returns None while parts are missing. The
-    bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of JobSettings only.
+    divide. 1 stores all frames and serves every rate. At least `batch` images are encoded at a time (rounded up to fill
+    the devices), `threads` (default: one per core, up to 8) decode. If the store already has this dataset, made from
+    the same shards in the same way, nothing is done. Any number of processes may run the same call, and start and be
+    killed at any time: each makes parts that no other process makes. `progress(done, total)` counts the episodes of all
+    processes; `warn` is called about values of the action that look like wrapping angles, in the parts that this
+    process makes. With `wait` the call waits for the parts of other processes; without, it returns None while parts are
+    missing. The bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of JobSettings
+    only.
 
-    Raises ConfigError for keys, settings or a store directory that cannot work, and for a
-    dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
-    (see `EpisodeSource`).
+    Raises ConfigError for keys, settings or a store directory that cannot work, and, unless `overwrite`, for a dataset
+    in its place that was made differently; DataError for damaged data (see `EpisodeSource`).
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
@@ -106,7 +106,7 @@ def tokenize_dataset(
             wait=wait,
             progress=progress,
         )
-    finally:  # what was seen of a job that ends here is not read again
+    finally:  # what was read so far is not read again if the job ends here
         watch.look()
     source.save_steps()
     return manifest
@@ -123,7 +123,7 @@ def plan_dataset(
     frame_step: int | None = None,
     recorded: str = "",
 ) -> Manifest:
-    """The manifest of a dataset before it is made; `recorded` as of `EpisodeSource.fingerprint_as`.
+    """The manifest of a dataset before it is made; `recorded` as in `EpisodeSource.fingerprint_as`.
 
     Raises ConfigError for settings that cannot work."""
     frame_step = resolve_frame_step(spec, frame_step, rate)
@@ -151,8 +151,8 @@ def plan_again(
     rate: float | None,
     frame_step: int | None = None,
 ) -> Manifest:
-    """The plan for an `existing` dataset by its entry and settings of now, of the same recordings by the same
-    tokenizer: no source is opened. Raises ConfigError for settings that cannot work."""
+    """The plan for an `existing` dataset with its present entry and settings, for the same recordings and tokenizer: no
+    source is opened. Raises ConfigError for settings that cannot work."""
     joins = existing.spec.joins if spec.joins else ()  # those that are given
     held_out = _without_idle_limit(existing.spec, existing.runs, held_out)
     return replace(
@@ -164,7 +164,7 @@ def plan_again(
 
 
 def _without_idle_limit(spec: DatasetSpec, runs: Sequence[EpisodeRun], held_out: HeldOut) -> HeldOut:
-    """The same amounts, without a `max_train` that leaves no episode out: the store is the one without it."""
+    """The same amounts, without a `max_train` that leaves no episode out: the store is then the same as without it."""
     if held_out.max_train is None or not runs:
         return held_out
     train, val = used_episodes(spec, runs, held_out)
@@ -173,7 +173,7 @@ def _without_idle_limit(spec: DatasetSpec, runs: Sequence[EpisodeRun], held_out:
 
 def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | None) -> int:
     """Native frames per stored frame: `frame_step` or, if that is None, the stride at `rate` Hz (None: native). Raises
-    ConfigError for a step that does not divide that stride."""
+    ConfigError if the step does not divide that stride."""
     stride = spec.stride_at(rate)
     frame_step = stride if frame_step is None else frame_step
     require(
@@ -185,7 +185,7 @@ def resolve_frame_step(spec: DatasetSpec, frame_step: int | None, rate: float | 
 
 
 def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
-    """What a manifest says of a tokenizer, which has the same fields."""
+    """What a manifest says about a tokenizer, which has the same fields."""
     return TokenizerFacts(**{f.name: getattr(tokenizer, f.name) for f in fields(TokenizerFacts)})
 
 
@@ -195,7 +195,7 @@ class _Pending:
 
     begin: Begin
     keep: bool
-    frame_count: int = 0  # frames put into the tokenizer's input
+    frame_count: int = 0  # frames given to the encoder
     frames: list[np.ndarray] = field(default_factory=list)
     end: End | None = None  # None: more frames are to come
 
@@ -219,17 +219,17 @@ class _Work:
         train, val = used_episodes(plan.spec, source.runs, plan.settings.held_out)
         self._is_val = val[self._numbers]
         self.episodes = np.flatnonzero((train | val)[self._numbers])
-        """int64: positions in the source of those that are read. Parts are ranges of them."""
+        """int64: positions in the source of the episodes that are read. Parts are ranges of them."""
         self.wanted = int((train | val).sum())
-        """How many there should be, unreadable ones counted."""
+        """How many episodes there should be, including unreadable ones."""
 
     @property
     def skipped(self) -> list[SkippedEpisodes]:
-        """What the source cannot give of the wanted episodes, before one is opened."""
+        """Wanted episodes that the source cannot give, before one is opened."""
         reasons = {self._source.without_location(why): n for why, n in sorted(self._source.skipped.items())}
         if self._plan.settings.max_train is None:
             return [SkippedEpisodes(why, episodes=n) for why, n in reasons.items()]
-        missing = self.wanted - len(self.episodes)  # of these it is not known which reason is whose
+        missing = self.wanted - len(self.episodes)  # it is not known which of the reasons belong to these
         return [SkippedEpisodes(" ".join([*reasons][:MAX_LISTED]), episodes=missing)] if missing else []
 
     def make(self, part: Part) -> Iterator[PartItem]:

@@ -1,7 +1,7 @@
-"""Looks for wrapping angles in the actions that are tokenised, which are read anyway.
+"""Looks for wrapping angles in the actions while they are tokenised and so read anyway.
 
-No model can predict a value that jumps by a whole turn, and to find this after training costs the training. Owns what
-is remembered of the actions; `registry.angles` says what such a jump is. Changes nothing that is stored.
+No model can predict a value that jumps by a whole turn, and to find this out after training wastes the training. Owns
+what is remembered about the actions; `registry.angles` says what such a jump is. Changes nothing that is stored.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import RECOGNISED, SWITCH_SHARE, AngleUnit, angle_lines, count_jumps, find_turns
 
 EARLY = 64
-"""Episodes after which is looked for the first time; the second is at the end."""
+"""Number of episodes after which the first check is made; the second is at the end."""
 
 REMEMBERED = 4096
-"""Steps by which an angle is told from a switch, at least, if there are so many."""
+"""Least number of steps needed to distinguish an angle from a switch, if there are that many."""
 
 
 class TurnWatch:
@@ -28,7 +28,7 @@ class TurnWatch:
         width = sum(spec.action_dims)
         self._low, self._high = np.full(width, np.inf), np.full(width, -np.inf)
         self._jumps = {unit: np.zeros((2, width), np.int64) for unit in RECOGNISED}
-        self._open = np.ones(width, bool)  # values of which nothing is known yet, neither by the entry nor by a warning
+        self._open = np.ones(width, bool)  # values about which neither the entry nor a warning says anything yet
         self._open[list(spec.angles if spec.angle_form != "as_recorded" else ())] = False
         self._first: list[np.ndarray] = []
         self._steps = self._episodes = 0
@@ -48,7 +48,7 @@ class TurnWatch:
             self.look()
 
     def look(self) -> None:
-        """Warns of what was found and not said before."""
+        """Warns of what was found and not reported before."""
         for unit, jumps in self._jumps.items():
             turning = self._open & find_turns(self._low, self._high, jumps, unit)
             found = [int(d) for d in np.flatnonzero(turning) if not self._is_switch(int(d))]

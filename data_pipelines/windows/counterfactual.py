@@ -23,7 +23,7 @@ class CounterfactualFrames:
     """True frames of each frozen window under the actions of the first window that `OtherWindows` chooses for it."""
 
     manifest: str  # hash of the frozen windows
-    prompt: int  # frames that are as recorded; the chunk of the last of them is the first other one
+    prompt: int  # number of frames that are as recorded; the last of them has the first other chunk
     frames: Mapping[str, np.ndarray]  # of a dataset: uint8 [windows, T - prompt, H, W, 3], in their frozen order
 
     def save(self, path: Path) -> None:

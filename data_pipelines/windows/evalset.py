@@ -1,4 +1,4 @@
-"""The frozen evaluation set: which held-out windows every trial of a study is measured on.
+"""The frozen evaluation set: the held-out windows on which every trial of a study is measured.
 
 Owns the choice of windows, its file, and their batches. Measures nothing.
 """
@@ -39,7 +39,7 @@ class DatasetWindows:
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """The settings of `EvalConfig` that bound a choice of windows. Others may lead to the same choice."""
+    """The settings of `EvalConfig` that bound a choice of windows. Different settings may lead to the same choice."""
 
     windows_per_dataset: int
     prompt_frames: int | None  # None: all windows are whole
@@ -54,7 +54,7 @@ class EvalManifest:
     spacing: int  # model frames between starts of windows in one episode
     store: str  # hash of the datasets' manifests
     datasets: tuple[DatasetWindows, ...] = field(default_factory=tuple)
-    rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
+    rate: float | None = FRAME_RATE  # frame rate in Hz; None: native
     least: int = 0  # real frames of the shortest window; 0 in files from before there was padding
     settings: ChoiceSettings | None = field(default=None, compare=False)  # None in files of earlier versions
 
@@ -77,7 +77,7 @@ class EvalManifest:
         return replace(self, datasets=tuple(datasets))
 
     def save(self, path: str | Path) -> None:
-        """Writes JSON with its own hash; whole or not at all. ConfigError if it cannot be written."""
+        """Writes JSON with its own hash, completely or not at all. Raises ConfigError if it cannot be written."""
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,16 +100,17 @@ class EvalManifest:
             raise DataError(f"{path}: the evaluation set cannot be read ({reason}). {advice}") from error
         except (ValueError, AttributeError, TypeError) as error:
             raise DataError(f"{path}: not an evaluation set ({error}). {advice}") from error
-        if found != stated:  # of what the file says: one of an earlier version lacks fields
+        if found != stated:  # hash of the file's own fields: a file of an earlier version lacks some
             raise DataError(f"{path}: its contents do not match the hash in it, {stated}: it was changed. {advice}")
         return manifest
 
 
 def subsample_windows(frozen: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, int], ...]:
-    """Up to `count` of the windows (episode, start), of as many episodes as possible: errors are clustered by episode.
+    """Up to `count` of the windows (episode, start), from as many episodes as possible: errors are clustered by
+    episode.
 
     Every episode gives one window before any gives a second. If there are more episodes than windows to choose, they
-    are taken at equal distances, as neighbouring episodes share a scene or a day.
+    are taken at equal distances, since neighbouring episodes share a scene or a day.
     """
     seen: defaultdict[int, int] = defaultdict(int)
     rounds: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)  # a window of each episode that has one left
@@ -135,8 +136,8 @@ def freeze_manifest(
 ) -> EvalManifest:
     """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.
 
-    A window has at least `prompt` + 1 real frames; all `frames` without a prompt, or where it fills the window, as that
-    of a policy may. Windows are disjoint, so that standard errors do not count the same pixels twice.
+    A window has at least `prompt` + 1 real frames; all `frames` if there is no prompt, or if the prompt fills the
+    window, as a policy's may. Windows are disjoint, so that standard errors do not count the same pixels twice.
     DIFFERS: the release evaluates the first windows of each dataset (reference section 6.1).
 
     Raises DataError if no dataset has a window.
@@ -173,20 +174,20 @@ def eval_batches(
     """Batches of the frozen windows (of each dataset the `first` ones, or all), dataset by dataset.
 
     A batch may hold windows of several datasets; the last one is padded to `batch` rows.
-    `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C], `actions` float32 [B, T, U] (raw
-    units), `embodiment` int32 [B], `images` uint8 [B, T, H, W, 3] (recorded), `valid` bool [B] (False
-    for padding, which repeats the last window), and what names a window, the same whatever the batch
-    size and the choice of datasets: `dataset`, a list of B names, `episode` int32 [B] (its number in
-    the source) and `start` int32 [B] (native frame). `action_mean` and `action_std` float32 [B, U] are of all
-    training actions of the dataset, whichever of them a model was trained on: what random actions are drawn
-    from. Where the manifest has short windows, `real` bool [B, T] says which frames are no padding.
+    `tokens` int32 [B, T, S] or, for latents, float32 [B, T, S, C], `actions` float32 [B, T, U] (raw units),
+    `embodiment` int32 [B], `images` uint8 [B, T, H, W, 3] (recorded), `valid` bool [B] (False for padding, which
+    repeats the last window), and what names a window, the same whatever the batch size and the choice of datasets:
+    `dataset`, a list of B names, `episode` int32 [B] (its number in the source) and `start` int32 [B] (native frame).
+    `action_mean` and `action_std` float32 [B, U] are those of all training actions of the dataset, whichever of them a
+    model was trained on; random actions are drawn from them. If the manifest has short windows, `real` bool [B, T] says
+    which frames are not padding.
 
-    `other_actions` adds action sequences of other episodes of each window's robot, that many per window (see
+    `other_actions` adds this many action sequences per window, from other episodes of the same robot (see
     `OtherWindows`): `other_actions` float32 [B, other_actions, T, U], and `other_valid` bool [B, other_actions], False
     where there are fewer. `counterfactual`, made for these windows and for the `prompt` (EvalConfig.prompt_frames) that
-    they are judged after, adds the frames that the first of them leads to:
-    `other_images` uint8 [B, T, H, W, 3], the recorded ones up to the prompt, and `other_seen` bool [B], False for
-    robots that nobody simulates and for windows that no other episode's actions cover.
+    they are judged after, adds the frames that the first of these sequences leads to: `other_images` uint8 [B, T, H, W,
+    3] (the recorded ones up to the prompt), and `other_seen` bool [B], False for robots that are not simulated and for
+    windows that no other episode's actions cover.
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
     dataset is not in the manifest or in `table`, and for a `counterfactual` of other windows, of another prompt, or

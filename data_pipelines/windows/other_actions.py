@@ -1,6 +1,6 @@
 """Actions of other episodes for a frozen window, to be compared with its own.
 
-They are of the same robot, from held-out episodes first and from training episodes if these are too few. Each is an
+They are from the same robot, from held-out episodes first and from training episodes if these are too few. Each is an
 uninterrupted sequence of one episode, as long as the window's real frames.
 """
 
@@ -64,7 +64,7 @@ class OtherWindows:
         """The first `count` windows of at least `real` frames that are not of episode `own`, in the order of choice."""
         windows, episode_idx, real_of = self._windows(name, split)
         at = np.flatnonzero((real_of >= real) & (episode_idx != own))
-        h, found = hash64(at, stream_seed(seed, split)), np.zeros(0, np.int64)  # no two of one hash
+        h, found = hash64(at, stream_seed(seed, split)), np.zeros(0, np.int64)  # no two have the same hash
         while len(found) < count and len(at):
             begins = np.flatnonzero(np.diff(episode_idx[at], prepend=-1))
             smallest = np.minimum.reduceat(h, begins)  # of each episode that has one left; only these are sorted

@@ -1,8 +1,8 @@
 """Slicing of a window out of an episode: frames at the study's rate, each with its chunk of actions.
 
 A window that starts at native frame n has frames n, n + stride, ..., each with the native actions from
-that frame until the next one, all of them inside one episode. Frames after the last one whose chunk is complete
-are padding: zeros at the end, which real frames do not attend to and which no metric counts. The others are real.
+that frame until the next one, all of them inside one episode. Frames after the last one with a complete chunk are
+padding: zeros at the end, which real frames do not attend to and which no metric counts. The other frames are real.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class WindowSlicer:
         return self.slice_frames(item.tokens, item, start).astype(dtype)
 
     def chunks(self, actions: np.ndarray, start: int, width: int) -> np.ndarray:
-        """float32 [T, U = width]: the chunk of each frame, of the native actions [N, A] of an episode, sub-step-major,
-        raw units, followed by zeros."""
+        """float32 [T, U = width]: the chunk of each frame, cut from the native actions [N, A] of an episode:
+        sub-step-major, raw units, followed by zeros."""
         first = start * self.frame_step
         real = int(self.max_real(len(actions) - first))
         chunk = actions[first : first + real * self.stride].reshape(real, self.stride * actions.shape[1])
@@ -75,13 +75,13 @@ class WindowSlicer:
 
 
 def make_slicer(store: TokenStore, name: str, frames: int, rate: float | None) -> WindowSlicer:
-    """At `rate` Hz (None: native). Raises ConfigError if the store lacks frames of that rate."""
+    """The slicer at `rate` Hz (None: native). Raises ConfigError if the store lacks frames at that rate."""
     require(frames >= 1, f"frames must be at least 1, got {frames}")
     manifest = store.manifest(name)
     return WindowSlicer(frames, manifest.stride_at(rate), manifest.frame_step)
 
 
 def _padded(array: np.ndarray, frames: int) -> np.ndarray:
-    """[n, ...] -> [frames, ...], zeros at the end; as it is where nothing is missing."""
+    """[n, ...] -> [frames, ...], zeros at the end; the array itself if nothing is missing."""
     missing = frames - len(array)
     return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1)) if missing else array

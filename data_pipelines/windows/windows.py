@@ -2,12 +2,12 @@
 
 Owns which windows exist; `slicer` slices one out of an episode. No record is read to count them.
 
-In an episode that is long enough every start counts whose T frames all have whole chunks. A shorter one
-gives padded windows of as many real frames as it has: at least `MIN_TRAIN_FRAMES` to train on, the prompt and one
-more to judge, or all T where a policy's prompt fills the window.
-DIFFERS: the release has no padded windows, accepts windows whose last chunk runs up to stride - 1 actions
-past the end of the episode, into the next one, drops the last window of a dataset, and keeps
-non-overlapping windows only (reference section 5.6).
+In an episode that is long enough, every start whose T frames all have whole chunks is a window. A shorter episode gives
+padded windows with all of its real frames: at least `MIN_TRAIN_FRAMES` for training; for evaluation the prompt and one
+more, or all T if a policy's prompt fills the window.
+DIFFERS: the release has no padded windows, accepts windows whose last chunk runs up to stride - 1 actions past the end
+of the episode, into the next one, drops the last window of a dataset, and keeps non-overlapping windows only (reference
+section 5.6).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class WindowSet:
     name: str
     split: str
     slicer: WindowSlicer
-    min_real: int  # real frames of a window, at least
+    min_real: int  # least number of real frames of a window
     episodes: np.ndarray  # int32: positions in the store
     ends: np.ndarray  # int64: windows up to and including each episode
     padded: int  # episodes whose windows are padded
@@ -92,13 +92,14 @@ class WindowSet:
 
 
 def least_judged(prompt: int, frames: int) -> int:
-    """Real frames of a window to judge, at least: the prompt and one more, or all T that a policy's prompt fills."""
+    """Least number of real frames of a window for evaluation: the prompt and one more, or all T if a policy's prompt
+    fills it."""
     return min(prompt + 1, frames)
 
 
 def settings_for_short(stride: int, min_real: int) -> str:
-    """The settings by which episodes that are too short for `min_real` frames at `stride` may give windows, in words;
-    '' if there are none."""
+    """In words, the settings with which episodes too short for `min_real` frames at `stride` may give windows; '' if
+    there are none."""
     rate = ["a higher frame rate (--set rate=HZ)"] * (stride > 1)
     return " or ".join(rate + ["a shorter prompt (--set eval.prompt_frames=N)"] * (min_real > MIN_TRAIN_FRAMES))
 
@@ -133,10 +134,10 @@ def train_windows(
 ) -> WindowSet:
     """Windows of the train split, optionally of `max_trajectories` episodes chosen by hash.
 
-    Windows have `min_real` real frames or more, and all of theirs where the model's T are fewer.
+    Windows have at least `min_real` real frames, or all T if the model's T is smaller.
 
-    Subsets with one `subset_seed` are nested: 10 trajectories are among the 100. Episodes without a window
-    are none of them.
+    Subsets with the same `subset_seed` are nested: 10 trajectories are among the 100. Episodes without a window are not
+    drawn.
     """
     require(
         max_trajectories is None or max_trajectories >= 1,
@@ -179,7 +180,7 @@ def _windows(
 def _chosen(manifest: Manifest, split: str, usable: np.ndarray, limit: int, salt: str) -> np.ndarray:
     """Positions in the store's split, ascending, of those `usable` (bool) episodes that are among the `limit` drawn.
 
-    They are drawn from the usable ones and the skipped ones, whose length nobody knows: a skipped one is not replaced.
+    They are drawn from the usable and the skipped ones, whose length is unknown: a skipped one is not replaced.
     """
     name, present = manifest.spec.name, np.asarray(manifest.split(split).episodes, np.int64)
     at = np.flatnonzero(usable)
