@@ -1,4 +1,4 @@
-"""The simulator suite: real robots' models from public simulators, written as RLDS (extra `sim`).
+"""The simulator suite: models of real robots from public simulators, written as RLDS (extra `sim`).
 
 `EMBODIMENTS` is the table, `generate_sim` makes the datasets, `replay` runs an episode again under
 other actions. Simulators run in processes of their own (`worker`), behind one interface

@@ -9,6 +9,6 @@ from data_pipelines.simulators.worker import Job, run_job
 
 if __name__ == "__main__":
     run_job(Job.from_json(sys.argv[1]))
-    # Without the destructors of drivers, some of which abort under EGL: all is written.
+    # Exits without the destructors of drivers, some of which abort under EGL: everything is written by now.
     sys.stdout.flush()
     os._exit(0)

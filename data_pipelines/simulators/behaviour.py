@@ -63,7 +63,7 @@ class Behaviour:
         self.steps_since_success = 0  # frames since success
 
     def act(self, reached: bool) -> np.ndarray:
-        """float32 [A]: the next action; `reached` says whether the goal has been, at any time."""
+        """float32 [A]: the next action; `reached`: whether the goal has been reached at any time."""
         walk = self.rest + self.reach * self.walk.step()
         jitter = self.jitter.step()
         lapsing = self._lapsing()

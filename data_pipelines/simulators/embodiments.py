@@ -36,7 +36,7 @@ META_WORLD = (
     "plate-slide-back-side-v3", "plate-slide-side-v3", "push-back-v3", "push-wall-v3", "reach-wall-v3",
     "soccer-v3", "stick-pull-v3", "sweep-into-v3", "window-close-v3",
 )  # fmt: skip
-"""All fifty tasks; those that look most different first, as short datasets have the first alone."""
+"""All fifty tasks; those that look most different come first, since short datasets have only the first ones."""
 
 
 def _lift(name: str, robot: str, package: str = "robosuite", **more) -> SimSpec:
@@ -199,7 +199,7 @@ _BY_NAME = {spec.name: spec for spec in EMBODIMENTS}
 
 
 def select(names: Sequence[str] | None) -> tuple[SimSpec, ...]:
-    """Rows by name, in the given order; all of them for None. ConfigError for unknown names."""
+    """Rows by name, in the given order; all of them for None. Raises ConfigError for unknown names."""
     if names is None:
         return EMBODIMENTS
     unknown = [name for name in names if name not in _BY_NAME]
@@ -208,6 +208,6 @@ def select(names: Sequence[str] | None) -> tuple[SimSpec, ...]:
 
 
 def get_embodiment(name: str) -> SimSpec:
-    """The row called `name`; ConfigError without one."""
+    """The row called `name`. Raises ConfigError if there is none."""
     (spec,) = select([name])
     return spec

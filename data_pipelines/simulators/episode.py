@@ -20,7 +20,7 @@ from data_pipelines.simulators.spec import SimSpec
 class Simulator(Protocol):
     """A running environment of one embodiment. Frame t is the state before action t.
 
-    Everything but `start` and `close` waits for the first `start`.
+    Everything except `start` and `close` requires an earlier `start`.
     """
 
     low: np.ndarray  # float64 [A], of actions
@@ -33,13 +33,13 @@ class Simulator(Protocol):
         """float64 [A]: the neutral action, the mean of the random walk."""
 
     def expert(self) -> Expert | None:
-        """The expert for the episode just started; None where there is none."""
+        """The expert for the episode just started; None if there is none."""
 
     def step(self, action: np.ndarray) -> tuple[float, bool]:
         """(reward, whether the goal is reached) after an action, float64 [A]."""
 
     def physics(self) -> np.ndarray:
-        """float64 [P]: the state of the physics, from which it goes on."""
+        """float64 [P]: the state of the physics, from which it can continue."""
 
     def set_physics(self, values: np.ndarray) -> None:
         """Inverse of `physics`."""
@@ -92,7 +92,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Replay:
-    """What other actions lead to. One frame more than actions: the last shows where it ended."""
+    """What other actions lead to. There is one more frame than actions: the last shows the end."""
 
     frames: np.ndarray  # uint8 [N + 1, size, size, 3]
     rewards: np.ndarray  # float32 [N]
@@ -120,8 +120,8 @@ def record_episode(simulator: Simulator, spec: SimSpec, env: str, seed: int) -> 
 
 
 def replay_episode(simulator: Simulator, start: StartState, actions: Sequence[np.ndarray]) -> Replay:
-    """Runs `actions` [N, A] (raw units) from `start`, in float32 and within the robot's bounds: as recorded ones were
-    run. Raises DataError for those of another robot."""
+    """Runs `actions` [N, A] (raw units) from `start`, in float32 and within the robot's bounds, as recorded actions
+    were run. Raises DataError for actions or a start of another robot."""
     actions = np.asarray(actions, np.float32)
     simulator.start(start.env, start.seed)
     size = len(simulator.low)

@@ -52,7 +52,8 @@ def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
 
 def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: int) -> list[str] | None:
     """Which settings of the existing dataset differ from those asked for; [] if only the versions of the packages or of
-    the generator do. None if nothing differs, or if there is no complete dataset, so that one is made in any case."""
+    the generator differ. None if nothing differs, or if there is no complete dataset, so that one is made in any
+    case."""
     if not directory.exists():
         return None
     metadata = read_metadata(directory)
@@ -99,10 +100,10 @@ def generate_sim(
 ) -> list[Path]:
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
-    `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
-    is left as it is; what other versions of the packages or the generator made is replaced. Raises
-    ConfigError for bad arguments, missing packages, what `made_by_other_versions` refuses and a dataset that another
-    process is making, DataError when a simulator fails; the other datasets are then made all the same.
+    `episodes` per dataset, frames of `size` x `size`. Complete datasets with the same fingerprint are left as they are;
+    those that other versions of the packages or the generator made are replaced. Raises ConfigError for bad arguments,
+    missing packages, what `made_by_other_versions` refuses and a dataset that another process is making, DataError if a
+    simulator fails; the other datasets are made nevertheless.
     """
     require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
     require(16 <= size <= 1024, f"the frame size must lie in 16..1024, got {size}")
@@ -135,7 +136,7 @@ class _Run:
     size: int
     seed: int
     progress: Progress | None
-    stack: ExitStack  # in which the locks of datasets are held
+    stack: ExitStack  # holds the locks of datasets
     done: int = 0  # episodes
     stopped: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -169,8 +170,8 @@ class _Run:
         return [i for i in range(self.episodes) if not record_path(self.staging(name), i).is_file()]
 
     def work(self, jobs: Sequence[Job], workers: int) -> dict[str, str]:
-        """Runs `jobs` and returns for each dataset that one of them failed for what is to be said of it, once for all
-        of them. When it is interrupted its processes are ended."""
+        """Runs `jobs`. Returns one message for each dataset for which a job failed. If it is interrupted, its processes
+        are ended."""
         with ThreadPoolExecutor(workers) as pool:
             running = {pool.submit(self.run, job): job.name for job in jobs}
             try:
@@ -182,12 +183,12 @@ class _Run:
         return dict(sorted((name, failure) for name, failure in outcomes if failure))
 
     def run(self, job: Job) -> str:
-        """One process. Returns what is to be said if it failed, nothing if not."""
+        """Runs one process. Returns a message if it failed, "" if not."""
         log = Path(job.directory) / "log.txt"
         with open(log, "ab") as messages:
             child = self.launch(job, messages)
             for line in child.stdout:
-                if line.strip().isdigit():  # packages print as well
+                if line.strip().isdigit():  # packages print other lines
                     self.count(job.name, 1)
             code = child.wait()
         with self.lock:
@@ -221,7 +222,7 @@ class _Run:
                 child.kill()
 
     def finish(self, spec: SimSpec) -> None:
-        """Puts a dataset together from its episodes."""
+        """Assembles a dataset from its episodes."""
         write_dataset(
             spec,
             self.root / spec.name,

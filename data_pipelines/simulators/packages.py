@@ -49,7 +49,7 @@ DEPENDENCIES = {
 """Backend -> dependencies of its packages whose versions affect simulation, control or rendering, if installed."""
 
 USED_VERSIONS = {"robosuite": "1.5.1"}
-"""Package -> its only version that is used. Episodes of robosuite 1.5.2 would ignore their seeds."""
+"""Package -> the only version that is accepted. Episodes of robosuite 1.5.2 would ignore their seeds."""
 
 EXTRA = "pip install -e '.[sim]'"
 
@@ -91,7 +91,7 @@ def _version(package: str) -> str:
 
 
 def why_unavailable(specs: Collection[SimSpec]) -> str:
-    """Why these embodiments cannot be simulated on this machine, with what to install; "" where they can."""
+    """Why these embodiments cannot be simulated on this machine, with what to install; "" if they can."""
     missing = missing_packages(specs)
     if missing:
         return (
@@ -117,8 +117,8 @@ def require_packages(specs: Collection[SimSpec]) -> None:
 
 
 def can_render() -> bool:
-    """Whether a simulator can render in this process: with Mesa's software renderer and TensorFlow in one process, the
-    first image ends it with a segmentation fault."""
+    """Whether a simulator can render in this process: if Mesa's software renderer and TensorFlow are in one process,
+    the first image ends it with a segmentation fault."""
     return "tensorflow" not in sys.modules
 
 
@@ -133,7 +133,7 @@ def gl_backend() -> str:
 def prepare_process() -> None:
     """Sets up off-screen rendering for this process; must be called before any simulator is imported.
 
-    Raises ConfigError where TensorFlow is loaded (`can_render`).
+    Raises ConfigError if TensorFlow is loaded (`can_render`).
     """
     require(
         can_render(),

@@ -37,7 +37,7 @@ def encode_episode(spec: SimSpec, episode: Episode, index: int) -> bytes:
         f"steps/observation/{IMAGE_KEY}": [encode_jpeg(f) for f in episode.frames],
         "steps/observation/state": episode.states.ravel(),
         "steps/action": episode.actions.ravel(),
-        "steps/is_terminal": np.zeros(steps, np.int64),  # cut by the clock, none ends by itself
+        "steps/is_terminal": np.zeros(steps, np.int64),  # the clock cuts episodes; none ends by itself
         "episode_metadata/file_path": [f"sim/{spec.name}/{index:06d}".encode()],
         "episode_metadata/seed": np.array([episode.start.seed], np.int64),
         START_KEY: [episode.start.to_json().encode()],

@@ -1,4 +1,4 @@
-"""An episode again, from its recorded start, under its own or other actions."""
+"""Replays an episode from its recorded start, under its own or other actions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 
 
 def read_start(dataset: RldsDataset, episode: int) -> StartState:
-    """Where an episode of the simulator suite began. EpisodeError for one of another origin."""
+    """The start of an episode of the simulator suite. Raises EpisodeError for an episode of another origin."""
     values = dataset.record(episode, [START_KEY]).get(START_KEY)
     if not values:
         raise EpisodeError(

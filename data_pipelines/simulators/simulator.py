@@ -1,5 +1,5 @@
-"""Robots of public simulators as `TrueSimulator`s. Only those of one environment: a `Start` names a robot and a
-seed."""
+"""Robots of public simulators as `TrueSimulator`s. Only robots with a single environment: a `Start` names only a robot
+and a seed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def can_simulate(robot: Robot) -> bool:
 
 
 class PhysicsState(NamedTuple):
-    """Where an episode is: the physics, and how many actions led there from the start."""
+    """The state of an episode: the physics, and the number of actions since the start."""
 
     physics: np.ndarray  # float64 [P]
     actions: int
@@ -37,7 +37,7 @@ class PhysicsWorld:
     """One environment, opened at once: one episode at a time, seen in frames of `size`."""
 
     def __init__(self, spec: SimSpec, size: int):
-        """Raises ConfigError where packages are missing, or TensorFlow is loaded in this process."""
+        """Raises ConfigError if packages are missing, or TensorFlow is loaded in this process."""
         require_packages([spec])
         prepare_process()
         from data_pipelines.simulators.backends import open_simulator
@@ -59,8 +59,8 @@ class PhysicsWorld:
         return PhysicsState(self.simulator.physics(), len(self._actions))
 
     def set_state(self, state: PhysicsState) -> None:
-        """Returns to an earlier state of this episode. The episode is begun again and its actions are repeated: the
-        controllers of some robots remember more than the physics holds."""
+        """Returns to an earlier state of this episode. The episode is started again and its actions are repeated: the
+        controllers of some robots have state that the physics does not hold."""
         earlier = self._actions[: state.actions]
         self.reset(self._seed)
         for action in earlier:
@@ -70,7 +70,7 @@ class PhysicsWorld:
         return self.simulator.frame()
 
     def success(self) -> bool:
-        """By the environment's word after the last action."""
+        """Success as the environment reports it after the last action."""
         return self._reached
 
     def close(self) -> None:
@@ -92,7 +92,8 @@ class PhysicsSimulator(TrueSimulator[PhysicsWorld]):
 
 
 def new_seeds(name: str, count: int, seed: int, split: str) -> np.ndarray:
-    """int64 [count]: of episodes that no dataset of `hma data sim` has; more of them begin with the same ones."""
+    """int64 [count]: seeds of episodes that no dataset of `hma data sim` has. A larger `count` begins with the same
+    seeds."""
     return np.array([zlib.crc32(f"{split}/{seed}/{name}/{i}".encode()) for i in range(count)], np.int64)
 
 

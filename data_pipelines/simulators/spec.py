@@ -21,8 +21,8 @@ Vector = tuple[float, float, float]
 class View:
     """Where the camera is: one of the model's own by name, or a free one (metres, degrees).
 
-    `follow` names a body that a free camera looks at instead of at a fixed point. `turned` is for
-    cameras that hang upside down (Meta-World's corners): the picture is turned by 180 degrees.
+    `follow` names a body that a free camera looks at instead of at a fixed point. `turned` is for cameras that are
+    mounted upside down (Meta-World's corners): the picture is turned by 180 degrees.
     """
 
     name: str = ""
@@ -56,10 +56,10 @@ class SimSpec:
     hz: float
     view: View
     instruction: str = ""  # "" takes the environment's name, in words
-    kwargs: Mapping[str, Any] = field(default_factory=dict)  # of the environment
+    kwargs: Mapping[str, Any] = field(default_factory=dict)  # arguments of the environment
     repeat: int = 1
-    expert: str = ""  # which script acts; "": a random walk
-    success: bool = False  # whether the environment says so
+    expert: str = ""  # the script that acts; "": a random walk
+    success: bool = False  # whether the environment reports success
     seconds: tuple[float, float] = (8.0, 10.0)  # shortest and longest episode
     gain: float = 0.6  # standard deviation of the random walk, as a share of half the action range
     tau: float = 0.6  # correlation time of the random walk, seconds

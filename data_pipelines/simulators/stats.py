@@ -19,9 +19,9 @@ HEADER = "| dataset | package | dims | Hz | expert | episodes | frames | seconds
 def stats_table(root: Path) -> str:
     """Markdown, one row per dataset of the suite under `root`, in the order of the table.
 
-    Episode lengths are shortest to longest, in seconds of the robot's time; frames/s is what one
-    process simulated and drew, the start of the first episode included. Raises DataError when
-    there is no dataset, or a stats.json that cannot be read.
+    Episode lengths are shortest to longest, in seconds of the robot's time; frames/s is what one process simulated and
+    drew, including the start of the first episode. Raises DataError if there is no dataset, or a stats.json cannot be
+    read.
     """
     rows, machines, sizes, dates = [], set(), set(), set()
     for spec in EMBODIMENTS:

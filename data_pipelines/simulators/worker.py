@@ -38,7 +38,7 @@ class Job:
 
 
 def episode_seed(name: str, seed: int, index: int) -> int:
-    """An episode's own seed: nothing else of a run enters it."""
+    """An episode's own seed: it depends on nothing else in a run."""
     return zlib.crc32(f"{seed}/{name}/{index}".encode())
 
 

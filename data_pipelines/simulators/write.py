@@ -31,8 +31,8 @@ def write_dataset(
 ) -> None:
     """`<home>/<version>/` from the episodes in `staging`, which are then removed.
 
-    `lock` is that of the dataset in `home`: who holds it may remove the staging directories of other settings. Raises
-    DataError for episodes whose states have different widths: a dataset has one.
+    `lock` is that of the dataset in `home`: its holder may remove the staging directories of other settings. Raises
+    DataError for episodes whose states have different widths: a dataset has only one.
     """
     facts = [json.loads(facts_path(staging, i).read_text()) for i in range(episodes)]
     examples = {f["states"]: f["env"] for f in facts}
@@ -78,7 +78,7 @@ def _write_stats(path: Path, spec: SimSpec, size: int, facts: list[dict]) -> Non
 
 
 def _machine() -> str:
-    """Processor and cores, for people."""
+    """CPU and cores, for people to read."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:  # not Linux

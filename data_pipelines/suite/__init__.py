@@ -2,9 +2,8 @@
 
 `EMBODIMENTS` is every robot, `TRAINED` the forty that studies train on, `UNSEEN` the ten that they
 do not; `generate_suite` makes the datasets, `Environment` steps a robot. `families` holds the
-tables; bodies and controls define robots, `tasks` and `behaviour` what they want, `world` what
-comes of it; `rollout` runs whole episodes, `render` draws them, `write` and `generate` put them
-on disk. Imports neither JAX nor TensorFlow.
+tables; bodies and controls define robots, `tasks` and `behaviour` what they try to do, `world` what results; `rollout`
+runs whole episodes, `render` draws them, `write` and `generate` put them on disk. Imports neither JAX nor TensorFlow.
 """
 
 from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED, UNSEEN

@@ -42,7 +42,7 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
 
     floor, objects = np.array([palette.floor]), np.array(palette.objects, float)[order]
     owner = objects[:, :1] if spec.task.marks_object else np.array(palette.robot[:1])
-    goal = 0.45 * owner + 0.55 * floor  # a pale shade of what belongs there
+    goal = 0.45 * owner + 0.55 * floor  # a pale shade of the colour of what belongs there
     return Appearance(
         floor=colours(floor),
         outside=colours(np.array([palette.outside])),
@@ -54,11 +54,11 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
 
 
 def object_order(spec: EmbodimentSpec, seed: int) -> np.ndarray:
-    """int: which of the palette's colours for objects the first object of an episode has, the second, and so on."""
+    """int: which of the palette's object colours the first object of an episode has, the second one, and so on."""
     return _begin(spec, seed)[2]
 
 
 def _begin(spec: EmbodimentSpec, seed: int) -> tuple[np.random.Generator, float, np.ndarray]:
-    """(what all else of an episode is drawn from, its light, the order of its objects' colours)."""
+    """(the generator from which the rest of an episode is drawn, its light, the order of its objects' colours)."""
     rng = np.random.default_rng([seed, 4])
     return rng, rng.uniform(0.97, 1.03), rng.permutation(len(spec.palette.objects))

@@ -19,7 +19,8 @@ class Behaviour:
     """
 
     def __init__(self, world: World, rng: np.random.Generator, *, expert: bool = False):
-        """An `expert` does not explore: it works on the task all the time, and stays where it is once that is done."""
+        """An `expert` does not explore: it works on the task all the time, and stays where it is once the task is
+        done."""
         n = len(world)
         self.world, self.rng, self.expert = world, rng, expert
         self.task_probability = world.spec.purpose * rng.uniform(0.0, 2.0, n)  # some episodes only explore

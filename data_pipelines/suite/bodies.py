@@ -1,8 +1,8 @@
 """Robot bodies: planar kinematic trees, and builders for the usual ones.
 
-Owns geometry only: links, joints, where things are for a configuration, and which small
-change of configuration moves a tool somewhere. What an action means is `controls`, what a
-robot wants is `tasks`. World units: the cameras see about [-1, 1] x [-1, 1].
+Owns geometry only: links, joints, where things are in a configuration, and which small change of configuration moves a
+tool somewhere. `controls` says what an action means, `tasks` what a robot tries to do. World units: the cameras see
+about [-1, 1] x [-1, 1].
 
 Array letters of this package: n episodes (or frames), C configuration entries, L links,
 M tools, K objects, A action values.

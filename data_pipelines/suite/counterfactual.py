@@ -19,8 +19,8 @@ def frames_under(
 ) -> np.ndarray:
     """uint8 [n, k, size, size, 3]: the frames before native steps `times` [n, k] of the episodes with these seeds.
 
-    Episode i executes `actions[i]`, float32 [>= max(times[i]), A]. As they would be recorded and read: JPEG, then
-    resized. Under an episode's own actions these are its frames, pixel by pixel.
+    Episode i executes `actions[i]`, float32 [>= max(times[i]), A]. The frames are as they would be recorded and read:
+    JPEG, then resized. Under an episode's own actions these are its frames, pixel by pixel.
     """
     steps = int(times.max()) + 1
     executed = np.zeros((len(seeds), steps, spec.action_dim), np.float32)

@@ -1,9 +1,9 @@
 """The fifty robots of the suite, and the order in which a study adds them.
 
 The order matters: scaling over datasets takes the first 5, 10, 20 and 40, and judges on the first
-five. It follows from a rule: in each of five rounds every trained family gives one robot. A hash draws
-the order of the families in a round and of the robots in a family, except that those whose dataset is
-video alone come last, as their actions cannot be judged. So every prefix has many families and sizes.
+five. It follows from a rule: in each of five rounds, every trained family contributes one robot. A hash draws the order
+of the families in a round and of the robots in a family, except that robots whose dataset has video only come last,
+since their actions cannot be judged. So every prefix has many families and sizes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SPECS = {spec.name: spec for spec in EMBODIMENTS}
 
 
 def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
-    """Specs by name, in the given order; all of them for None. ConfigError for unknown names."""
+    """Specs by name, in the given order; all of them for None. Raises ConfigError for unknown names."""
     if names is None:
         return EMBODIMENTS
     unknown = [name for name in names if name not in SPECS]
@@ -52,10 +52,10 @@ def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
 
 
 def siblings(spec: EmbodimentSpec) -> tuple[EmbodimentSpec, ...]:
-    """The others of its family."""
+    """The other robots of its family."""
     return tuple(s for s in EMBODIMENTS if s.family == spec.family and s.name != spec.name)
 
 
 def strangers(spec: EmbodimentSpec) -> tuple[EmbodimentSpec, ...]:
-    """Robots of other families with equally many action values."""
+    """Robots of other families with the same number of action values."""
     return tuple(s for s in EMBODIMENTS if s.family != spec.family and s.action_dim == spec.action_dim)

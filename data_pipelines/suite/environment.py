@@ -1,4 +1,4 @@
-"""A robot of the suite to step: the true environment that a learned simulator is compared with."""
+"""A robot of the suite that can be stepped: the true environment with which a learned simulator is compared."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Environment:
     """One episode at a time, at the robot's native rate, its actions in the robot's raw units.
 
     `reset` with the seed of a recorded episode (`episode_metadata/seed`) and stepping through its
-    actions gives back its frames. A state that was got can be set again, any number of times and
-    also in another environment of the same robot: the same actions then have the same effects.
+    actions gives back its frames. A state from `get_state` can be set again, any number of times and also in another
+    environment of the same robot: the same actions then have the same effects.
     """
 
     def __init__(self, robot: str | EmbodimentSpec):
-        """Raises ConfigError for a name that the suite has not."""
+        """Raises ConfigError for a name that the suite does not have."""
         self.spec = robot if isinstance(robot, EmbodimentSpec) else select([robot])[0]
         self._world = World(self.spec, [0])
 
@@ -44,7 +44,7 @@ class Environment:
         return render_frames(self.spec, looks, world.goals, world.q, world.objects, np.zeros(1, int))[0]
 
     def positions(self) -> np.ndarray:
-        """float32 [P, 2]: where the points that the spec names are in the frame, in pixels (column, row)."""
+        """float32 [P, 2]: positions in the frame of the points that the spec names, in pixels (column, row)."""
         return positions_of(self.spec, self._world.q, self._world.objects)[0]
 
     def success(self) -> bool:
@@ -56,7 +56,7 @@ class Environment:
         return self._world.state
 
     def set_state(self, state: State) -> None:
-        """Goes on from a state of the same robot. Raises ConfigError for one of another shape."""
+        """Continues from a state of the same robot. Raises ConfigError for a state of another shape."""
         have, given = ({k: np.shape(v) for k, v in vars(s).items()} for s in (self._world.state, state))
         require(have == given, f"{self.spec.name}: the state is from another robot: it has shapes {given}, not {have}")
         self._world.state = state

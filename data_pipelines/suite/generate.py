@@ -28,8 +28,8 @@ from hma_jax.runtime.parent import die_with
 
 GENERATOR_VERSION = 8
 """Raise it when simulation, rendering or encoding change: datasets of older versions are then made again.
-Committed studies rest on 8. Left for the next one: starts at which the goal is reached (`World`), and episodes that the
-clock ends as terminal (`write`)."""
+Committed studies use 8. Left for the next version: starts at which the goal is already reached (`World`), and episodes
+that are marked terminal although the clock ends them (`write`)."""
 
 MIN_EPISODES = 8
 """Training episodes of the smallest datasets, at any scale, unless `fewest` says otherwise."""
@@ -45,8 +45,8 @@ Progress = Callable[[str, int, int], None]
 
 
 def episode_count(spec: EmbodimentSpec, scale: float, fewest: int = MIN_EPISODES) -> int:
-    """Training episodes at a scale: the largest dataset has `scale` times as many as at 1, the
-    smallest always `fewest`, and what lies between is stretched evenly in the logarithm."""
+    """Training episodes at a scale: the largest dataset has `scale` times as many as at scale 1, the smallest always
+    `fewest`, and those in between are stretched evenly in the logarithm."""
     stretch = max(math.log(scale * MAX_EPISODES / fewest) / math.log(MAX_EPISODES / MIN_EPISODES), 0.0)
     return round(fewest * (spec.episodes / MIN_EPISODES) ** stretch)
 
@@ -55,7 +55,7 @@ def fingerprint(
     spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION, fewest: int = MIN_EPISODES
 ) -> str:
     """Hash of what the bytes of this dataset depend on, except the versions of numpy (what its random generators draw)
-    and of simplejpeg: with other ones it stays in use."""
+    and of simplejpeg: under other versions a dataset stays in use."""
     text = repr((GENERATOR_VERSION, spec, episode_count(spec, scale, fewest), validation, seed))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -73,10 +73,10 @@ def generate_suite(
 ) -> list[Path]:
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
-    `scale` multiplies the size of the largest dataset, `fewest` is that of the smallest, see `episode_count`; each has
-    `validation` held-out episodes besides. Datasets already complete with the same fingerprint are left as they are,
-    others are remade; each appears all at once.
-    Raises ConfigError for bad arguments or a root that cannot be written.
+    `scale` multiplies the size of the largest dataset, `fewest` is the size of the smallest (see `episode_count`); each
+    has `validation` held-out episodes besides. Datasets already complete with the same fingerprint are left as they
+    are, others are remade; each appears all at once. Raises ConfigError for bad arguments or a root that cannot be
+    written.
     """
     require(0 < scale < math.inf, f"suite scale must be positive and finite, got {scale}")
     require(validation >= 1, f"suite validation must be at least 1 episode, got {validation}")
@@ -115,8 +115,8 @@ def generate_suite(
 
 @contextmanager
 def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Ended at once where the block is left by an exception, Ctrl-C for one: by itself the pool would first do all that
-    it was given. What a process leaves half-made is made anew."""
+    """A pool of processes that ends at once if an exception, such as Ctrl-C, leaves the block: by itself it would first
+    finish all that it was given. What a process leaves half-made is made anew."""
     # Spawned, not forked: the caller may have started threads (JAX has).
     pool = ProcessPoolExecutor(
         count,
@@ -137,12 +137,12 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 def _enter_process(parent: int) -> None:
     die_with(parent)
-    # A terminal sends Ctrl-C to all; a process would give up one dataset and go on with the next.
+    # A terminal sends Ctrl-C to all processes; each would give up one dataset and go on with the next.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _make(spec: EmbodimentSpec, root: Path, scale: float, seed: int, validation: int, fewest: int) -> None:
-    """One dataset, unless another process makes it meanwhile."""
+    """Makes one dataset, unless another process makes it meanwhile."""
     final, expected = root / spec.name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
     with lock_output(final.with_name(f".{VERSION}"), wait=math.inf) as lock:
         if is_complete(final, expected):

@@ -21,19 +21,19 @@ CHUNK = 128
 """Frames drawn together: enough that numpy's work outweighs its calls, and few enough for the cache."""
 
 LIGHT = np.array([-0.6, 0.8])
-"""Where the light comes from, on the floor."""
+"""Direction on the floor from which the light comes."""
 
 SOFTNESS = 3.0
-"""Pixels over which an edge fades, as a lens has it: half as many at the size of the studies."""
+"""Pixels over which an edge fades, as through a lens: half as many at the image size of the studies."""
 
 DARK = 60.0
-"""Grey levels that a shadow takes away."""
+"""Grey levels that a shadow subtracts."""
 
 CAP = 0.7
 """Share of an object's contrast to mid-grey in the flat cap on its middle."""
 
 SHADOW = 0.06
-"""How far shadows fall from what throws them, world units."""
+"""Distance between shadows and what casts them, world units."""
 
 
 class View:
@@ -90,7 +90,7 @@ def render_frames(
 ) -> np.ndarray:
     """uint8 [F, H, W, 3] of configurations q [F, C] and objects [F, K, 2].
 
-    `episode` [F] says which of the n episodes of `looks` and `goals` [n, M, 2] a frame is of.
+    `episode` [F]: which of the n episodes of `looks` and `goals` [n, M, 2] each frame belongs to.
     """
     view = View(spec.camera)
     ids, which = np.unique(episode, return_inverse=True)
@@ -106,10 +106,9 @@ def render_frames(
 
 
 def positions_of(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np.ndarray:
-    """float32 [F, P, 2]: where the points that the spec names truly are in each frame, in pixels (column, row).
+    """float32 [F, P, 2]: true positions in each frame of the points that the spec names, in pixels (column, row).
 
-    q [F, C], objects [F, K, 2]. (0, 0) is the middle of the first pixel; what is out of view lies
-    outside the image.
+    q [F, C], objects [F, K, 2]. (0, 0) is the middle of the first pixel; points out of view are outside the image.
     """
     tools = spec.body.tool_points(spec.body.pose(q))
     return View(spec.camera).points(np.concatenate([tools, objects], 1)).astype(np.float32)
@@ -117,7 +116,7 @@ def positions_of(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np
 
 def _draw(view: View, canvas: np.ndarray, shapes: Shapes) -> np.ndarray:
     """uint8 [F, 3, H, W]: the shapes and their shadows on `canvas`, which is used up."""
-    # One painting of all shadows, so that none is darker where two meet.
+    # All shadows are painted at once, so that none is darker where two overlap.
     shade = np.zeros((len(canvas), 1, *canvas.shape[2:]), np.float32)
     dark = np.full((len(canvas), 1), DARK, np.float32)
     angle = view.angles(shapes.angle)

@@ -26,9 +26,9 @@ def arm(
     pushers: int = 1,
     stripe: int = 1,
 ) -> Body:
-    """A chain of revolute links. `heading` (degrees) is straight out; the first joint swings
-    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner, and after
-    every `stripe` links another colour comes.
+    """A chain of revolute links. `heading` (degrees) is straight out; the first joint swings by +-`swing`, the others
+    by +-`bend` degrees. Each link is `taper` times as thick as the one before, and the colour
+    changes after every `stripe` links.
 
     The last `pushers` links push objects; with a `fist` (its radius) only that does, and the
     arm passes above them.
@@ -88,7 +88,7 @@ def gantry(
     if rail:
         links.append(Link(parent=0, mount=(0.0, -1.2), angle=math.pi / 2, length=2.4, radius=0.08))
     links.append(Link(parent=0, joint=1, kind="slide_y", radius=size, paint=1, touches=touches))
-    links.append(Link(parent=len(links) - 1, radius=0.45 * size, paint=2))  # a cap: a head looks like no puck
+    links.append(Link(parent=len(links) - 1, radius=0.45 * size, paint=2))  # a cap: unlike a puck
     joints = [Joint(-reach, reach, speed)] * 2
     if turns:
         links.append(Link(parent=len(links) - 2, joint=2))

@@ -40,7 +40,7 @@ class Rollout:
 
 
 def episode_seeds(spec: EmbodimentSpec, count: int, seed: int, split: str = "train") -> np.ndarray:
-    """int64 [count]: the seeds of a split's episodes. More episodes begin with the same ones."""
+    """int64 [count]: the seeds of a split's episodes. A larger `count` begins with the same seeds."""
     return zlib.crc32(f"{seed}/{spec.name}/{split}".encode()) * 2**20 + np.arange(count, dtype=np.int64)
 
 
@@ -52,8 +52,8 @@ def episode_lengths(spec: EmbodimentSpec, seeds: Sequence[int]) -> np.ndarray:
 
 
 def simulate(spec: EmbodimentSpec, seeds: Sequence[int], actions: np.ndarray | None = None) -> Rollout:
-    """Runs the episodes with these seeds. With `actions` [n, T, A] these are executed, from the
-    same starts, in place of the scripted behaviour: an episode's own give it back exactly."""
+    """Runs the episodes with these seeds. If `actions` [n, T, A] are given, they are executed from the same starts in
+    place of the scripted behaviour: an episode's own actions reproduce it exactly."""
     world = World(spec, seeds)
     behaviour = Behaviour(world, np.random.default_rng([int(seeds[0]), len(seeds), 2]))
     lengths = episode_lengths(spec, seeds)

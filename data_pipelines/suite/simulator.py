@@ -1,4 +1,4 @@
-"""The suite's true robots as a `TrueSimulator`, how they are commanded, and starts of their held-out episodes."""
+"""The suite's robots as a `TrueSimulator`, how they are commanded, and starts of their held-out episodes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _parts(control: Control) -> Sequence[str]:
 
 
 def _keys(spec: EmbodimentSpec) -> tuple[tuple[float, ...], ...]:
-    """What right, up, D and W do to each action value; a positive angle turns to the left."""
+    """What the keys right, up, D and W do to each action value; a positive angle turns to the left."""
     if isinstance(spec.controls[0], Drive) and spec.controls[0].style == "wheels":
         turn, ahead = (1.0, -1.0), (1.0, 1.0)
         return turn, ahead, turn, ahead
@@ -68,7 +68,7 @@ def suite_starts(
     `count` held-out ones of a suite made with `seed`.
 
     Actions are drawn anew: they are not those of the suite's episodes, and depend on `count`. A frame is shown every
-    `stride` native steps; None: as near to FRAME_RATE as can be.
+    `stride` native steps; None: as near to FRAME_RATE as possible.
     """
     spec = SPECS[name]
     stride, numbers = stride or stride_of(spec.hz, FRAME_RATE), episode_seeds(spec, count, seed, "val")

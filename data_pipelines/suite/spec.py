@@ -27,8 +27,7 @@ MAX_SECONDS = 60.0
 class Camera:
     """A fixed view: pixel = rotate(point - centre) * zoom, in halves of the image's side.
 
-    The floor spans [-1, 1] x [-1, 1]. `tilt` < 1 looks at it from the front, so that it is less
-    high than wide.
+    The floor spans [-1, 1] x [-1, 1]. `tilt` < 1 looks at it from the front, so that it appears less high than wide.
     """
 
     rotate: float = 0.0  # degrees
@@ -51,9 +50,9 @@ class Palette:
 
 @dataclass(frozen=True)
 class Physics:
-    """How things move: the same for all robots of a family."""
+    """How things move; the same for all robots of a family."""
 
-    inertia: float = 0.08  # seconds in which a joint takes up the velocity it is asked for
+    inertia: float = 0.08  # seconds in which a joint reaches the commanded velocity
     friction: float = 2.5  # deceleration of a sliding object, world units per second squared
     bounce: float = 0.2  # restitution of contacts
 
@@ -79,7 +78,7 @@ class EmbodimentSpec:
     delay: int = 0  # native steps until an action is executed
     purpose: float = 0.4  # mean share of the time spent on the task; the rest explores
     restless: float = 1.2  # mean changes of the explored goal per second
-    noise: float = 0.2  # of goals, in units of what a joint can move in 0.5 s
+    noise: float = 0.2  # noise of goals, in units of what a joint can move in 0.5 s
 
     def __post_init__(self):
         name = self.name
@@ -97,7 +96,7 @@ class EmbodimentSpec:
 
     @property
     def action_dim(self) -> int:
-        """A, also of a robot whose dataset is video alone."""
+        """A, also for a robot whose dataset has video only."""
         return sum(c.dim for c in self.controls)
 
     @property
@@ -112,7 +111,7 @@ class EmbodimentSpec:
 
     @property
     def convention(self) -> str:
-        """absolute, delta or velocity: of the first, the main control."""
+        """absolute, delta or velocity: that of the first control, the main one."""
         return self.controls[0].convention
 
     @property

@@ -1,7 +1,7 @@
 """Tasks: goals and objects, when an episode succeeds, and where a tool should go next.
 
-A task is scripted only one step deep ("get behind the object", "push it to the mark"); that,
-imprecise control and exploration make failures as real as successes.
+A task is scripted only one step deep ("get behind the object", "push it to the mark"); this, imprecise control and
+exploration produce real failures as well as successes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Visibility of objects: their colours, and the share of each that lies in the image and is not occluded by a link.
+"""Visibility of objects: their colours, and the share of each that is in the image and not occluded by a link.
 
 Computed from the shapes that `render` paints, at a few points of each object.
 """
@@ -23,7 +23,7 @@ def object_colours(spec: EmbodimentSpec, seeds: Sequence[int]) -> np.ndarray:
 
 
 def visible_shares(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np.ndarray:
-    """float [F, K]: how much of each object is seen in configurations q [F, C] with objects [F, K, 2]."""
+    """float [F, K]: the visible share of each object in configurations q [F, C] with objects [F, K, 2]."""
     view, pose = View(spec.camera), spec.body.pose(q)
     turns = [np.arange(count) * 2 * np.pi / count for _, count in RINGS]
     circle = [share * np.stack([np.cos(t), np.sin(t)], -1) for (share, _), t in zip(RINGS, turns, strict=True)]

@@ -18,7 +18,7 @@ SUBSTEP_SECONDS = 1 / 15
 """Longest physics step: bodies move less than an object's radius in it."""
 
 EDGE = 1.0
-"""Objects stay on the floor, [-EDGE, EDGE] x [-EDGE, EDGE]."""
+"""Objects stay on the floor: [-EDGE, EDGE] x [-EDGE, EDGE]."""
 
 START_GAP = 0.02
 """Room between things at the start of an episode."""
@@ -26,14 +26,14 @@ START_GAP = 0.02
 
 @dataclass
 class State:
-    """Everything that changes in n episodes, and what distinguishes them. Copies share nothing."""
+    """Everything that changes in n episodes, and what distinguishes the episodes. Copies share nothing."""
 
     q: np.ndarray  # [n, C] configuration
     v: np.ndarray  # [n, C] its velocity
     objects: np.ndarray  # [n, K, 2]
     object_v: np.ndarray  # [n, K, 2]
     held: np.ndarray  # int [n, M]: the object in each tool's grip, or -1
-    hold: np.ndarray  # [n, M, 2]: where it lies in the grip
+    hold: np.ndarray  # [n, M, 2]: its position in the grip
     pending: np.ndarray  # [n, delay, A]: actions that were given and not executed yet
     goals: np.ndarray  # [n, M, 2]
     hand: np.ndarray  # int [n]: the tool that does the task
@@ -45,7 +45,7 @@ class State:
 
 
 class World:
-    """n episodes of a robot from their seeds on. `state` may be read, kept and put back."""
+    """n episodes of a robot, started from their seeds. `state` may be read, kept and put back."""
 
     def __init__(self, spec: EmbodimentSpec, seeds: Sequence[int]):
         body, task = spec.body, spec.task
@@ -114,7 +114,8 @@ class World:
         objects = np.stack([p[:, 0] for p in points[1:]], 1)
         away = np.linalg.norm(objects[:, 0] - goals[:, 0], axis=1)
         # Mirrored, so that fewer episodes begin with the goal reached. Some still do: near the centre of the floor the
-        # other place is on the mark too, things are moved apart below, and of `Reach` it is tools that reach the goal.
+        # mirrored place is on the mark too, things are moved apart below, and in `Reach` it is tools that reach the
+        # goal.
         close = away < 2.5 * task.radius
         objects[close, 0] = -objects[close, 0]
         self._state = State(
@@ -123,10 +124,10 @@ class World:
             goals=goals, hand=np.zeros(n, int), seeds=seeds,
         )  # fmt: skip
         self.pose = body.pose(draws[0])
-        for _ in range(60):  # random places overlap; apart, things do not move by themselves
+        for _ in range(60):  # random places overlap; things that are apart do not move by themselves
             before = objects.copy()
             self._separate(self.pose.origin, self.pose.tip, 1.0, START_GAP)
-            if np.array_equal(objects, before):  # where they go depends on where they are alone
+            if np.array_equal(objects, before):  # where they go depends only on where they are
                 break
         self._state.object_v[:] = 0
         self._state.hand = np.linalg.norm(self.tools - objects[:, :1], axis=-1).argmin(1)
@@ -195,7 +196,7 @@ class World:
             s.objects[rows[has], s.held[has, m]] = place
 
     def _slide(self, h: float) -> None:
-        """Objects that nobody holds go on as they went, slower by friction."""
+        """Objects that nobody holds keep moving, slowed by friction."""
         s = self._state
         held = (s.held[:, :, None] == np.arange(s.objects.shape[1])).any(1)[..., None]
         speed = np.sqrt(_dot(s.object_v, s.object_v))
@@ -232,7 +233,7 @@ class World:
                     continue
                 normal = away / np.maximum(distance, 1e-6)
                 closing = _dot(s.object_v[:, k] - s.object_v[:, j], normal)
-                push = np.where((overlap > 0) & (closing < 0), -(1 + bounce) * closing / 2, 0.0)  # of equal mass
+                push = np.where((overlap > 0) & (closing < 0), -(1 + bounce) * closing / 2, 0.0)  # equal mass
                 for which, sign in ((k, 0.5), (j, -0.5)):
                     s.objects[:, which] += normal * overlap * sign
                     s.object_v[:, which] += normal * push * 2 * sign

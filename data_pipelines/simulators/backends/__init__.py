@@ -1,6 +1,6 @@
 """Simulators by package, behind one interface (`episode.Simulator`).
 
-Every module knows one package. Import nothing of here before `packages.prepare_process`.
+Every module knows one package. Import nothing from here before `packages.prepare_process`.
 """
 
 from __future__ import annotations

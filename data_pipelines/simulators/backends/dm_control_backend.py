@@ -13,7 +13,7 @@ class Backend(PhysicsBackend):
         self.group, _, self.task = env.rpartition("/")
 
     def reset(self, seed: int) -> None:
-        # Made anew for every episode: it is cheap, and the seed is given to the constructor.
+        # Made anew for every episode: this is cheap, and the constructor takes the seed.
         if self.group == "manipulation":
             self.env = manipulation.load(self.task, seed=seed)
             self.env._time_limit = np.inf

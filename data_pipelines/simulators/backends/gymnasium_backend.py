@@ -37,7 +37,7 @@ class Backend(PhysicsBackend):
 
     def vector(self) -> np.ndarray:
         if isinstance(self.observation, dict) and "Fetch" in self.made:
-            return self.observation["observation"][:10].astype(np.float32)  # what all its tasks have
+            return self.observation["observation"][:10].astype(np.float32)  # what all its tasks have in common
         proprio = [self.info[key] for key in sorted(self.info) if key.startswith("proprio/")]
         return np.concatenate(proprio).astype(np.float32) if proprio else super().vector()
 
@@ -48,6 +48,6 @@ class Backend(PhysicsBackend):
 
 
 def _success(info: dict) -> bool:
-    """Whether an environment says that its goal is reached, in whichever words."""
+    """Whether an environment says that its goal is reached, under any of the usual keys."""
     done = info.get("success", info.get("is_success", info.get("step_task_completions", False)))
     return bool(len(done)) if isinstance(done, list) else bool(done)

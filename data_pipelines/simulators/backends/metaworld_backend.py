@@ -21,7 +21,7 @@ class Backend(PhysicsBackend):
         self.kind = tasks.ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{env}-goal-observable"]
 
     def reset(self, seed: int) -> None:
-        self.env = self.kind(seed=seed)  # which is where it draws what is to be done
+        self.env = self.kind(seed=seed)  # this draws the task
         self.env.max_path_length = np.inf
         self.observation, _ = self.env.reset()
         self.model, self.data = self.env.model, self.env.data

@@ -63,7 +63,7 @@ class PhysicsBackend(ABC):
 
     def start(self, env: str, seed: int) -> None:
         if env != self.made:
-            np.random.seed(0)  # several packages draw from it
+            np.random.seed(0)  # several packages draw from the global generator
             self.make(env)
             self.made = env
         np.random.seed(seed)
@@ -86,8 +86,8 @@ class PhysicsBackend(ABC):
         return values
 
     def set_physics(self, values: np.ndarray) -> None:
-        # What follows from the state is recomputed only where the state is another: a restored
-        # start is then the start to the last bit.
+        # Derived quantities are recomputed only if the state is different: a restored start is then bit for bit the
+        # start.
         if not np.array_equal(values, self.physics()):
             mujoco.mj_setState(self.model, self.data, values, EVERYTHING)
             mujoco.mj_forward(self.model, self.data)

@@ -2,7 +2,7 @@
 
 Shadows, reflections and multisampling take ten times as long as the rest on a software renderer: they are off, and
 edges are antialiased by rendering at twice the size. The packages' own renderers are not used:
-robosuite's returns uninitialised memory now and then, gym-aloha's draws 640 x 480 in every step.
+robosuite's sometimes returns uninitialised memory, and gym-aloha's draws 640 x 480 in every step.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ NEVER = 10**9  # steps
 
 
 def _hollow_sawyer() -> None:
-    """MuJoCo 3.3 refuses meshes of the Sawyer whose volume is nearly nil: take them as shells."""
+    """MuJoCo 3.3 refuses meshes of the Sawyer whose volume is nearly zero: load them as shells."""
     load = MujocoXML.__init__
 
     def patched(self, fname, *args, **kwargs):
@@ -54,9 +54,9 @@ class Backend(PhysicsBackend):
             control_freq=round(self.spec.hz * self.spec.repeat),
             horizon=NEVER,
             ignore_done=True,
-            hard_reset=False,  # the model stays, which saves seconds an episode
+            hard_reset=False,  # the model is kept, which saves seconds per episode
         )
-        for name in self.env._observables:  # computed in every step of the physics; nobody looks
+        for name in self.env._observables:  # computed in every step of the physics, but not used
             self.env.modify_observable(name, "enabled", False)
 
     def reset(self, seed: int) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from data_pipelines.simulators.behaviour import Expert
 
 GAIN = 6.0  # action per metre
-FAST = 0.5  # at most, of full speed: episodes of seconds, not of half a second
+FAST = 0.5  # largest share of full speed: episodes last seconds, not half a second
 OPEN, CLOSED = 1.0, -1.0
 BEHIND = 0.09  # metres behind the block where pushing starts
 ABOVE = 0.12  # metres over the block where the hand travels

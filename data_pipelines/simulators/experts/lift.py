@@ -7,11 +7,11 @@ import numpy as np
 from data_pipelines.simulators.behaviour import Expert
 
 GAIN = 10.0  # action per metre
-FAST = 0.6  # at most, of full speed
+FAST = 0.6  # largest share of full speed
 OPEN, CLOSED = -1.0, 1.0
 ABOVE = 0.12  # metres over the cube where the hand travels
-NEAR = 0.02  # metres across at which the hand may go down
-GRASP_STEPS = 8  # that the fingers take to close
+NEAR = 0.02  # horizontal distance in metres at which the hand may go down
+GRASP_STEPS = 8  # steps that the fingers take to close
 DROPPED = 0.06  # metres between hand and cube at which it is lost
 
 

@@ -33,7 +33,7 @@ def expert(env) -> Expert:
 
 
 def _turning(env, offset: np.ndarray) -> np.ndarray:
-    """Where the T is in its place but turned: push across, on the side where the disc is."""
+    """If the T is in its place but turned: where to push across, on the side where the disc is."""
     error = (env.goal_pose[2] - env.block.angle + np.pi) % (2 * np.pi) - np.pi
     across = np.array([-offset[1], offset[0]]) / max(np.linalg.norm(offset), 1e-9)
     return across * (1.0 if error >= 0 else -1.0)

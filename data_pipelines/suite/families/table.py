@@ -1,4 +1,4 @@
-"""How a family's table is written: what is common, then one `Row` per sibling."""
+"""How a family's table is written: the common settings, then one `Row` per sibling."""
 
 from __future__ import annotations
 
