@@ -1,1 +1,2 @@
-"""What is known of a study before it runs: what it costs, what of it is done, and whether its trials can be trained."""
+"""What is known about a study before it runs: what it costs, which parts are done, and whether its trials can be
+trained."""

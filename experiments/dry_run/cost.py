@@ -1,9 +1,9 @@
 """What a study will cost, before it runs: parameters, FLOPs and a time estimate per trial.
 
 Needs no data and no device: action sizes come from the registry, parameter counts from the declared
-model without making an array. The rate of a device and times are those of the preset's machine
-(`Study.flops_per_second`, `Study.trial_seconds`); several devices are taken to be as many times faster. What trials
-have in common is counted once; what is made before the first one is estimated in `preparing_cost`.
+model without making an array. The rate of a device and the times are those of the preset's machine
+(`Study.flops_per_second`, `Study.trial_seconds`); n devices are assumed to be n times as fast. What trials have in
+common is counted once; what is made before the first one is estimated in `preparing_cost`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def estimate(trial: Trial) -> Cost:
 
     table, config = _table_of(trial), trial.eval
     windows = len(trial.evaluated) * config.windows_per_dataset
-    batches = -(-windows // config.batch)  # the last one is filled up
+    batches = -(-windows // config.batch)  # the last batch is padded
     if trial.measure_untrained:
         batches += -(-len(trial.evaluated) * min(config.batch, config.windows_per_dataset) // config.batch)
     return Cost(
@@ -87,9 +87,9 @@ def declared_table(names: tuple[str, ...], rate: float | None) -> EmbodimentTabl
 
 
 def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
-    """The protocol on one window: likelihood under the recorded actions and other episodes', predicted frames, those
-    under random actions and (counted though users' data have none) under another episode's, and the policy; of all that
-    what the model is trained for."""
+    """The protocol on one window: likelihood under the recorded actions and those of other episodes, predicted frames,
+    frames under random actions and (counted although users' data have none) under another episode's actions, and the
+    policy; of these, the parts that the model is trained for."""
     from hma_jax.evaluation.protocol import predicts_actions, predicts_frames
     from hma_jax.generation.flops import rollout_flops, sampler_flops
     from hma_jax.model.flops import denoiser_flops, pass_flops
@@ -105,7 +105,7 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
     if not predicts_frames(setting):
         return flops
     window_pass = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, masked
-    true_pass = pass_flops(model, table, frames - 1, frames / 2, predicted=0)  # what these come after
+    true_pass = pass_flops(model, table, frames - 1, frames / 2, predicted=0)  # the frames before these
     likelihood = true_pass + window_pass
     if model.diffusion:
         likelihood += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
@@ -122,19 +122,20 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """The remaining cost of one trial, after those that it shares the beginning of its training with."""
+    """The remaining cost of one trial, after the trials with which it shares the beginning of its training."""
 
     trial: Trial
     cost: Cost
-    flops: float  # that it has to itself
+    flops: float  # not shared with others
     seconds: float
-    keep: tuple[int, ...] = ()  # steps whose checkpoints stay, for trials that go on from there
+    keep: tuple[int, ...] = ()  # steps whose checkpoints are kept, for trials that continue from there
 
 
 def plan_trials(
     study: Study, sweeps: Sequence[Sweep], devices: float = 1.0, evaluated: bool = True, done: Done = NOTHING
 ) -> dict[str, TrialPlan]:
-    """Every trial of `sweeps` by id, each on so many `devices`: what is left of it. `evaluated`: not only trained."""
+    """What is left to do for every trial of `sweeps`, by id, each on this number of `devices`. `evaluated`: not only
+    trained."""
     trials = unique_trials(sweeps, done.provenance)
     shared = share_runs(trials)
     plans = {}

@@ -1,7 +1,7 @@
-"""What of a study exists already, for dry runs: prepared data, finished trials, and progress of unfinished ones.
+"""Which parts of a study exist already, for dry runs: prepared data, finished trials, and progress of unfinished ones.
 
-Nothing is made and no data are read, so that a dataset that was changed since is not noticed: the study's own command
-refuses it.
+Nothing is made and no data are read, so a dataset that has been changed since is not noticed here: the study's own
+command refuses it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ConfigError
 
 UNKNOWN = Provenance("", "", "")
-"""Stands in where nothing is known of it, and only the trials' own fields matter."""
+"""A placeholder where the provenance is unknown and only the trials' own fields matter."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Done:
 
     suite: bool = False
     tokenizer: bool = False
-    tokens: bool = False  # and the evaluation windows
+    tokens: bool = False  # tokens and the evaluation windows
     provenance: Provenance = UNKNOWN
     finished: frozenset[str] = frozenset()
-    left: Mapping[str, str] = field(default_factory=dict)  # that ended without a result and are not run again, and how
-    steps: Mapping[str, int] = field(default_factory=dict)  # of trials not finished: made, or gone on from
-    other: int = 0  # finished trials of data that are to be replaced
+    left: Mapping[str, str] = field(default_factory=dict)  # how trials ended that are not run again
+    steps: Mapping[str, int] = field(default_factory=dict)  # steps of unfinished trials: made, or taken from others
+    other: int = 0  # finished trials whose data will be replaced
 
 
 NOTHING = Done()
@@ -53,15 +53,15 @@ NOTHING = Done()
 def find_done(
     setup: StudySetup, sweeps: Sequence[Sweep], retry_failed: bool = False, accept_code: bool = False
 ) -> Done:
-    """What there is of the trials of `sweeps` in the study's directory; nothing where another study is.
+    """What exists of the trials of `sweeps` in the study's directory; nothing if the directory holds another study.
 
-    `retry_failed`: trials that failed are run again; `accept_code`: they may go on from what other sources
-    trained. Raises ConfigError for a damaged ledger.
+    `retry_failed`: trials that failed are run again; `accept_code`: they may continue from what other sources trained.
+    Raises ConfigError for a damaged ledger.
     """
     study, workspace = setup.study, setup.workspace
     try:
         record = find_record(workspace)
-    except ConfigError:  # it cannot be read, of which the study's own command speaks
+    except ConfigError:  # it cannot be read, which the study's own command reports
         return NOTHING
     other = record is not None and _prepared_by(record.study) != _prepared_by(study)
     done = NOTHING if other else find_prepared(setup)
@@ -76,7 +76,8 @@ def find_done(
 
 
 def find_prepared(setup: StudySetup) -> Done:
-    """What is prepared, of the settings and entries that the study has: steps before the first that is made again."""
+    """What is prepared with the study's present settings and entries: the steps before the first one that is made
+    again."""
     changed = _changed(setup)
     suite = not setup.data and suite_is_there(setup.study, setup.workspace)
     tokenizer = setup.workspace.tokenizer.exists() and not changed & {"suite", "tokenizer"}
@@ -106,7 +107,7 @@ def _trials(
 
 
 def _prepared_by(study: Study) -> list[Any]:
-    """The settings on which it depends what trials are given."""
+    """The settings that determine the trials' inputs."""
     protocol = study.eval
     return [
         study.all_names(), study.suite, study.tokenizer, study.tokenizer_train, study.store, study.tau, study.rate,

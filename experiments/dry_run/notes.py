@@ -1,5 +1,5 @@
-"""What a person should know before hours pass: how large a model is trained, on how much of their data, where its
-tokenizer is trained, and which setting has no effect in so few steps."""
+"""What users should know before hours pass: how large a model is trained, on how much of their data, where its
+tokenizer is trained, and which setting has no effect in this number of steps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hma_jax.config import ConfigError, TokenizerConfig, TrainConfig
 
 
 def say_notes(setup: StudySetup, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> None:
-    """All of them, before a study runs and in its dry run."""
+    """Prints all notes, before a study runs and in its dry run."""
     trials = [point.trial for sweep in sweeps for point in sweep.points]
     if setup.data:
         say_scale(setup, trials)
@@ -35,7 +35,7 @@ def say_notes(setup: StudySetup, sweeps: Sequence[Sweep], launcher_options: Laun
 
 @contextmanager
 def refusal_as_note() -> Iterator[None]:
-    """Says in a dry run what the command itself would end with."""
+    """In a dry run, prints as a note the error with which the command itself would end."""
     try:
         yield
     except ConfigError as error:
@@ -43,11 +43,11 @@ def refusal_as_note() -> Iterator[None]:
 
 
 def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
-    """One line on the largest model of `trials`, and another preset where this one is made for a processor."""
+    """Prints a line on the largest model of `trials`, and names another preset if this one is made for CPUs."""
     height, width = setup.study.tokenizer.image_shape
     widest = max(trials, key=lambda trial: (trial.model.width, trial.model.layers, len(trial.datasets)))
     caps = [trial.max_trajectories for trial in trials]
-    some = any(trial.capped for trial in trials)  # a cap that holds for some datasets leaves the others whole
+    some = any(trial.capped for trial in trials)  # a cap on some datasets leaves the others whole
     most = None if None in caps or some else max(caps)
     tokenised = setup.study.store.max_train
     most = min((n for n in (most, tokenised) if n is not None), default=None)
@@ -66,8 +66,8 @@ def say_scale(setup: StudySetup, trials: Sequence[Trial]) -> None:
 
 
 def say_average(configs: Iterable[TrainConfig]) -> None:
-    """A line where a decay of the moving average is larger than any that a run comes to, so that others would have the
-    same effect."""
+    """Prints a line if the decay of the moving average is larger than any that a run reaches, so that other values
+    would have the same effect."""
     from hma_jax.training.average import warmup_decay
 
     last = {(config.ema_decay, config.steps): warmup_decay(config.steps - 1) for config in configs}
@@ -84,8 +84,8 @@ def say_average(configs: Iterable[TrainConfig]) -> None:
 
 
 def _say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> None:
-    """A line where a study for accelerators trains its tokenizer on this machine without one, while its trials run on
-    others."""
+    """Prints a line if a study for accelerators trains its tokenizer on this machine, which has none, while its trials
+    run on other machines."""
     elsewhere = launcher_options.name != "local" and setup.study.for_accelerators
     made = setup.tokenizer is not None or setup.workspace.tokenizer.exists()
     made = made or not isinstance(setup.study.tokenizer, TokenizerConfig)  # it cannot be trained
@@ -97,7 +97,7 @@ def _say_prepared_here(setup: StudySetup, launcher_options: LauncherOptions) -> 
 
 
 def say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
-    """A line on the axis trajectories where it has fewer points on the user's datasets than were asked for."""
+    """Prints a line if the axis trajectories has fewer points on the user's datasets than were asked for."""
     caps, most = setup.study.trajectory_counts, most_trajectories(setup.study)
     dropped = [cap for cap in setup.asked_counts if cap not in caps]
     if "trajectories" in {sweep.name for sweep in sweeps} and dropped and most:
@@ -110,7 +110,8 @@ def say_points(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
 
 
 def _say_one_point(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
-    """A line on the axis datasets where it has only one point of several datasets, which the user did not choose."""
+    """Prints a line if the axis datasets has only one point although there are several datasets, and the user did not
+    choose this."""
     names, alone = setup.study.dataset_names(), len(setup.study.dataset_counts) == 1
     chosen = "dataset_counts" in setup.arguments.chosen()
     if "datasets" in {sweep.name for sweep in sweeps} and not chosen and alone and len(names) > 1:
@@ -123,7 +124,7 @@ def _say_one_point(setup: StudySetup, sweeps: Sequence[Sweep]) -> None:
 
 
 def _parts(whole: int) -> str:
-    """A quarter, half and all of it, as --set takes a list."""
+    """A quarter, half and all of `whole`, as a list for --set."""
     return ",".join(map(str, sorted({max(round(part * whole), 1) for part in (0.25, 0.5, 1)})))
 
 
@@ -133,7 +134,8 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _say_unused(study: Study) -> None:
-    """A line on datasets that have more trajectories to train on than a trial takes, as far as it is known how many."""
+    """Prints a line on datasets that have more trajectories to train on than a trial takes, as far as their number is
+    known."""
     counts, names = study.trajectory_counts, study.dataset_names()
     sizes = {name: size_of(get_spec(name), study.store.held_out) for name in names}
     larger = {name: size.tokenised for name, size in sizes.items() if (size.trained or size.tokenised) > counts[-1]}

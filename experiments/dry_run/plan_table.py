@@ -23,9 +23,9 @@ from experiments.terminal.words import counted, duration, in_thousands
 
 @dataclass(frozen=True)
 class Devices:
-    """What trials are computed on."""
+    """The devices on which trials are computed."""
 
-    each: float = 1.0  # of a trial; below 1: several trials share one
+    each: float = 1.0  # devices per trial; below 1: several trials share one
     at_once: int | None = 1  # trials at a time; None: the cluster says
 
 
@@ -89,7 +89,7 @@ def plan_table(
 
 
 def _describe_done(done: Done, trials: int) -> str:
-    """What is not counted, since it is there."""
+    """What is not counted because it exists."""
     existing = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
     parts = [name for name, exists in existing.items() if exists]
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
@@ -144,7 +144,7 @@ def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before:
 
 
 def _axes(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
-    """What every trial is, by id: the control, a variant, or a point of one axis or several."""
+    """What each trial is, by id: the control, a variant, or a point of one or several axes."""
     names: dict[str, dict[str, str]] = {}
     for sweep in sweeps:
         for point in sweep.points:
@@ -154,7 +154,7 @@ def _axes(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
 
 
 def _places(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
-    """Where trials stand on an axis of numbers, by id."""
+    """The positions of trials on an axis of numbers, by id."""
     return {
         trial_id(point.trial, provenance): f"{point.x:g}"
         for sweep in sweeps

@@ -1,8 +1,8 @@
-"""What is made before the first trial of a study will cost: simulating, the tokenizer, tokens, and starting up.
+"""The cost of what is made before the first trial of a study: simulating, the tokenizer, tokens, and starting up.
 
-By formula and by what was measured on two cores of the machine that the `cpu` preset is meant for; nothing is made and
-no data is read. A dataset of which neither its files nor the registry say how many frames it has is not counted, and
-named.
+Computed by formula and from measurements on two cores of the machine for which the `cpu` preset is meant; nothing is
+made and no data is read. A dataset is not counted, but named, if neither its files nor the registry say how many frames
+it has.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from experiments.terminal.words import duration, few
 from hma_jax.config import AnyTokenizerConfig, TokenizerConfig
 
 SIMULATED = 3000.0
-"""Native frames of the suite that two cores simulate, draw and write in a second."""
+"""Native frames of the suite that two cores simulate, draw and write per second."""
 DECODED = 1500.0
-"""Frames that a core reads, decodes in full and resizes in a second, to train a tokenizer on or to encode. Several
-share this work (`decoding_threads`), but the machine that plans it may be another than the one that does it."""
+"""Frames that a core reads, decodes at full size and resizes per second, for training a tokenizer or for encoding.
+Several cores share this work (`decoding_threads`), but the planning machine need not be the one that does it."""
 LARGE_PRODUCTS = 3.0
-"""How many times the FLOPs of a small world model a tokenizer computes in a second: its products are larger, and it
+"""How many times as many FLOPs per second a tokenizer reaches as a small world model: its products are larger, and it
 has all cores."""
 START = 30.0
-"""Seconds of importing and compiling, of the whole preparation."""
+"""Seconds that the whole preparation spends importing and compiling."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class PreparingCost:
     simulating: float = 0.0
     tokenizer: float = 0.0
     tokens: float = 0.0
-    unknown: tuple[str, ...] = ()  # datasets of which nothing says how many frames they have
-    datasets: int = 0  # those too
+    unknown: tuple[str, ...] = ()  # datasets whose number of frames is unknown
+    datasets: int = 0  # including these
 
     @property
     def seconds(self) -> float:
@@ -49,7 +49,7 @@ class PreparingCost:
 @dataclass(frozen=True)
 class Frames:
     native: float
-    kept: float  # at the study's rate, of the episodes that are tokenised
+    kept: float  # frames at the study's rate, in the episodes that are tokenised
     simulated: bool
 
 
@@ -57,7 +57,7 @@ def estimate_preparing(
     study: Study, simulated: bool = True, trained: bool = True, tokenised: bool = True
 ) -> PreparingCost:
     """`simulated`: the suite is made, no data is given. `trained`: the tokenizer is trained, none is given.
-    `tokenised`: tokens are made, which are not there yet; when they are, nothing else is made either."""
+    `tokenised`: tokens are made, since they do not exist yet; if they exist, nothing else is made either."""
     if not tokenised:
         return PreparingCost()
     counts = {name: count_frames(study, name) for name in study.all_names()}
@@ -76,8 +76,8 @@ def estimate_preparing(
 
 
 def count_frames(study: Study, name: str) -> Frames | None:
-    """Number of frames of the episodes of a dataset that tokens are made of, held-out ones included; None where
-    nothing says it."""
+    """Number of frames in the episodes of a dataset from which tokens are made, including held-out ones; None if
+    unknown."""
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
@@ -102,8 +102,8 @@ def count_frames(study: Study, name: str) -> Frames | None:
 
 @functools.cache
 def tokenizer_flops(config: AnyTokenizerConfig) -> tuple[float, float]:
-    """(to encode an image, to train on one) by counting matrix products; 0 for a tokenizer that is not declared here,
-    whose time is then that of reading frames alone."""
+    """FLOPs (to encode an image, to train on one) by counting matrix products; 0 for a tokenizer that is not declared
+    here, whose time is then only that of reading frames."""
     import jax
     import jax.numpy as jnp
 

@@ -16,8 +16,8 @@ from hma_jax.config import ConfigError, MeshConfig, TrainConfig, require
 
 
 def require_trainable(study: Study, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> None:
-    """Raises ConfigError for a trial that would fail once all is prepared (`check_launched`)."""
-    if launcher_options.share() is None and launcher_options.name == "local":  # they have what JAX finds here
+    """Raises ConfigError for a trial that would fail once everything is prepared (`check_launched`)."""
+    if launcher_options.share() is None and launcher_options.name == "local":  # the devices that JAX finds
         import jax
 
         check_trials(study, sweeps, float(jax.device_count()))
@@ -26,8 +26,8 @@ def require_trainable(study: Study, sweeps: Sequence[Sweep], launcher_options: L
 
 
 def check_launched(study: Study, sweeps: Sequence[Sweep], launcher_options: LauncherOptions) -> float:
-    """`check_trials` on what the launcher gives each. Where that is too much of this machine, the error names how many
-    --workers may share it."""
+    """`check_trials` with what the launcher gives each trial. If that is too much of this machine, the error says how
+    many --workers may share it."""
     share = launcher_options.share()
     try:
         return check_trials(study, sweeps, share)
@@ -46,7 +46,7 @@ def check_launched(study: Study, sweeps: Sequence[Sweep], launcher_options: Laun
 
 
 def devices_of(mesh: MeshConfig, share: float | None) -> float:
-    """The devices that a program uses of its `share`; where that is unknown, as many as the mesh needs at least.
+    """Number of devices that a program uses of its `share`; if that is unknown, the least number that the mesh needs.
 
     Raises ConfigError for a mesh that does not fit them, as training would.
     """
@@ -58,9 +58,9 @@ def devices_of(mesh: MeshConfig, share: float | None) -> float:
 
 
 def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
-    """`devices_of` each trial. Raises ConfigError also for one whose batch or model does not divide over them, whose
-    learning rate would not do what is said of it, or that is to train robots alone that it does not have, or that have
-    nothing to themselves."""
+    """`devices_of` each trial. Raises ConfigError also for a trial whose batch or model does not divide over them,
+    whose learning rate would not do what its description says, or that is to train only robots that it does not have or
+    that have no parameters of their own."""
     from hma_jax.runtime.mesh import check_sizes, mesh_sizes
     from hma_jax.training.optimizer import check_schedule
 
@@ -70,7 +70,7 @@ def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> 
     for trial in unique_trials(sweeps, UNKNOWN).values():
         check_sizes(sizes, trial.model, trial.train.batch, execution.accumulate)
         check_schedule(trial.train.optimizer, trial.train.steps)
-        if trial.source:  # each is judged as a robot that the model was adapted to
+        if trial.source:  # each is judged as a robot to which the model was adapted
             _require_actions(trial.train.only, trial.rate)
         require_only(trial.train, [name for one in trial.with_source() for name in one.datasets], trial.rate)
     return devices
@@ -86,8 +86,8 @@ def _require_actions(robots: Sequence[str], rate: float | None) -> None:
 
 
 def require_only(train: TrainConfig, robots: Sequence[str], rate: float | None) -> None:
-    """Raises ConfigError, as training would, where `train.only` names others than the `robots` that a model is trained
-    on, and where none of those that it names has anything to itself that would be trained."""
+    """Raises ConfigError, as training would, if `train.only` names robots that are not among the `robots` that a model
+    is trained on, or if none of those named has parameters of its own to train."""
     without = [name for name in train.only if name not in robots]
     require(not without, f"train.only: the study has no robot {few(without)}, but {few(robots)}")
     if train.only:

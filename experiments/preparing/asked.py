@@ -1,4 +1,5 @@
-"""What the process that holds a study's directory was asked to make in it, for those that would share the work."""
+"""What the process that holds a study's directory was asked to make there, for other processes that want to share the
+work."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from hma_jax.runtime.files import write_file
 FILE = ".asked.json"
 
 WRITTEN_WITHIN = 60.0
-"""Seconds for which one that joins waits for the file of a process that has just taken the directory, on a shared disk
-too; who has written none by then is at another command."""
+"""Seconds for which a joining process waits for the file of a process that has just taken the directory, also on a
+shared disk; a process that has written none by then is running another command."""
 
 ENTRIES, RECORDINGS = "entries", "recordings"
 
@@ -29,8 +30,8 @@ Asked = dict[str, Any]
 
 
 def asked_for(study: Study, sources: Sequence[Source], tokenizer: Path | None) -> Asked:
-    """What tokens and windows depend on, under the names that --set has; a `tokenizer` that is given, by its directory,
-    is known by its identity. The recordings are not known before the sources were opened."""
+    """What tokens and windows depend on, under the names that --set uses; a `tokenizer` that is given, as a directory,
+    is identified by its content. The recordings are not known before the sources are opened."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     return {
@@ -52,8 +53,8 @@ def with_recordings(asked: Asked, study: Study, sources: Sequence[Source]) -> As
 
 
 def write_asked(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Path | None) -> None:
-    """For those that join while the directory is held; raises what `check_sources` raises. Sources without an index
-    take hours to open, so what is known before that is written before it."""
+    """Writes what was asked, for processes that join while the directory is held; raises what `check_sources` raises.
+    Sources without an index take hours to open, so what is known before that is written first."""
     asked = asked_for(study, sources, tokenizer)
     _write(workspace, asked)
     _write(workspace, with_recordings(asked, study, sources))
@@ -68,8 +69,8 @@ def _write(workspace: Workspace, asked: Asked) -> None:
 def require_same_asked(
     study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Path | None, busy: Busy
 ) -> None:
-    """Raises Busy if the process that holds the directory was asked for something else, where it says so, and as
-    `check_sources` does. Waits for what that process has still to find out."""
+    """Raises Busy if the process that holds the directory says that it was asked for something else; and what
+    `check_sources` raises. Waits for what that process has still to find out."""
     here, began = asked_for(study, sources, tokenizer), time.monotonic()
     if there := _wait_for_asked(workspace, busy, began):
         _require_same(there | {RECORDINGS: None}, here, busy)
@@ -81,7 +82,7 @@ def require_same_asked(
 def _require_same(there: Asked, here: Asked, busy: Busy) -> None:
     if ENTRIES not in there:
         raise Busy(f"{busy}. The work cannot be shared, since that one is of an earlier version", busy.holder)
-    both = there[ENTRIES].keys() & here[ENTRIES].keys()  # the others are told by `datasets`
+    both = there[ENTRIES].keys() & here[ENTRIES].keys()  # `datasets` shows the others
     if lines := diff(_of(both, there), _of(both, here)):
         raise Busy(
             f"{busy}. The work cannot be shared, since that one was asked for something else (there -> here):\n  "
@@ -96,8 +97,9 @@ def _of(names: Collection[str], asked: Asked) -> Asked:
 
 
 def _wait_for_asked(workspace: Workspace, busy: Busy, began: float, *, opened: bool = False) -> Asked | None:
-    """What the holder of the directory was asked for; with `opened`, once it says its recordings too. None if it has
-    ended, or is at another command, having written nothing for WRITTEN_WITHIN seconds since `began`."""
+    """What the holder of the directory was asked for; with `opened`, waits until this includes its recordings. None if
+    the holder has ended, or is running another command (it has written nothing for WRITTEN_WITHIN seconds since
+    `began`)."""
     announced = False
     for pause in backoff():
         asked = _read(workspace)

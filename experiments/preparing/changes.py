@@ -1,7 +1,7 @@
 """Whether a study can be prepared in its directory: asked before anything is made, by commands and their dry runs.
 
-Compares what is there with the study's settings and entries, in all steps at once. No dataset is opened, so that
-recordings that changed are not noticed: the step that reads them refuses them.
+Compares what is there with the study's settings and entries, in all steps at once. No dataset is opened, so changed
+recordings are not noticed here: the step that reads them refuses them.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ def require_preparable(
     replace: Step | None,
     more: Sequence[Change] = (),
 ) -> None:
-    """Raises ConfigError for a study on `data` that has no tokenizer and cannot train one, and for what was made from
-    other inputs, `more` of which the caller knows, unless `replace` allows it."""
+    """Raises ConfigError for a study on `data` that has no tokenizer and cannot train one, and, unless `replace` allows
+    it, for products that were made from other inputs; `more`: such changes that the caller knows."""
     if data and tokenizer is None:
         require_trainable_tokenizer(study.tokenizer)
     require_unchanged([*find_changes(study, workspace, data, tokenizer), *more], replace)
 
 
 def find_changes(study: Study, workspace: Workspace, data: Sequence[str], tokenizer: Path | None) -> list[Change]:
-    """Steps whose product is there, but was made from other inputs, in their order. Of those after a changed one, what
-    follows from it is not among them."""
+    """Steps, in order, whose product exists but was made from other inputs. For steps after a changed one, consequences
+    of that change are not listed."""
     changes = [
         Change("suite", workspace.suite, () if data else suite_changes(study, workspace)),
         Change("tokenizer", workspace.tokenizer, trained_changes(study, workspace), unchanged(workspace.tokenizer))

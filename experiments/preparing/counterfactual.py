@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 def make_counterfactual(study: Study, workspace: Workspace) -> None:
-    """Simulates them, unless they are there for these windows and this prompt.
+    """Simulates the frames, unless they exist for these windows and this prompt.
 
-    Robots whose dataset does not say their actions have none. Raises DataError if the simulator does not give back
-    what was recorded, under the recorded actions.
+    Robots whose dataset does not say their actions have none. Raises DataError if the simulator, under the recorded
+    actions, does not reproduce the recording.
     """
     from data_pipelines.suite.embodiments import select
     from data_pipelines.tokens.store import TokenStore
@@ -39,7 +39,7 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
             existing = CounterfactualFrames.load(workspace.counterfactual)
             if (existing.manifest, existing.prompt) == (manifest.hash(), prompt):
                 return
-        except DataError:  # it follows from what is here: made again
+        except DataError:  # it follows from what is here, so it is made again
             pass
     slicers = {name: make_slicer(store, name, manifest.frames, manifest.rate) for name in manifest.names}
     others = OtherWindows(store, slicers, manifest.frames, manifest.rate, manifest.seed)
@@ -63,7 +63,7 @@ def _of_robot(
     study: Study,
 ) -> np.ndarray:
     """Frames uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros. A window that no other episode's
-    actions cover, as one of the longest episode, has the recorded frames, which nobody reads."""
+    actions cover, such as one of the longest episode, has the recorded frames, which are not used."""
     from data_pipelines.suite.counterfactual import frames_under
 
     name, size = spec.name, study.tokenizer.image_size

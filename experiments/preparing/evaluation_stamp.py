@@ -1,5 +1,5 @@
-"""A stamp beside the results of `hma evaluate`: of which model, windows and protocol they are. Results of others do not
-replace them unless that is asked for."""
+"""A stamp beside the results of `hma evaluate`: the model, windows and protocol that they belong to. Other results
+replace them only on request."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ STAMP = "evaluation.made_from.json"
 FORMERLY_NAMED = frozenset(
     "weight_cap time_shift recall chain_factors own_past_rounds displaced_past change_weight matrices".split()
 )
-"""Fields that earlier versions hashed with any value; a field that is added is none of them."""
+"""Fields that earlier versions hashed whatever their value. Fields that are added later are not among them."""
 
 
 def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedData, config: EvalConfig) -> MadeFrom:
     """The stamp of an evaluation on the windows of the datasets `names`.
 
-    The step is recorded only: of a run that trains on, later results replace earlier ones. So are, for `hma compare`,
-    the steps that its training was to have, and the seed, which is part of the model's hash as well.
+    The step is only recorded, not compared: if a run trains on, later results replace earlier ones. For `hma compare`,
+    the planned number of training steps is recorded too, and the seed, which is also part of the model's hash.
     """
     chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {
@@ -50,20 +50,20 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
         "data": data,
     }
     recorded = {"step": trained.step}
-    if "loader" in trained.provenance:  # a converted model does not know them
+    if "loader" in trained.provenance:  # a converted model does not record them
         recorded |= {"steps": trained.train.steps, "seed": trained.train.seed}
     return MadeFrom(inputs, recorded)
 
 
 def _hash_model(trained: Run, named: Collection[str] = ()) -> str:
-    """A hash of what a run was trained to be, whatever its number of steps."""
+    """A hash of what a run was trained to be, independent of its number of steps."""
     model, train = (identity_of(config, named) for config in (trained.model, trained.train))
     del train["steps"]
     return stable_hash({"model": model, "train": train, "provenance": trained.provenance})
 
 
 def require_same_evaluation(place: Path, wanted: MadeFrom, trained: Run) -> None:
-    """Raises ConfigError if `place` holds results of another evaluation than `wanted`, which is of `trained`."""
+    """Raises ConfigError if `place` holds results of an evaluation other than `wanted`, which is that of `trained`."""
     existing = read_stamp(place, STAMP)
     if existing is not None:
         known = existing.inputs | {"eval": _protocol(existing.inputs.get("eval", {}))}
@@ -90,8 +90,8 @@ def _protocol(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _differences_of_windows(place: Path, wanted: MadeFrom) -> list[str]:
-    """For results of an earlier version, which have no stamp: lines on their datasets, and on how many windows of
-    each."""
+    """For results of an earlier version, which have no stamp: lines on differences in datasets and in the number of
+    windows of each."""
     from hma_jax.evaluation.windows import FILE, WindowTable
 
     try:

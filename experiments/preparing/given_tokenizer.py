@@ -1,5 +1,5 @@
-"""A tokenizer that is given to a study: copied from where it was trained, or refused; what it may know is told, and how
-well it reconstructs the study's frames."""
+"""A tokenizer that is given to a study: it is copied from where it was trained, or refused. Reports held-out data that
+it may have been trained on, and how well it reconstructs the study's frames."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ GIVEN = "given with --tokenizer, identity"
 """The origin of a copy, followed by what the tokenizer is."""
 
 TRAINED_FROM = "trained_from"
-"""In the stamp of a copy: the inputs of the training, where they are known. Its identity alone tells it from other
+"""In the stamp of a copy: the inputs of the training, if they are known. Only its identity distinguishes it from other
 tokenizers."""
 
 JUDGED = "judged_on.json"
-"""Beside a tokenizer that was given: by which frames it was judged, as the inputs of a stamp."""
+"""File beside a tokenizer that was given: the frames by which it was judged, as the inputs of a stamp."""
 
 USUAL_STD = (0.5, 2.0)
-"""The standard deviations of latents that are taken for about 1; others are told."""
+"""Standard deviations of latents that count as about 1; others are reported."""
 
 
 def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """Raises ConfigError if the workspace has another tokenizer than the one that is given by its directory `source`
-    or, without, than the study would train."""
+    """Raises ConfigError if the workspace's tokenizer is not the one in the given directory `source` or, without
+    `source`, not the one that the study would train."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     if source is None:
@@ -65,9 +65,9 @@ def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspa
 def adopt_tokenizer(
     source: Path, study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
 ) -> None:
-    """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already. Notes say of
-    which `sources` it may know held-out frames, or that this is not known, and which unseen robots it was trained on.
-    The stamp of the copy says what was known of the training.
+    """Copies a tokenizer that was trained elsewhere; nothing is done if the same one is there already. Notes say which
+    `sources` have held-out frames that it may have been trained on, or that this is not known, and which unseen robots
+    it was trained on. The stamp of the copy records what was known about the training.
 
     Raises ConfigError if it is not the kind that the study is made for, or if another one is there, unless
     `replace` allows it.
@@ -97,13 +97,13 @@ def adopt_tokenizer(
 def judge_tokenizer(
     study: Study, workspace: Workspace, sources: Sequence[Source], *, threads: int | None = None
 ) -> None:
-    """How well the workspace's tokenizer, which was given, reconstructs frames that the study holds out: said, and
-    written beside it; nothing is done if it was judged by the same frames. A note tells latents of an unusual scale.
-    `threads` as in `make_frame_loader`."""
+    """Measures how well the workspace's tokenizer, which was given, reconstructs frames that the study holds out;
+    prints the result and writes it beside the tokenizer. Nothing is done if it was judged by the same frames before. A
+    note reports latents with an unusual scale. `threads` as in `make_frame_loader`."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     place, sources = workspace.tokenizer, seen(study, sources)
-    before = read_stamp(place, JUDGED) or read_stamp(place)  # one that was trained here was judged then
+    before = read_stamp(place, JUDGED) or read_stamp(place)  # one that was trained here was judged after training
     frames = frames_made_from(study, sources, before)
     known = {name: before.inputs[name] for name in frames if name in before.inputs} if before else {}
     if (place / QUALITY).exists() and not differences(known, frames):
@@ -133,7 +133,7 @@ def _training(stamp: MadeFrom | None) -> MadeFrom:
 
 
 def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: Step | None) -> bool:
-    """Whether the workspace has the tokenizer that is given, by its directory `source`. Raises ConfigError if it has
+    """Whether the workspace already has the tokenizer in the given directory `source`. Raises ConfigError if it has
     another one, unless `replace` allows it."""
     from hma_jax.tokenizers.io import load_tokenizer
 
@@ -144,8 +144,8 @@ def _adopted(tokenizer: Tokenizer, source: Path, workspace: Workspace, replace: 
 
 
 def given_changes(source: Path, workspace: Workspace) -> list[str]:
-    """How the tokenizer of the workspace is another one than that in the directory `source`, by what they say of
-    themselves; [] without one."""
+    """How the workspace's tokenizer differs from the one in the directory `source`, according to what they say about
+    themselves; [] if there is none."""
     from hma_jax.tokenizers.io import read_identity
 
     return _of_another(read_identity(source), source, workspace.tokenizer, read_identity)
@@ -161,7 +161,7 @@ def _of_another(identity: str, source: Path, place: Path, identify: Callable[[Pa
         there = identify(place)
     except ConfigError as error:
         return [str(error)]
-    if there == identity:  # trained here, or the very directory that is given
+    if there == identity:  # trained here, or the given directory itself
         return []
     origin = existing.inputs[ORIGIN] if existing else "not written down"
     return [f"tokenizer: {there} ({origin}) -> {identity} ({source})"]
@@ -172,15 +172,15 @@ def _given(identity: str) -> str:
 
 
 def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[Source]) -> None:
-    """Warns where a given tokenizer was trained on frames that the study holds out: it was trained on datasets of
-    the study with fewer episodes held out (those are among these) or with others, on datasets before they grew (the
-    hold-out is drawn among all episodes of a dataset), or on robots that no model of the study is trained on."""
+    """Warns if a given tokenizer may have been trained on frames that the study holds out: on datasets of the study
+    with fewer (a subset of these) or other episodes held out, on datasets before they grew (the hold-out is drawn among
+    all episodes of a dataset), or on robots that no model of the study is trained on."""
     trained_with = training.inputs.get("store", {})
     data = {name: facts for name, facts in training.inputs["data"].items() if name in study.all_names()}
     more = [
         f"store.{name}: {trained_with[name]} -> {value}"
         for name, value in to_dict(study.store.held_out).items()
-        if name != "max_train"  # which changes nothing of what is held out
+        if name != "max_train"  # this does not change what is held out
         and value > trained_with.get(name, math.inf)
     ]
     if data and more:
@@ -216,8 +216,8 @@ def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[So
 
 
 def _other_splits(facts: Mapping[str, Any], spec: DatasetSpec) -> tuple[str, ...]:
-    """Lines on how other episodes of a dataset were held out of a training by the `facts` of its stamp than its entry
-    says now. What an earlier version did not write down is not compared."""
+    """Lines on how the held-out episodes of a dataset, according to the `facts` in a training's stamp, differ from
+    those that its entry gives now. Facts that an earlier version did not record are not compared."""
     now = {name: getattr(spec, name) for name in OF_FRAMES}
     before = {name: facts.get(name, value) for name, value in now.items()}
     same = before["val_split"] == now["val_split"] != ""  # whatever else is read

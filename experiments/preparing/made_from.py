@@ -1,10 +1,10 @@
 """Stamps of prepared data: what they were made from, and whether they may be replaced.
 
 Three kinds of facts are written beside what is made, none of them a path or a time. *Inputs* are settings and data,
-by content. A thing that is there and was made from other inputs is refused, never replaced, unless the user asked for
-that. What is *recorded*, the hash of the sources that made it, changes with many an edit that alters nothing: a
-difference is said, and the thing that is there stays in use. To have it made by the new sources, remove it. The
-*machine* is for people.
+by content. A thing that exists and was made from other inputs is refused, and never replaced unless the user asks for
+that. What is *recorded*, the hash of the sources that made it, changes with many edits that alter nothing: a difference
+is reported, and the existing thing stays in use. To have it made by the new sources, remove it. The *machine* is for
+people.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ OLD_STAMP = "made_from.txt"
 """The stamp of earlier versions: a hash, which does not show what differs."""
 
 FORMERLY_RECORDED = ("tau", "order")
-"""Inputs that stamps of earlier versions have as recorded only."""
+"""Inputs that are only recorded in stamps of earlier versions."""
 
 ORIGIN = "origin"
 """The input that decides which others there are."""
@@ -52,7 +52,7 @@ class MadeFrom:
     machine: dict[str, Any] = field(default_factory=dict)
 
     def identity(self) -> dict[str, Any]:
-        """Equal for things that are made in the same way by the same sources, as JSON."""
+        """A value, as JSON, that is equal for things made in the same way by the same sources."""
         return {"inputs": self.inputs, "recorded": self.recorded}
 
     @property
@@ -64,7 +64,7 @@ class MadeFrom:
 
 
 def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
-    """What the thing in `directory` was made from; None if it is not written down there, or damaged."""
+    """What the thing in `directory` was made from; None if that is not recorded there, or is damaged."""
     try:
         existing = from_dict(MadeFrom, json.loads((directory / name).read_text()))
         require(all(isinstance(part, dict) for part in vars(existing).values()), "not JSON values by name")
@@ -76,8 +76,8 @@ def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
 
 
 def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Lines 'setting: old -> new' for inputs that differ. What an earlier version did not write down of a dataset is
-    not compared."""
+    """Lines 'setting: old -> new' for inputs that differ. Facts about a dataset that an earlier version did not record
+    are not compared."""
     if existing.get(ORIGIN) != wanted.get(ORIGIN):
         return [f"{ORIGIN}: {existing.get(ORIGIN)} -> {wanted.get(ORIGIN)}"]
     old, new = dict(existing), dict(wanted)
@@ -112,19 +112,19 @@ def dataset_differences(existing: Sequence[str], wanted: Sequence[str]) -> list[
 
 
 def may_replace(step: Step, replace: Step | None) -> bool:
-    """Whether the user asked for `step`, or something that it is made of, to be replaced."""
+    """Whether the user asked to replace `step`, or something from which it is made."""
     order = get_args(Step)
     return replace is not None and order.index(replace) <= order.index(step)
 
 
 @dataclass(frozen=True)
 class Change:
-    """How what a step made in a `place` differs from what is asked for."""
+    """How the product of a step in a `place` differs from what is asked for."""
 
     step: Step
     place: Path
-    lines: Sequence[str]  # 'setting: there -> asked for'; (): in nothing
-    otherwise: str = ""  # one more way to go on
+    lines: Sequence[str]  # 'setting: there -> asked for'; (): no difference
+    otherwise: str = ""  # one more way to continue
 
 
 def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | None, otherwise: str = "") -> None:
@@ -133,7 +133,7 @@ def require_same(step: Step, place: Path, lines: Sequence[str], replace: Step | 
 
 
 def require_unchanged(changes: Sequence[Change], replace: Step | None) -> None:
-    """Raises ConfigError for changes that the user did not ask for, of all steps at once: it names the --replace that
+    """Raises ConfigError for changes that the user did not ask for, for all steps at once: it names the --replace that
     allows them all."""
     refused = [change for change in changes if change.lines and not may_replace(change.step, replace)]
     if not refused:
@@ -153,7 +153,7 @@ def require_unchanged(changes: Sequence[Change], replace: Step | None) -> None:
 
 
 def say_recorded(what: str, place: Path, existing: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Tells that something stays in use although other sources would make it now; of what both say."""
+    """Prints that something stays in use although other sources would make it now; compares only what both record."""
     lines = [line for name in existing.keys() & now.keys() for line in diff(existing[name], now[name], name)]
     if lines:
         say(

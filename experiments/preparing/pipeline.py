@@ -1,9 +1,9 @@
 """From datasets to everything a trial needs: suite, tokenizer, token store, frozen windows and, of the suite, what is
 true in them under other actions.
 
-Each step is skipped when its output is there and was made from the same inputs, and goes on where it was cut
-short. What was made from other inputs is refused unless it may be replaced (`preparing.made_from`). What was
-prepared is named by the hashes of `Provenance`.
+Each step is skipped if its output exists and was made from the same inputs, and continues where it was interrupted.
+Output that was made from other inputs is refused unless it may be replaced (`preparing.made_from`). What was prepared
+is identified by the hashes of `Provenance`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ def prepare(
 ) -> Provenance:
     """Makes what is missing and returns what trials depend on.
 
-    `data` are directories of the user's datasets; () simulates the suite. Instead of training one, a trained
-    `tokenizer` is taken from its directory. What follows from `replace` on may be made again in its place. `batch` and
-    `threads` as in `make_store`; a tokenizer is trained and judged with as many threads. Raises ConfigError or
-    DataError.
+    `data` are directories of the user's datasets; () simulates the suite. A trained `tokenizer` is taken from its
+    directory instead of training one. Steps from `replace` on may be redone and their products replaced. `batch` and
+    `threads` as in `make_store`; a tokenizer is trained and judged with the same number of threads. Raises ConfigError
+    or DataError.
     """
     require_plain(workspace.root)
     if study.eval.lpips:
-        require_lpips()  # before all that the evaluation comes after
+        require_lpips()  # before all the work that precedes the evaluation
     require_preparable(study, workspace, data, tokenizer, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     write_asked(study, workspace, sources, tokenizer)

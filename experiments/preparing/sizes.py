@@ -1,4 +1,4 @@
-"""Finds how many trajectories the user's datasets have, and says where the registry says something else."""
+"""Finds how many trajectories the user's datasets have, and reports where the registry differs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hma_jax.config import ConfigError
 
 
 def group_readable(data: Sequence[str]) -> dict[str, dict[str, str]]:
-    """As `group_by_dataset`; {} where one of them cannot be read: who reads it says why."""
+    """Like `group_by_dataset`; {} if one of them cannot be read: the code that reads it says why."""
     try:
         return group_by_dataset(data)
     except (DataError, ConfigError):
@@ -27,8 +27,8 @@ def group_readable(data: Sequence[str]) -> dict[str, dict[str, str]]:
 def find_sizes(
     datasets: Mapping[str, Mapping[str, str]], held_out: HeldOut, workspace: Workspace
 ) -> dict[str, DataSize]:
-    """The sizes of `datasets`, as `group_by_dataset` gives them, whose files say how many episodes there are or whose
-    tokens are in `workspace`: tokens that were made of as many episodes, of a dataset of as many."""
+    """The sizes of those `datasets` (as `group_by_dataset` gives them) whose files say how many episodes there are, or
+    whose tokens are in `workspace` and were made from the same number of episodes."""
     by_tokens, sizes, others = sizes_by_tokens(workspace.data_summary), {}, []
     for name, places in datasets.items():
         spec, tokens = find_spec(name), by_tokens.get(name)
@@ -47,8 +47,8 @@ def find_sizes(
 
 
 def size_by_files(spec: DatasetSpec, places: Mapping[str, str], held_out: HeldOut) -> DataSize | None:
-    """The size of the dataset whose parts lie at `places`. None where its files do not say it: who reads them says what
-    is damaged there."""
+    """The size of the dataset whose parts lie at `places`. None if its files do not say it: the code that reads them
+    reports damage."""
     from data_pipelines.sources.open import read_size
 
     try:

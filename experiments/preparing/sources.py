@@ -29,9 +29,9 @@ Unopened = tuple["DatasetSpec", None]
 
 
 def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
-    """{dataset: {name in its files: location}} of the datasets at these locations; several locations are one dataset
-    where an entry joins them. Raises NoDatasetError with all locations that are no datasets, another DataError for one
-    that cannot be read, ConfigError for two of one name."""
+    """{dataset: {name in its files: location}} of the datasets at these locations; several locations are one dataset if
+    an entry joins them. Raises NoDatasetError with all locations that are not datasets, another DataError for one that
+    cannot be read, ConfigError for two with the same name."""
     places: dict[str, str] = {}
     datasets: dict[str, dict[str, str]] = {}
     for place, name in zip(data, _names_at(data), strict=True):
@@ -65,7 +65,7 @@ def _names_at(data: Sequence[str]) -> list[str]:
 
 
 def require_entries(names: Sequence[str], datasets: Mapping[str, Mapping[str, str]]) -> None:
-    """Raises ConfigError for datasets (`group_by_dataset`) that no entry describes, with the place of each."""
+    """Raises ConfigError, with the place of each, for datasets (`group_by_dataset`) that no entry describes."""
     unknown = [
         f"{describe_unknown(name)} It is what the files in {place} call themselves."
         for name in names
@@ -84,8 +84,8 @@ def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
 
 
 def source_of(name: str, places: Mapping[str, str]) -> Source:
-    """A dataset with its registry entry, which joins those of its parts that are given; says which are not. Raises
-    ConfigError for an unknown name."""
+    """A dataset with its registry entry, limited to those of the joined parts that are given; prints which are not.
+    Raises ConfigError for an unknown name."""
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.rlds.location import locate
 
@@ -102,7 +102,7 @@ def source_of(name: str, places: Mapping[str, str]) -> Source:
 
 
 def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
-    """The simulated datasets, which must be there. Raises ConfigError with `advice` otherwise."""
+    """The simulated datasets. Raises ConfigError, with `advice`, if they do not exist."""
     sources = [(get_spec(name), workspace.suite / name) for name in study.all_names()]
     missing = [spec.name for spec, path in sources if not path.is_dir()]
     require(not missing, f"{workspace.suite}: {', '.join(missing)} not simulated yet. {advice}")
@@ -110,8 +110,8 @@ def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
 
 
 def check_sources(study: Study, sources: Sequence[Source]) -> dict[str, EpisodeSource]:
-    """Opens every dataset, by name, before anything is made of one, which may take hours. Raises ConfigError and
-    DataError for what tokenising would refuse of it without reading an episode."""
+    """Opens every dataset, by name, before anything is made from one, which may take hours. Raises ConfigError and
+    DataError for whatever tokenising would refuse without reading an episode."""
     from data_pipelines.tokens.tokenize_job import resolve_frame_step
 
     opened = {}
@@ -123,8 +123,8 @@ def check_sources(study: Study, sources: Sequence[Source]) -> dict[str, EpisodeS
 
 
 def check_entries(study: Study, data: Sequence[str]) -> None:
-    """The part of `check_sources` that takes no time, for a dry run: whether the entries of the user's directories
-    fit the fields that their files declare. Says which rates are not reached. RLDS records are not looked for."""
+    """The part of `check_sources` that takes no time, for a dry run: checks that the entries of the user's directories
+    fit the fields that their files declare. Prints which rates are not reached. Does not search for RLDS records."""
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.open import find_format
     from data_pipelines.sources.rlds.schema import FEATURES, check_fields, read_metadata, resolve_version
@@ -147,8 +147,8 @@ def check_entries(study: Study, data: Sequence[str]) -> None:
 
 
 def say_other_versions(sources: Sequence[Source]) -> None:
-    """Names the RLDS datasets of another version than their entry was written for. Where its fields are in the files
-    too, nothing else tells that units or conventions are others."""
+    """Names the RLDS datasets whose version is not the one for which their entry was written. If the entry's fields
+    exist in the files, nothing else shows that units or conventions have changed."""
     from data_pipelines.sources.joined import Parts
     from data_pipelines.sources.open import find_format
     from data_pipelines.sources.rlds.schema import read_info, resolve_version
@@ -169,7 +169,7 @@ def say_other_versions(sources: Sequence[Source]) -> None:
 
 
 def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
-    """Names the datasets that were recorded at a lower rate than frames are asked for at."""
+    """Names the datasets that were recorded at a lower rate than the one at which frames are asked for."""
     asked = ((spec, spec.rate or study.rate) for spec, _ in sources)
     slow = [f"{s.name} ({s.hz:g} Hz, not {rate:g})" for s, rate in asked if rate and rate > s.rate_for(1)]
     if slow:
@@ -177,8 +177,8 @@ def say_unreached_rates(study: Study, sources: Sequence[Source]) -> None:
 
 
 def say_short_episodes(study: Study, sources: Sequence[Source]) -> None:
-    """Names the datasets of which, as far as their files or else their entries say, few episodes or none give a window
-    to evaluate on: how long each is may be known only when it is tokenised, after a tokenizer was trained."""
+    """Names the datasets of which, according to their files or else their entries, few or no episodes give a window to
+    evaluate on. The length of each episode may be known only when it is tokenised, after a tokenizer was trained."""
     from data_pipelines.windows.windows import least_judged, settings_for_short
 
     least, short, stride = least_judged(study.eval.prompt_frames, study.model.frames), [], 1

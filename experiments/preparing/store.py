@@ -36,10 +36,11 @@ def make_store(
     threads: int | None = None,
     replace: Step | None = None,
 ) -> None:
-    """Tokens of every source; those made in the same way are kept. Any number of processes may do it at a time.
+    """Makes the tokens of every source; those made in the same way are kept. Any number of processes may do this at the
+    same time.
 
-    Raises ConfigError, before anything is done, if other tokens are in the place of some, unless `replace` allows
-    it. When it returns, every dataset is complete: parts that others are making are waited for at the end.
+    Raises ConfigError, before anything is done, if other tokens are in the place of some, unless `replace` allows it.
+    When it returns, every dataset is complete: at the end it waits for parts that other processes are making.
     `tokenizer`: a directory, if it is not the workspace's. `batch` and `threads` as in `tokenize_dataset`.
     """
     from data_pipelines.tokens.tokenize_job import tokenize_dataset
@@ -70,8 +71,8 @@ def make_store(
 
 
 def data_differences(study: Study, workspace: Workspace, data: Sequence[str], tokenizer: Tokenizer) -> list[str]:
-    """How the recordings at `data`, and the registry's entries of them, differ from those that the tokens here were
-    made from; settings of the store are not compared, nor what cannot be opened."""
+    """How the recordings at `data`, and their registry entries, differ from those from which the tokens here were made.
+    Settings of the store are not compared, nor data that cannot be opened."""
     try:
         sources = [source_of(name, places) for name, places in group_by_dataset(data).items()]
         lines = _differences(study, workspace, sources, tokenizer)
@@ -81,7 +82,7 @@ def data_differences(study: Study, workspace: Workspace, data: Sequence[str], to
 
 
 def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
-    """Notes datasets whose files state another native rate than their entry; the entry counts."""
+    """Notes datasets whose files state a native rate other than their entry's; the entry's rate is used."""
     from data_pipelines.sources.open import read_rate
     from data_pipelines.sources.source import same_rate
 
@@ -95,7 +96,7 @@ def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
 
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:
-    """How the datasets that are in the store were made otherwise; a line that holds for several is said once."""
+    """How the datasets in the store were made differently; a line that holds for several datasets is given once."""
     from data_pipelines.tokens.dataset_writer import differences, recorded_source
     from data_pipelines.tokens.tokenize_job import plan_dataset
 
@@ -112,8 +113,8 @@ def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], 
 
 
 def token_changes(study: Study, workspace: Workspace) -> list[str]:
-    """How the datasets that are in the store were made otherwise, by what is known before one is opened: by their
-    entries and the settings."""
+    """How the datasets in the store were made differently, as far as is known before one is opened: from their entries
+    and the settings."""
     from data_pipelines.tokens.dataset_writer import differences
     from data_pipelines.tokens.manifest import FILE
     from data_pipelines.tokens.manifest_file import load_manifest
@@ -131,7 +132,7 @@ def token_changes(study: Study, workspace: Workspace) -> list[str]:
 
 
 def _joined_lines(names: Iterable[str], differences: Callable[[str], list[str]]) -> list[str]:
-    """The `differences` of datasets; a line that holds for several is said once."""
+    """The `differences` of datasets; a line that holds for several datasets is given once."""
     found: dict[str, list[str]] = {}
     for name in names:
         try:

@@ -34,8 +34,8 @@ def require_simulated(names: Sequence[str], advice: str = "Give RLDS directories
 def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) -> list[Source]:
     """The simulated datasets of the study, written once.
 
-    Raises ConfigError where some are there with another seed or size, unless `replace` allows it. Those made by
-    an earlier version of the simulator stay in use, with a note.
+    Raises ConfigError if some exist with another seed or size, unless `replace` allows it. Datasets made by an earlier
+    version of the simulator stay in use, with a note.
     """
     from data_pipelines.sources.rlds.writer import VERSION
     from data_pipelines.suite.generate import generate_suite
@@ -66,7 +66,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
 
 
 def suite_changes(study: Study, workspace: Workspace) -> list[str]:
-    """How the simulated datasets that are there were made otherwise than the study would."""
+    """How the existing simulated datasets were made differently from what the study would make."""
     from data_pipelines.sources.rlds.writer import VERSION
 
     places = {name: workspace.suite / name / VERSION for name in study.all_names()}
@@ -74,7 +74,7 @@ def suite_changes(study: Study, workspace: Workspace) -> list[str]:
 
 
 def suite_is_there(study: Study, workspace: Workspace) -> bool:
-    """Whether all datasets of the study are there, with the settings that it has."""
+    """Whether all datasets of the study exist, with its settings."""
     from data_pipelines.sources.rlds.writer import VERSION
 
     places = {name: workspace.suite / name / VERSION for name in study.all_names()}
@@ -82,9 +82,9 @@ def suite_is_there(study: Study, workspace: Workspace) -> bool:
 
 
 def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | None:
-    """Lines on how a dataset that is there was made otherwise than `suite` says; [] if only by another version of the
-    simulator. None for a dataset that is as it should be, and for one that is to be made in any case: it is not there,
-    or lacks shards."""
+    """Lines on how an existing dataset was made differently from what `suite` says; [] if only by another version of
+    the simulator. None for a dataset that is as it should be, and for one that will be made in any case, because it is
+    missing or lacks shards."""
     from data_pipelines.publishing.fingerprint import FINGERPRINT, is_complete, read_metadata, shard_lengths
     from data_pipelines.suite.embodiments import select
     from data_pipelines.suite.generate import episode_count, fingerprint

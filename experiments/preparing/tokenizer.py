@@ -1,4 +1,4 @@
-"""The tokenizer of a study, trained on its datasets; `given_tokenizer` has those that are not."""
+"""The tokenizer of a study, trained on its datasets; `given_tokenizer` handles tokenizers that are not."""
 
 from __future__ import annotations
 
@@ -46,29 +46,29 @@ if TYPE_CHECKING:
 
 QUALITY = "quality.json"
 QUALITY_FRAMES = 1024
-"""Held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
+"""Number of held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
 
 OF_FRAMES = ("split", "val_split")
-"""Facts of a registry entry that say which frames a dataset has for a tokenizer, beside its camera."""
+"""Facts of a registry entry, besides its camera, that say which frames a dataset has for a tokenizer."""
 
 SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames", "data_pipelines.sources.open")
-"""The modules that train it; what they import follows (`running.closure`), of these three in functions as well: readers
-are imported when a dataset needs them."""
+"""The modules that train it, with everything that they import (`running.closure`). For these three, imports inside
+functions count too: readers are imported when a dataset needs them."""
 
 TRAINED = "trained here"
 """The origin of a tokenizer that was not given."""
 
 FRAMES, ENCODED, SHRUNK = "frames", "those that are encoded", "JPEG images of RLDS shrunk while they were decoded"
-"""Recorded: on which frames a tokenizer was trained and judged. Earlier versions, which record none, took smaller ones
-where a decoder could make them, by another filter than that of the frames that are encoded."""
+"""Recorded: the frames on which a tokenizer was trained and judged. Earlier versions, which did not record this, let
+the decoder shrink frames if it could, with a filter other than that of the frames that are encoded."""
 
 
 def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[Source]) -> MadeFrom:
-    """What the tokenizer of a study is trained from, under the names that --set has for it. Recordings are named as in
-    the stamp of the tokenizer that is there, which may be of an earlier version.
+    """What the tokenizer of a study is trained from, under the names that --set uses. Recordings are named as in the
+    stamp of the existing tokenizer, which may be of an earlier version.
 
-    Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
-    of where a dataset's frames are.
+    Steps, batch and objective of the model are not part of it; the mixture's temperature is, and what the registry says
+    about where a dataset's frames are.
     """
     inputs = {
         ORIGIN: TRAINED,
@@ -88,7 +88,7 @@ def frames_made_from(
     study: Study, sources: Sequence[Source] | Sequence[Unopened], existing: MadeFrom | None
 ) -> dict[str, Any]:
     """Inputs of a stamp that say which frames a tokenizer is trained on and judged by. Recordings are named as in an
-    `existing` stamp, which may be of an earlier version; those that are not opened are taken for the same."""
+    `existing` stamp, which may be of an earlier version; those that are not opened are assumed to be the same."""
     settings, known = study.store, existing.inputs.get("data", {}) if existing else {}
 
     def shards(spec: DatasetSpec, path: Location | Parts | None) -> str:
@@ -120,7 +120,7 @@ def make_tokenizer(
     *,
     threads: int | None = None,
 ) -> None:
-    """A tokenizer trained on frames of all sources; nothing is done if it is there.
+    """Trains a tokenizer on frames of all sources; nothing is done if it exists.
 
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. `threads` as in `make_frame_loader`. Raises
     ConfigError if one is there that was made from other inputs, unless `replace` allows it.
@@ -170,18 +170,18 @@ def make_frames(
 
 
 def save_quality(quality: Stat, directory: Path) -> None:
-    """Tells the PSNR of a tokenizer's reconstruction, and writes it beside the tokenizer."""
+    """Prints the PSNR of a tokenizer's reconstruction, and writes it beside the tokenizer."""
     console.print(f"its reconstruction of held-out frames: {plus_minus(quality.mean, quality.sem)} dB PSNR")
     write_file(directory / QUALITY, json.dumps(dataclasses.asdict(quality)))
 
 
 def require_same_trained(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """Raises ConfigError if the workspace has another tokenizer than the study would train."""
+    """Raises ConfigError if the workspace's tokenizer is not the one that the study would train."""
     _in_place(workspace.tokenizer, tokenizer_made_from(study, workspace, seen(study, sources)), None)
 
 
 def require_trainable_tokenizer(config: AnyTokenizerConfig) -> None:
-    """Raises ConfigError for a kind of tokenizer that is only imported or given."""
+    """Raises ConfigError for a kind of tokenizer that can only be imported or given."""
     require(
         isinstance(config, TokenizerConfig),
         "the study's tokenizer cannot be trained here: make one of published weights with `hma tokenizer import`, and give "
@@ -190,8 +190,8 @@ def require_trainable_tokenizer(config: AnyTokenizerConfig) -> None:
 
 
 def trained_changes(study: Study, workspace: Workspace) -> list[str]:
-    """How the tokenizer of the workspace was made otherwise than the study would train it, by what is known before a
-    dataset is opened; [] without one."""
+    """How the workspace's tokenizer was made differently from the one that the study would train, as far as is known
+    before a dataset is opened; [] if there is none."""
     place, existing = workspace.tokenizer, read_stamp(workspace.tokenizer)
     if not place.exists():
         return []
@@ -201,13 +201,13 @@ def trained_changes(study: Study, workspace: Workspace) -> list[str]:
 
 
 def seen(study: Study, sources: Sequence[Source]) -> list[Source]:
-    """The sources that a tokenizer is trained on and judged by: all but those of unseen robots."""
+    """The sources that a tokenizer is trained on and judged by: all except those of unseen robots."""
     return [(spec, path) for spec, path in sources if spec.name not in study.unseen]
 
 
 def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
-    """Whether the tokenizer that is to be trained is there. Raises ConfigError if another one is, unless `replace`
-    allows it."""
+    """Whether the tokenizer that is to be trained exists. Raises ConfigError if another one is in its place, unless
+    `replace` allows it."""
     if not place.exists():
         return False
     existing = read_stamp(place)
@@ -227,7 +227,7 @@ def _made_otherwise(place: Path, existing: MadeFrom | None, inputs: Mapping[str,
 
 
 def unchanged(place: Path) -> str:
-    """How to go on with a tokenizer of other inputs."""
+    """How to continue with a tokenizer that was made from other inputs."""
     return f"use it unchanged with --tokenizer {place}"
 
 
@@ -236,8 +236,8 @@ def reconstruction_psnr(
 ) -> Stat:
     """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames from the first batch of `frames` on.
 
-    Every frame counts equally; the error counts episodes, within each dataset. `progress` is called with the number of
-    frames that are done, and that of all.
+    Every frame counts equally; the standard error is over episodes, within each dataset. `progress` is called with the
+    number of frames that are done and the number of all frames.
     """
     from hma_jax.evaluation.metrics import psnr
     from hma_jax.evaluation.statistics import mean_and_sem, stratified

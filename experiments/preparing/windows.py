@@ -23,16 +23,17 @@ if TYPE_CHECKING:
     from data_pipelines.windows.evalset import EvalManifest
 
 HELD_OUT = 0.25
-"""Share of a dataset's episodes: if more are held out, a note says how many and why."""
+"""Share of a dataset's episodes; if more are held out, a note says how many and why."""
 
 
 def require_same_windows(study: Study, workspace: Workspace, replace: Step | None) -> None:
-    """Raises ConfigError, before anything is made, if what is known by then differs from the frozen windows."""
+    """Raises ConfigError, before anything is made, if what is known by then does not fit the frozen windows."""
     require_same("windows", workspace.manifest, window_changes(study, workspace), replace)
 
 
 def window_changes(study: Study, workspace: Workspace) -> list[str]:
-    """How the frozen windows differ from what is known of the study's before tokens are made; [] without any."""
+    """How the frozen windows differ from what is known about the study's windows before tokens are made; [] if there
+    are none."""
     from data_pipelines.windows.evalset import EvalManifest
 
     if not workspace.manifest.exists():
@@ -47,7 +48,7 @@ def window_changes(study: Study, workspace: Workspace) -> list[str]:
 def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = None) -> Provenance:
     """The validation windows that all trials share, and a summary of the data.
 
-    Raises ConfigError if others are there, unless `replace` allows it.
+    Raises ConfigError if other windows exist, unless `replace` allows it.
     """
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.evalset import freeze_manifest
@@ -82,7 +83,7 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
 
 
 def _what_helps(study: Study, store: TokenStore, name: str) -> str:
-    """The end of a note on a dataset without a window: which settings would make one in its short episodes."""
+    """The end of a note on a dataset without a window: the settings with which its short episodes would give one."""
     from data_pipelines.windows.windows import least_judged, settings_for_short
 
     manifest, least = store.manifest(name), least_judged(study.eval.prompt_frames, study.model.frames)
@@ -91,7 +92,7 @@ def _what_helps(study: Study, store: TokenStore, name: str) -> str:
 
 
 def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
-    """Whether the windows that are there are those of the tokens that are there."""
+    """Whether the existing windows belong to the existing tokens."""
     from data_pipelines.tokens.store import TokenStore
 
     existing = _frozen(workspace, None)
@@ -99,8 +100,8 @@ def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
 
 
 def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) -> None:
-    """Raises ConfigError if a dataset that is `judged` has no evaluation window, or any of the study no training
-    window: a point of an axis would seem to be of more datasets than it was made with."""
+    """Raises ConfigError if a `judged` dataset has no evaluation window, or a dataset of the study no training window:
+    a point of an axis would seem to include more datasets than it was made with."""
     from data_pipelines.windows.evalset import EvalManifest
     from data_pipelines.windows.windows import least_judged
 
@@ -120,7 +121,7 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
 
 
 def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
-    """The windows that are there. ConfigError if they cannot be read, unless they may be replaced."""
+    """The existing windows. Raises ConfigError if they cannot be read, unless they may be replaced."""
     from data_pipelines.windows.evalset import EvalManifest
 
     if not workspace.manifest.exists():
@@ -142,7 +143,7 @@ def _setting_differences(
 
 
 def _differences(existing: EvalManifest, wanted: EvalManifest) -> list[str]:
-    """In the words of --set."""
+    """The differences, under the names that --set uses."""
     names = [d.dataset for d in wanted.datasets]
     lines = _setting_differences(existing, wanted.frames, wanted.rate, wanted.seed, names)
     if existing.store != wanted.store and not lines:
@@ -159,8 +160,8 @@ def _differences(existing: EvalManifest, wanted: EvalManifest) -> list[str]:
 
 
 def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float | None) -> dict[str, dict[str, int]]:
-    """Per dataset: training episodes, those too short for a window or for a whole one, windows, episodes held out
-    and skipped, and those that `StoreConfig.max_train` left out, if it did."""
+    """Per dataset: numbers of training episodes, of those too short for a window or for a whole window, of windows, of
+    episodes held out and skipped, and of those that `StoreConfig.max_train` left out, if any."""
     from data_pipelines.windows.windows import train_windows
 
     summary = {}
@@ -184,7 +185,7 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
     many = []
     for name, facts in summary.items():
         if get_spec(name).val_split:
-            continue  # none of them was taken from what is trained on
+            continue  # these were not taken from training episodes
         held_out = facts["held_out"]
         episodes = held_out + facts["episodes"] + facts.get("left_out", 0)
         if held_out > HELD_OUT * episodes and held_out > round(settings.val_fraction * episodes):
@@ -197,7 +198,7 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
 
 
 def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> None:
-    """Says in how many datasets windows end with padding, and where that is most of them; `file` has the others."""
+    """Prints in how many datasets windows end with padding, and in which most of them do; `file` lists the others."""
     padded = {name: facts for name, facts in summary.items() if facts["padded"]}
     if padded:
         most = sorted(padded, key=lambda name: -padded[name]["padded"] / padded[name]["episodes"])
@@ -209,7 +210,7 @@ def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> No
 
 
 def say_alone(summary: dict[str, dict[str, int]]) -> None:
-    """Names the robots of one training episode: of no other one can a control take their actions."""
+    """Names the robots with a single training episode: a control has no other episode from which to take actions."""
     alone = [
         name
         for name, facts in summary.items()
@@ -223,7 +224,7 @@ def say_alone(summary: dict[str, dict[str, int]]) -> None:
 
 
 def _remark(name: str, facts: dict[str, int], no_evaluation: str) -> None:
-    """Says what of a dataset is not used."""
+    """Says which part of a dataset is not used."""
     remarks = []
     if facts["too_short"]:
         remarks.append(f"{facts['too_short']} of {facts['episodes']} training episodes are too short for any window")

@@ -1,1 +1,1 @@
-"""Trials are run: which are missing, where each runs, and what became of it."""
+"""Runs trials: which are missing, where each runs, and how it ended."""

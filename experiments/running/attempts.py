@@ -1,7 +1,7 @@
 """One attempt at a trial: the files it leaves in the trial's directory, and the state of the trial that follows.
 
-The same wherever the attempt runs. Its process holds the trial's lock, which has a lease
-(`data_pipelines.publishing.output_lock`), for as long as it lives; whoever finds the lock free may try again.
+This is the same wherever the attempt runs. Its process holds the trial's lock, which has a lease
+(`data_pipelines.publishing.output_lock`), for as long as it lives; any process that finds the lock free may try again.
 A trial's directory holds, besides what `experiments.running.run_trial` lists,
 
     trial.lock      while an attempt is alive
@@ -41,12 +41,13 @@ CRASHES = (signal.SIGABRT, signal.SIGBUS, signal.SIGSEGV)
 """Signals by which a process ends when a driver, an accelerator or memory fails."""
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-"""Signals that ask an attempt to stop. It saves and ends with 130 or 143; before it is ready to save, with -n."""
+"""Signals that ask an attempt to stop. It saves and ends with 130 or 143; if it is not yet ready to save, it ends with
+-n."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Where a trial stands: one of the states of `ledger`, with a message when it has no result."""
+    """The state of a trial: one of the states of `ledger`, with a message if it has no result."""
 
     event: str
     message: str = ""
@@ -54,8 +55,8 @@ class State:
 
 @dataclass(frozen=True)
 class AttemptEnd:
-    """How the process of an attempt ended. `code` is as of `subprocess`, negative for a signal; None if nobody
-    saw its end, and then `why` says how that is known."""
+    """How the process of an attempt ended. `code` is as in `subprocess`, negative for a signal; None if its end was not
+    observed, in which case `why` says how it is known to have ended."""
 
     code: int | None
     why: str = ""
@@ -63,8 +64,8 @@ class AttemptEnd:
 
 @contextmanager
 def attempt(directory: Path) -> Iterator[OutputLock]:
-    """The trial's lock, held while the process of an attempt runs. Waits while another process holds it, until a lease
-    of a machine that died would be over. Raises Held if one that lives holds it.
+    """The trial's lock, held while the process of an attempt runs. While another process holds it, waits until the
+    lease of a dead machine would have expired. Raises Held if a living process holds it.
     """
     with lock_output(directory / "trial", wait=EXPIRES + RENEWED_EVERY) as lock:
         who = {"host": socket.gethostname(), "process": os.getpid(), "token": secrets.token_hex(4)}
@@ -73,7 +74,7 @@ def attempt(directory: Path) -> Iterator[OutputLock]:
 
 
 def _engine_job() -> dict[str, str]:
-    """The job of an engine that this process is in, and its node, by the names that the engine's commands take."""
+    """The engine's job that this process is part of, and its node, under the names that the engine's commands take."""
     array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     job = f"{array}_{task}" if array else os.environ.get("SLURM_JOB_ID")
     named = {"job": job, "node": os.environ.get("SLURMD_NODENAME")}
@@ -97,8 +98,8 @@ def is_alive(directory: Path) -> bool:
 
 
 def read_start(directory: Path) -> dict[str, Any] | None:
-    """Host, process, an engine's job and a token of the latest attempt; None before its process is up, or if the
-    file cannot be read now."""
+    """Host, process, engine job and token of the latest attempt; None before its process has started, or if the file
+    cannot be read now."""
     return _read_now(directory / STARTED)
 
 
@@ -122,7 +123,7 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def outcome(directory: Path, ended: AttemptEnd) -> State:
-    """How an attempt that has ended left its trial: LOST too if what it left cannot be read now."""
+    """The state in which an ended attempt left its trial; also LOST if what it left cannot be read now."""
     try:
         if (directory / RESULT).exists():
             return State(FINISHED)
@@ -149,13 +150,13 @@ def outcome(directory: Path, ended: AttemptEnd) -> State:
 
 
 def _signal(code: int) -> int:
-    """The number of the signal that ended a process, said by subprocess (-n) or a shell (128 + n); 0: none."""
+    """The number of the signal that ended a process, as subprocess (-n) or a shell (128 + n) reports it; 0: none."""
     number = -code if code < 0 else code - 128
     return number if number in set(signal.Signals) else 0
 
 
 def read_states(ids: Sequence[str], trials: Path, ledger: Ledger) -> dict[str, State]:
-    """The state of each trial. A result on disk is the truth; the ledger may lag behind it."""
+    """The state of each trial. A result on disk takes precedence; the ledger may lag behind it."""
     recorded = retry_io(ledger.states)
     return {id: retry_io(_state, trials / id, recorded.get(id)) for id in ids}
 

@@ -27,15 +27,15 @@ from hma_jax.runtime.parent import die_with
 _PARENT, _CORES, _ACCELERATOR = "HMA_PARENT_PID", "HMA_CORES", "HMA_ACCELERATOR"
 
 CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
-"""Variables of a slot that the user's environment overrides. Which accelerators a slot has is not among them: they are
-some of those that the user allows."""
+"""Variables of a slot that the user's environment overrides. The accelerators of a slot are not among them: they are
+chosen from those that the user allows."""
 
 LOGGERS = ("hma_jax", "data_pipelines", "experiments")
 """Parents of all loggers of this project."""
 
 
 class NoAccelerator(ConfigError):
-    """JAX does not compute on the accelerators that are here."""
+    """JAX does not use the accelerators of this machine."""
 
 
 def child_environment(compile_cache: Path, slot: Slot = Slot(), accelerator: str = "") -> dict[str, str]:
@@ -57,11 +57,11 @@ def child_environment(compile_cache: Path, slot: Slot = Slot(), accelerator: str
 
 
 def enter_child(parent: int = 0) -> None:
-    """Called first in a child: takes its cores, arranges to die with its `parent` (0: which the environment names) and
-    to end in order when asked to."""
-    open_closed_output()  # a child does not have what its parent opened
-    faulthandler.enable()  # a library that ends the process by a signal is named by what its threads did
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
+    """Called first in a child: limits it to its cores, makes it end with its `parent` (0: the one that the environment
+    names) and end in good order when it is asked to."""
+    open_closed_output()  # a child has no use for what its parent opened
+    faulthandler.enable()  # if a library ends the process by a signal, the threads' stacks show which one
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # also if a background shell job had it ignored
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked
     for number in (signal.SIGUSR1, signal.SIGUSR2):  # Slurm's, for the process above
         signal.signal(number, signal.SIG_IGN)
@@ -77,9 +77,9 @@ def enter_child(parent: int = 0) -> None:
 
 
 def require_accelerator(kind: str | None = None) -> None:
-    """Raises NoAccelerator if JAX computes on the processor though an accelerator of this `kind` is expected, by
-    default of the kind that this process's parent named; none is for "", or with JAX_PLATFORMS=cpu. JAX itself would
-    go on without a word."""
+    """Raises NoAccelerator if JAX computes on the CPU although an accelerator of this `kind` is expected (default: the
+    kind that this process's parent named). None is expected for "", or with JAX_PLATFORMS=cpu. JAX itself would
+    continue silently."""
     kind = os.environ.get(_ACCELERATOR, "") if kind is None else kind
     if not kind or os.environ.get("JAX_PLATFORMS") == "cpu":
         return
@@ -98,9 +98,9 @@ def require_accelerator(kind: str | None = None) -> None:
 
 
 def silence_background() -> None:
-    """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
-    pages of their own, from threads and destructors where nothing can catch it, until the very
-    end. The error message says it once.
+    """Silences background reports for the rest of this process: if a checkpoint turns out damaged, its reader tasks
+    report it at length, from threads and destructors where nothing can catch it, until the very end. The error message
+    says it once.
     """
     sys.unraisablehook = _say_nothing
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
@@ -109,9 +109,9 @@ def silence_background() -> None:
 
 @contextmanager
 def plain_messages() -> Iterator[None]:
-    """What this project logs is a line on standard error, while the block runs, also after a library has called
-    `logging.basicConfig`, which would begin it with a level and a module. That is standard error as it is at the
-    time: a progress bar replaces it, to show lines above itself."""
+    """While the block runs, each log message of this project is a plain line on standard error, even after a library
+    has called `logging.basicConfig`, which would prefix it with a level and a module. The stream is looked up at each
+    message: a progress bar replaces standard error to show lines above itself."""
     handler, loggers = logging.lastResort, [logging.getLogger(name) for name in LOGGERS]
     for logger in loggers:
         logger.addHandler(handler)

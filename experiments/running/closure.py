@@ -1,9 +1,9 @@
 """Which sources a program runs, found by reading imports, and a hash of each that no comment changes.
 
-The closure of a program is what Python imports to run it: its root modules, what they import anywhere, their
-functions included, and what those modules import in turn where they are imported themselves. Only modules of this
-project count; versions of other packages are recorded beside (`machine`). What functions of other modules import is
-not followed: `imported_modules` finds it once it has been imported.
+The closure of a program is what Python imports to run it: its root modules, what these import anywhere, including
+inside functions, and what the imported modules import in turn at import time. Only modules of this project count;
+versions of other packages are recorded separately (`machine`). Imports inside functions of other modules are not
+followed: `imported_modules` finds them once they have happened.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ Closure = Mapping[str, str]
 
 
 def closure_hash(closure: Closure) -> str:
-    """One hash for all of it."""
+    """One hash for the whole closure."""
     return stable_hash(dict(closure))
 
 
 def trace(roots: Iterable[str], root: Path = ROOT) -> dict[str, str]:
     """The closure of the modules `roots`, read from the files under `root` as they are now.
 
-    Raises ValueError for a root that is no module there, SyntaxError for a file that is no Python.
+    Raises ValueError for a root that is not a module there, SyntaxError for a file that is not Python.
     """
     roots = tuple(roots)
     strangers = [name for name in roots if _file(name, root) is None]
@@ -62,7 +62,7 @@ def imported_modules() -> dict[str, str]:
 
 
 def changed(old: Closure, new: Closure) -> list[str]:
-    """Names of the modules in both that differ; those that only one has are not compared."""
+    """Names of the modules in both that differ; modules that only one has are not compared."""
     return [name for name in sorted(old.keys() & new.keys()) if old[name] != new[name]]
 
 
@@ -70,7 +70,7 @@ def changed(old: Closure, new: Closure) -> list[str]:
 
 
 class _Source:
-    """What is known of a file's text."""
+    """What is known about a file's text."""
 
     def __init__(self, text: bytes):
         tree = ast.parse(text)
@@ -83,7 +83,7 @@ _read = lru_cache(maxsize=1024)(_Source)
 
 
 def _file(name: str, root: Path) -> Path | None:
-    """The file of a module of ours; None for one of others, and for what is a name in a module."""
+    """The file of a module of this project; None for other modules, and for a name inside a module."""
     if name.split(".")[0] not in PACKAGES:
         return None
     path = root.joinpath(*name.split("."))
@@ -102,7 +102,8 @@ def _parents(name: str) -> Iterator[str]:
 
 
 def _imports(tree: ast.AST, functions: bool) -> Iterator[str]:
-    """Names that may be modules; with `functions` those that functions import as well. Not those for type checkers."""
+    """Names that may be modules; with `functions`, also those that functions import. Imports for type checkers are left
+    out."""
     for node in _statements(tree):
         match node:
             case ast.Import(names=names):
@@ -121,22 +122,22 @@ def _imports(tree: ast.AST, functions: bool) -> Iterator[str]:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """What a statement holds of further ones; those are not in expressions."""
+    """The statements inside a statement; expressions contain none."""
     for field in ("body", "orelse", "finalbody", "handlers", "cases"):
         inside = getattr(node, field, ())
-        yield from inside if isinstance(inside, list) else ()  # the body of a lambda or of `a if b else c` is none
+        yield from inside if isinstance(inside, list) else ()  # a lambda's body, or that of `a if b else c`, is none
 
 
 def _hash(tree: ast.AST) -> str:
-    """Hash of what a file means: equal for files that differ in comments, docstrings or layout alone, and the same
-    under every version of Python that reads the file to the same syntax tree."""
+    """Hash of what a file means: equal for files that differ only in comments, docstrings or layout, and the same under
+    every version of Python that reads the file to the same syntax tree."""
     pieces: list[str] = []
     _write(tree, pieces)
     return hashlib.sha256("".join(pieces).encode()).hexdigest()[:16]
 
 
 def _write(node: object, pieces: list[str]) -> None:
-    """A syntax tree as text. What is empty is left out: later versions of Python have fields that earlier lack."""
+    """A syntax tree as text. Empty fields are left out: later versions of Python have fields that earlier ones lack."""
     if isinstance(node, ast.AST):
         pieces.append(f"({type(node).__name__}")
         for name in node._fields:
@@ -158,5 +159,6 @@ def _write(node: object, pieces: list[str]) -> None:
 
 
 def _is_text_alone(node: object) -> bool:
-    """A docstring, of a module, class, function or attribute: text that is a statement does nothing."""
+    """Whether a node is a docstring (of a module, class, function or attribute): a string that is a statement does
+    nothing."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)

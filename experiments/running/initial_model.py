@@ -1,4 +1,5 @@
-"""The initial model of a training run that goes on from a trained one: its parameters, and slices for new robots."""
+"""The initial model of a training run that continues from a trained model: its parameters, and slices for new
+robots."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class InitialModel(TypedDict):
-    """The arguments of `train_trial` for a model that begins with trained parameters."""
+    """The arguments of `train_trial` for a model that starts from trained parameters."""
 
     table: EmbodimentTable
     initial: Params

@@ -16,10 +16,11 @@ from hma_jax.config.json import from_dict
 
 
 def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, SharedTraining]:
-    """(the trial, how it is computed, what it shares with others). Fields that came after the job was written take
-    their defaults.
+    """(the trial, how it is computed, what it shares with others). Fields that were added after the job was written
+    take their defaults.
 
-    Earlier versions counted how a trial is computed to the trial itself. Raises ConfigError for what is no job.
+    In earlier versions, how a trial is computed was part of the trial itself. Raises ConfigError for a record that is
+    not a job.
     """
     try:
         trial, former_execution = migrate(record["trial"])
@@ -31,7 +32,7 @@ def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, SharedTrai
 
 
 def trial_in(directory: Path) -> tuple[Trial, Provenance]:
-    """A finished trial and what it depends on, from its job.json. Raises ConfigError where that cannot be read."""
+    """A finished trial and what it depends on, from its job.json. Raises ConfigError if that cannot be read."""
     try:
         job = json.loads((directory / JOB).read_text())
         return read_job(job)[0], inputs_of(job["provenance"])

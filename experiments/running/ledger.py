@@ -1,9 +1,9 @@
 """The ledger: an append-only record of what happened to every trial.
 
 One JSON object per line, on disk before `append` returns. A process killed while it writes
-leaves a torn last line, which the next writer cuts off. There is one writer, the command that
-holds the study's directory (`Workspace.locked`), wherever its trials run: what a trial's process
-has to say stands in the trial's own directory (`attempts`).
+leaves a torn last line, which the next writer cuts off. There is one writer, the command that holds the study's
+directory (`Workspace.locked`), wherever its trials run: a trial's process reports only in the trial's own directory
+(`attempts`).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from hma_jax.runtime.files import naming
 
 RUNNING, FINISHED, DIVERGED, FAILED = "running", "finished", "diverged", "failed"
 LOST, PREEMPTED = "lost", "preempted"
-"""Ended without a result, through no fault of its own: its process is gone (killed, out of memory, a machine
-that died), or it was asked to stop and has saved. Both go on from the last checkpoint."""
+"""Ended without a result, through no fault of its own: its process is gone (killed, out of memory, a machine that
+died), or it was asked to stop and has saved. Both continue from the last checkpoint."""
 
 REFUSED = "refused"
-"""Its sources are not those that the sweep was started with: it did not run, and may the next time."""
+"""Its sources are not those that the sweep was started with: it did not run, but may run the next time."""
 
 MISSING = "missing"
 """The state of a trial without a line: it has not run."""
@@ -62,7 +62,7 @@ class Ledger:
     def states(self) -> dict[str, dict[str, Any]]:
         """The last record of each trial, by id; its `event` is a state.
 
-        Whether one that is RUNNING still runs, the ledger cannot know: see `attempts.read_states`.
+        The ledger cannot know whether a RUNNING trial still runs: see `attempts.read_states`.
         """
         last = {record["trial"]: dict(record) for record in self.records()}
         for record in last.values():
@@ -85,7 +85,7 @@ class Ledger:
 
 
 def name_within(root: Path, message: str) -> str:
-    """`message` with the files under `root` named as seen from there: ledgers and pages are read on other machines."""
+    """`message` with the files under `root` named relative to it: ledgers and pages are read on other machines."""
     for place in (root.resolve(), root):
         if place != Path("."):
             message = re.sub(rf"(?<![\w./-]){re.escape(str(place))}/", "", message)

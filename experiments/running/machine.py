@@ -1,4 +1,4 @@
-"""Where a result was made: commit, versions, processor, devices. For records, never for ids."""
+"""Where a result was made: commit, versions, CPU, devices. For records, never for ids."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ def describe_machine(devices: Sequence[Any] = ()) -> dict[str, Any]:
 
 @cache
 def git_commit() -> str:
-    """The commit of the sources, marked when the work tree differs from it; '' outside git. As it was when a process
-    first asked: what it runs was loaded then."""
+    """The commit of the sources, marked if the work tree differs from it; '' outside git. The value is from the
+    process's first call, since its code was loaded then."""
     return commit_of(Path(__file__).resolve())
 
 
 def commit_of(file: Path) -> str:
-    """The commit of the repository that `file` is part of, marked when its work tree differs; '' for a file of none."""
+    """The commit of the repository that `file` is part of, marked if its work tree differs; '' if it is part of
+    none."""
 
     def git(*arguments: str) -> str:
         done = subprocess.run(
@@ -46,7 +47,7 @@ def commit_of(file: Path) -> str:
         return done.stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", file.name)  # an installed file may lie within a repository of others
+        git("ls-files", "--error-unmatch", file.name)  # an installed file may lie inside some other repository
         changed = git("status", "--porcelain", "--untracked-files=no")
         return git("rev-parse", "--short=12", "HEAD") + (" + uncommitted changes" if changed else "")
     except (OSError, subprocess.SubprocessError):

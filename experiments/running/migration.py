@@ -1,4 +1,4 @@
-"""Migration of configurations that earlier versions wrote to today's fields."""
+"""Migrates configurations that earlier versions wrote to today's fields."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXECUTION = {
     "attention": ("attention", {"by_frame": "auto", "whole": "plain"}),
     "accumulate": ("accumulate", {}),
 }
-"""Former fields of the model or its training that are fields of the execution today: the field, and today's names of
+"""Former fields of the model or its training that are fields of the execution today: the field, and today's names for
 its former values."""
 
 DECODING = ("unmask_steps", "sampler")
@@ -22,8 +22,8 @@ DECODING = ("unmask_steps", "sampler")
 def migrate(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """(a trial's or study's fields under today's names, the fields of its execution that were among them).
 
-    Fields that came later are left to their defaults. Raises KeyError or TypeError for what is neither a trial nor a
-    study.
+    Fields that were added later keep their defaults. Raises KeyError or TypeError for anything that is neither a trial
+    nor a study.
     """
     today = {**config, **{name: {**config[name]} for name in ("model", "train", "eval")}}
     former = {key: today[name].pop(key) for name, keys in FORMER_FIELDS.items() for key in keys if key in today[name]}

@@ -1,11 +1,11 @@
-"""What a trial's numbers depend on besides its configuration, and what is recorded of how they were made.
+"""What a trial's numbers depend on besides its configuration, and what is recorded about how they were made.
 
 A trial is named by its configuration and its `Provenance`: inputs by their content, and one number that is raised
 when a change to the code alters results. Nothing else is part of the name, neither the bytes of a source file nor a
-machine, so that a trial is the same trial wherever it ran. What it ran with is recorded beside its numbers, in the
-trial's provenance.json, at every start of its process. The command that starts trials gives each the hashes of
-the sources that it found; a trial whose own differ refuses to run, so that no change of the code in the middle of a
-sweep goes unnoticed.
+machine, so that a trial is the same trial wherever it ran. The sources, versions and machine that it ran with are
+recorded beside its numbers, in the trial's provenance.json, at every start of its process. The command that starts
+trials gives each one the hashes of the sources that it found; a trial that finds other sources refuses to run, so that
+no change of the code in the middle of a sweep goes unnoticed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ROOTS = tuple(f"experiments.running.{name}" for name in ("trial_main", "run_tria
 
 @dataclass(frozen=True)
 class Provenance:
-    """The identity of each input, by its content; a trial with another one is another trial."""
+    """The identity of each input, by its content; with a different input a trial is a different trial."""
 
     store: str  # of the token store
     manifest: str  # of the frozen evaluation windows
@@ -47,7 +47,7 @@ class CodeChanged(ConfigError):
 
 @dataclass(frozen=True)
 class Start:
-    """What a process of the trial ran with. A start that is like the one before is not recorded again."""
+    """What a process of the trial ran with. A start that is equal to the one before is not recorded again."""
 
     code: str  # hash of its closure
     machine: dict[str, Any]  # commit, versions, processor (`machine`)
@@ -59,21 +59,21 @@ class TrialRecord:
 
     inputs: Provenance
     closures: dict[str, dict[str, str]] = field(default_factory=dict)  # {hash: {module: hash}}, of every start
-    besides: dict[str, str] = field(default_factory=dict)  # modules imported later on, that are in no closure
+    besides: dict[str, str] = field(default_factory=dict)  # modules that were imported later and are in no closure
     starts: tuple[Start, ...] = ()
 
     @property
     def code(self) -> str:
-        """The closure of the process that finished it."""
+        """The closure of the process that finished the trial."""
         return self.starts[-1].code if self.starts else ""
 
     def sources(self) -> dict[str, dict[str, str]]:
-        """Every module that it ran, for the hash of each closure."""
+        """Every module that the trial ran, for the hash of each closure."""
         return {code: closure | self.besides for code, closure in self.closures.items()}
 
 
 def trial_closure() -> dict[str, str]:
-    """The sources that a trial started now would run. Raises CodeChanged while they cannot be read."""
+    """The sources that a trial started now would run. Raises CodeChanged if they cannot be read at the moment."""
     try:
         return trace(ROOTS)
     except (OSError, SyntaxError, ValueError) as error:  # in the middle of a `git pull`, say
@@ -81,10 +81,11 @@ def trial_closure() -> dict[str, str]:
 
 
 def load_sources(given: Closure | None) -> dict[str, str]:
-    """Imports all that a trial runs, and returns the closure that was imported. To be called before any work.
+    """Imports everything that a trial runs, and returns the closure that was imported. To be called before any work.
 
-    Raises CodeChanged if it is not the one that was `given` by the runner (None: it was started by hand), or if
-    files changed meanwhile. From then on nothing but what the trial's record names as `besides` is read from disk.
+    Raises CodeChanged if it is not the one `given` by the runner (None: the trial was started by hand), or if files
+    changed meanwhile. From then on, the only sources read from disk are those that the trial's record lists as
+    `besides`.
     """
     closure = trial_closure()
     _require_same(closure if given is None else given, closure)
@@ -105,7 +106,8 @@ def _require_same(given: Closure, found: Closure) -> None:
 
 
 def record_start(directory: Path, inputs: Provenance, closure: Closure) -> None:
-    """Notes in a trial's directory with what it starts, or goes on. Raises ConfigError for a damaged record there."""
+    """Records in a trial's directory with what it starts or continues. Raises ConfigError for a damaged record
+    there."""
     known = read_record(directory) or TrialRecord(inputs)
     start = Start(closure_hash(closure), describe_machine())
     starts = known.starts if known.starts[-1:] == (start,) else (*known.starts, start)
@@ -113,7 +115,7 @@ def record_start(directory: Path, inputs: Provenance, closure: Closure) -> None:
 
 
 def record_end(directory: Path) -> None:
-    """Notes what the process has imported besides, on branches that few trials take."""
+    """Records what else the process has imported, on branches that few trials take."""
     known = read_record(directory)
     if known is not None:
         own = known.closures[known.code]
@@ -122,7 +124,8 @@ def record_end(directory: Path) -> None:
 
 
 def record_origin(directory: Path, source: Path) -> None:
-    """Notes that a trial goes on from what the trial in `source` computed: with its sources, on its machines."""
+    """Records that a trial continues from what the trial in `source` computed, with that trial's sources and
+    machines."""
     before, known = read_record(source), read_record(directory)
     if before is not None and known is not None:
         starts = tuple(start for start in before.starts if start not in known.starts) + known.starts
@@ -131,7 +134,7 @@ def record_origin(directory: Path, source: Path) -> None:
 
 
 def read_record(directory: Path) -> TrialRecord | None:
-    """None where there is none. Raises ConfigError for one that cannot be read."""
+    """The record in `directory`; None if there is none. Raises ConfigError for one that cannot be read."""
     path = directory / FILE
     try:
         return from_dict(TrialRecord, json.loads(path.read_text()))
@@ -142,7 +145,7 @@ def read_record(directory: Path) -> TrialRecord | None:
 
 
 def inputs_of(values: Mapping[str, Any]) -> Provenance:
-    """As it is written today or was by earlier versions, which had a hash of all sources in it."""
+    """The inputs as written today, or by earlier versions, which included a hash of all sources."""
     if "code" in values:
         values = {name: value for name, value in values.items() if name != "code"} | {"results": 0}
     return from_dict(Provenance, dict(values))

@@ -1,7 +1,7 @@
 """The sealed result of a trial: it holds hashes of the files it was computed from, and of itself.
 
-A finished trial can so be copied between machines, and files that were truncated or edited are detected. It does not
-protect from deliberate forgery, which would compute the hashes again.
+So a finished trial can be copied between machines, and truncated or edited files are detected. This does not protect
+against deliberate forgery, which could recompute the hashes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from hma_jax.runtime.files import write_file
 SAMPLES = "samples.npz"
 
 SEALED = (WINDOWS, SAMPLES, f"{RUN}/metrics.jsonl", provenance.FILE)
-"""Files beside a result that it vouches for, where they are. Checkpoints are not among them: no number is read from
-them again, and a copy may leave them out."""
+"""Files beside a result that it vouches for, if they exist. Checkpoints are not among them: no number is read from them
+again, and a copy may leave them out."""
 
 SPARED = (SAMPLES,)
 """Files among `SEALED` that no number depends on and that are most of a trial's bytes: a copy may leave them out."""
@@ -36,7 +36,7 @@ def write_result(directory: Path, result: dict[str, Any]) -> None:
 
 
 def read_result(directory: Path) -> dict[str, Any]:
-    """Raises ConfigError unless result.json and the files it was computed with are as they were written."""
+    """Raises ConfigError unless result.json and the files that it was computed from are as they were written."""
     try:
         values = json.loads((directory / RESULT).read_text())
         stated = values.pop("hash")

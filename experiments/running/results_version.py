@@ -5,9 +5,9 @@ CHANGES = {
     2: "action-nats, retrieval of the true actions and, on the suite, counterfactual PSNR are measured",
 }
 """What each number changed. Add one when a change to the code alters the numbers of a trial whose configuration and
-inputs stay as they are: finished trials of the number before are then other trials, which nobody mistakes for these.
-Not for what changes tokenizers, tokens or windows: these are named by their content. A change that alters nothing
-beyond rounding leaves the number; the sources that each trial ran are recorded beside it (`provenance`)."""
+inputs stay as they are: finished trials of the previous number are then different trials, and cannot be mistaken for
+new ones. Changes to tokenizers, tokens or windows need none: these are named by their content. A change that alters
+nothing beyond rounding keeps the number; the sources that each trial ran are recorded beside it (`provenance`)."""
 
 RESULTS_VERSION = max(CHANGES)
 
@@ -41,5 +41,5 @@ OF_SOME = {
     "the average of a robot's weights goes on in steps without it": {"train.ema_decay": lambda decay: decay > 0},
     "the average soon forgets the initial weights": {"train.ema_decay": lambda decay: decay > 0},
 }
-"""Changes that alter the numbers of a few trials only: those whose fields have such values, or values that such a
-function is true of. They are part of the names of these trials, and all others stay finished."""
+"""Changes that alter the numbers of only a few trials: those whose fields have these values, or values for which the
+function is true. They are part of the names of these trials, and all others stay finished."""

@@ -13,11 +13,11 @@ UNSET = arg(help_behavior_hint="")
 """For an option whose text says what happens without it."""
 
 CHECKPOINTS = 5
-"""Saved per training run, evenly spread, besides those by time: what an interrupted trial resumes from. A run of fewer
-steps is saved at its end alone, as saving would take longer than its steps."""
+"""Number of checkpoints per training run, evenly spread, in addition to those by time; an interrupted trial resumes
+from them. A run of fewer steps is saved only at its end, since saving would take longer than its steps."""
 
 VALIDATIONS = 20
-"""Per training run that is validated while it trains, unless told otherwise."""
+"""Number of validations per training run, for runs that are validated while they train, unless set otherwise."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RunOptions:
     keep_checkpoints: Annotated[int, arg(name="keep-checkpoints", metavar="N")] = 2
     """Number of newest checkpoints that are kept."""
     keep_every: Annotated[int, arg(name="keep-every", metavar="STEPS")] = 0
-    """Also save and keep the checkpoints of every so many steps; 0: none.
+    """Also save and keep a checkpoint each time this many steps have passed; 0: none.
     With schedule wsd the last one before the decay is kept anyway."""
     skip_damaged: Annotated[FlagCreatePairsOff[bool], arg(name="skip-damaged"), UNSET] = False
     """Continue from the newest undamaged checkpoint.
@@ -45,11 +45,11 @@ class RunOptions:
     """Steps between evaluations of the loss on held-out windows; 0: none.
     They are written to RUN/validation.jsonl."""
     trace: Annotated[int | None, arg(metavar="STEPS"), UNSET] = None
-    """Record a profile of so many steps with JAX's profiler, after the first ten, in
-    RUN/profile (docs/performance.md)."""
+    """Record a profile of this many steps with JAX's profiler, after the first ten, in RUN/profile
+    (docs/performance.md)."""
 
     def check(self) -> None:
-        """Raises ConfigError, in the words of the command line."""
+        """Raises ConfigError for invalid values, naming the options of the command line."""
         hint = "; 0 saves at the end and when interrupted"
         for name, more in (
             ("checkpoint_every", hint),

@@ -46,7 +46,7 @@ Progress = Callable[[str, int, int], None]
 """Called as progress(phase, done, total)."""
 
 LAST = 0.1
-"""The part of a run's steps over which its training loss is averaged."""
+"""The last part of a run's steps, over which its training loss is averaged."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class PreparedData:
     store: TokenStore
     tokenizer: Tokenizer
     manifest: EvalManifest
-    counterfactual: CounterfactualFrames | None = None  # of robots that are simulated
+    counterfactual: CounterfactualFrames | None = None  # for robots that are simulated
 
 
 def open_prepared_data(workspace: Workspace) -> PreparedData:
@@ -88,7 +88,7 @@ def train_trial(
     initial: Params | None = None,
     origin: dict[str, Any] | None = None,
 ) -> FitResult:
-    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
+    """Trains, or continues training, in `run_dir`. Raises what `hma_jax.training.train.train_model` raises.
 
     A model with trained parameters has its own `table` (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.
@@ -106,7 +106,7 @@ def train_trial(
     lost = {"lost": {name: store.manifest(name).skipped_count for name in trial.datasets}}  # damaged episodes, left out
 
     def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
-        before = {"order": 1} | provenance["loader"]  # of versions that did not say in which order they drew
+        before = {"order": 1} | provenance["loader"]  # records of versions that did not say their order of draws
         return lost | provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
 
     def report(step: int, steps: int, values: dict[str, float]) -> None:
@@ -157,8 +157,8 @@ def train_trial(
 def validation_batches(
     trial: Trial, prepared: PreparedData, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
 ) -> Iterator[dict[str, Any]]:
-    """Some frozen windows of each evaluated dataset, of as many episodes as can be: one batch as large as in training,
-    this process's rows."""
+    """Some frozen windows of each evaluated dataset, from as many episodes as possible: one batch as large as in
+    training, of which this process gets its rows."""
     from data_pipelines.windows.evalset import eval_batches
     from hma_jax.runtime.rows import own_rows
     from hma_jax.training.step import TRAINING_ARRAYS
@@ -185,10 +185,11 @@ def evaluate_on(
     progress: Progress = lambda *_: None,
     parts: Parts | None = None,
 ) -> Evaluation:
-    """The protocol over the frozen windows of `names`, or over the `first` ones of each; `parts` are done already.
+    """Runs the protocol over the frozen windows of `names`, or over the `first` ones of each; `parts` hold what is done
+    already.
 
-    Counterfactual PSNR needs simulated frames for this very prompt, and generated ones. What was trained for actions
-    alone is shown none of other episodes.
+    Counterfactual PSNR needs simulated frames for exactly this prompt, and generated frames. Models that were trained
+    only to predict actions are not shown actions of other episodes.
     """
     from data_pipelines.windows.evalset import eval_batches
     from hma_jax.evaluation.evaluate import evaluate
@@ -271,14 +272,14 @@ def run_trial(
     weights, loss = trained.state.weights, last_loss(trained.losses)
     seconds = {"train_seconds": trained.seconds, "compile_seconds": trained.compile_seconds}
     layout = jax.tree.map(lambda x: x.sharding, weights)
-    del trained, beginning  # moments and initial parameters would lie on the devices beside what evaluation computes
+    del trained, beginning  # moments and initial parameters would take device memory during evaluation
 
     subject = (trial.model, table, prepared, trial.eval, trial.train.masking.setting)
     parts = Parts(directory / EVALUATING, lambda: _evaluated(trial, prepared, directory, execution))
     evaluation = evaluate_on(trial.evaluated, weights, *subject, execution=execution, progress=progress, parts=parts)
     del weights
     untrained = None
-    if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
+    if trial.measure_untrained:  # a few windows are enough: it has learnt nothing
         fresh = declared.init(trial.train.seed, layout)
         untrained = evaluate_on(
             trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
@@ -309,7 +310,7 @@ def run_trial(
 
 
 def _evaluated(trial: Trial, prepared: PreparedData, directory: Path, execution: ExecutionConfig) -> list[Any]:
-    """On what the numbers of a trial's evaluation depend: sources, settings, windows and weights."""
+    """What the numbers of a trial's evaluation depend on: sources, settings, windows and weights."""
     from hma_jax.training.hashes import read_list
 
     record, weights = read_record(directory), read_list(directory / RUN / CHECKPOINTS / str(trial.train.steps))

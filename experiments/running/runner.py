@@ -1,9 +1,9 @@
 """Runs the trials that are missing, by a launcher, and recovers from failures.
 
-A trial that crashes is recorded with its message and the others go on. One whose process is lost or asked to stop
-is tried again and goes on from its checkpoint, for as long as its attempts get further (`attempts.reached`). A place
-where one trial after another is lost before its first step gets no more of them. The runner itself may be interrupted
-or killed at any point: the next run goes on with what is there, and waits for trials that still run on other machines.
+A trial that crashes is recorded with its message and the others go on. A trial whose process is lost or asked to stop
+is tried again from its checkpoint, for as long as its attempts get further (`attempts.reached`). A place where one
+trial after another is lost before its first step gets no more trials. The runner itself may be interrupted or killed at
+any point: the next run continues with what is there, and waits for trials that still run on other machines.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from hma_jax.runtime.files import IO_ERRNOS, write_file
 from hma_jax.runtime.locks import EXPIRES, RENEWED_EVERY
 
 TRIES = 3
-"""How many attempts in a row at a trial, in one command, may be lost or stopped without getting further: it may run
+"""How many attempts at a trial, in a row and in one command, may be lost or stopped without getting further: it may run
 out of memory each time, or need more time than its jobs have."""
 
 BAD_PLACE = 3
-"""So many trials in a row lost before their first step are the fault of the place where they ran."""
+"""If this many trials in a row are lost before their first step, the place where they ran is to blame."""
 
 STALL_SECONDS = 1800.0
 """Seconds without progress after which a running trial is said to stall."""
@@ -66,7 +66,7 @@ class Job:
     id: str
     title: str
     record: Mapping[str, Any]
-    after: frozenset[str] = frozenset()  # ids of trials that have to end first, of those that run at all
+    after: frozenset[str] = frozenset()  # ids of trials that have to end first, if they run at all
 
 
 class Monitor:
@@ -90,12 +90,12 @@ def run_missing(
     retry_failed: bool = False,
     monitor: Monitor | None = None,
 ) -> dict[str, State]:
-    """Brings every job to an end and returns their states.
+    """Runs every job to its end and returns their states.
 
     Trials of earlier runs that diverged are left alone: they would diverge again. So are failed ones unless
-    `retry_failed`; they then go on from their checkpoints. On KeyboardInterrupt the running trials save their state
+    `retry_failed`; they then continue from their checkpoints. On KeyboardInterrupt the running trials save their state
     before it is raised again. One runner at a time (`Workspace.locked`): raises ConfigError, and leaves the trials
-    alone, when `lost` says that another one has taken over.
+    alone, if `lost` says that another one has taken over.
     """
     run = _Run(trials, ledger, launcher, monitor or Monitor(), lost)
     before = read_states([job.id for job in jobs], trials, ledger)
@@ -119,7 +119,7 @@ class _Attempt:
     directory: Path
     handle: Any
     launched: float
-    reached: int  # of the trial, when this attempt began
+    reached: int  # how far the trial was when this attempt began
     began: float  # when its process was first seen; before that, when it was launched
     moved: float  # when it last made progress
     start: dict[str, Any] | None = None
@@ -127,8 +127,8 @@ class _Attempt:
 
 
 class _Run:
-    """`waiting` jobs with the state that each is in, those that are `running`, and those of earlier runners that
-    still run `elsewhere`."""
+    """`waiting` jobs with their states, jobs that are `running`, and those of earlier runners that still run
+    `elsewhere`."""
 
     def __init__(self, trials: Path, ledger: Ledger, launcher: Launcher, monitor: Monitor, lost: Callable[[], bool]):
         self.trials, self.ledger, self.launcher, self.monitor, self.lost = trials, ledger, launcher, monitor, lost
@@ -162,7 +162,7 @@ class _Run:
             )
 
     def stop(self) -> None:
-        """Trials that still run save their state; how each ended is recorded."""
+        """Lets trials that still run save their state, and records how each ended."""
         attempts, self.running = self.running, []
         if attempts:
             for attempt, ended in zip(attempts, self.launcher.stop([a.handle for a in attempts]), strict=True):
@@ -211,7 +211,7 @@ class _Run:
         return directory
 
     def _poll(self, attempt: _Attempt) -> None:
-        ended = self.launcher.ended(attempt.handle)  # first: what is read below was written before
+        ended = self.launcher.ended(attempt.handle)  # read first: what is read below was written earlier
         self._note_start(attempt)
         if ended is not None:
             self.running.remove(attempt)
@@ -222,13 +222,13 @@ class _Run:
                 why = f"stopped {TRIES} times in a row before it got further; its attempts need more time"
                 state = State(PREEMPTED, ": ".join(filter(None, (why, state.message))))
             self._end(attempt, state, again)
-            if state.event == REFUSED:  # as every other one would be
+            if state.event == REFUSED:  # as every other trial would be
                 self.waiting.clear()
             return
         if self._note_progress(attempt):
             self.monitor.progressed(attempt.job, **attempt.shown)
         elif attempt.start and time.monotonic() - attempt.moved > STALL_SECONDS:
-            attempt.moved = math.inf  # it is said once
+            attempt.moved = math.inf  # reported once
             where = f"process {attempt.start['process']} on {attempt.start['host']}"
             log.warning(
                 "%s makes no progress since %.0f minutes; if it hangs (%s), kill its %s, and it continues from its "
@@ -248,7 +248,7 @@ class _Run:
         if start and start != attempt.start:
             if attempt.start:
                 self._count(attempt)
-                if self.fruitless[attempt.job.id] >= TRIES:  # the engine would go on for ever
+                if self.fruitless[attempt.job.id] >= TRIES:  # the engine would repeat it forever
                     self.launcher.ask_to_stop([attempt.handle])
             attempt.start, attempt.began = start, time.monotonic()
             attempt.moved = attempt.began
@@ -263,7 +263,7 @@ class _Run:
         self.monitor.ended(attempt.job, state, seconds, again)
 
     def _count(self, attempt: _Attempt) -> None:
-        """What an attempt that is over has achieved decides whether it counts."""
+        """Counts an attempt that has ended, depending on what it achieved."""
         before, attempt.reached = attempt.reached, retry_io(reached, attempt.directory)
         self.fruitless[attempt.job.id] = 0 if attempt.reached > before else self.fruitless[attempt.job.id] + 1
 
@@ -277,7 +277,7 @@ class _Run:
             return False
         if self._is_held(job):  # by an earlier runner's attempt, or until the lease of a dead machine is over
             self.elsewhere.append(job)
-        else:  # one that got no further goes last: others may meanwhile show that the place is to blame
+        else:  # a trial that got no further goes last: others may meanwhile show that the place is to blame
             self.waiting.insert(len(self.waiting) if self.fruitless[job.id] else 0, (job, state.event))
         return True
 
@@ -305,14 +305,15 @@ class _Run:
                 )  # fmt: skip
 
     def _others_run(self, attempt: _Attempt) -> bool:
-        """Whether a trial that began before this attempt still runs, in a place where none is lost. Otherwise what all
-        places share may be to blame, such as a disk or how JAX is installed."""
+        """Whether a trial that began before this attempt still runs, in a place where none was lost. If not, something
+        that all places share may be to blame, such as a disk or the installation of JAX."""
         older = (other for other in self.running if other.began <= attempt.began)
         places = {self.launcher.place(other.handle, other.start) for other in older}
         return bool(places - {None} - self.lost_at.keys())
 
     def _poll_elsewhere(self) -> None:
-        """What an earlier runner started and left: once its lock is free, it has ended or is ours to try."""
+        """Checks trials that an earlier runner started and left: once its lock is free, a trial has ended or may be
+        tried by this runner."""
         if time.monotonic() - self.polled < POLL_SECONDS:
             return
         self.polled = time.monotonic()

@@ -1,4 +1,4 @@
-"""A shared disk that does not answer for a while, as when its server starts anew."""
+"""A shared disk that does not answer for a while, for instance while its server restarts."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ log = logging.getLogger(__name__)
 
 
 def retry_io(act: Callable[..., T], *arguments: object) -> T:
-    """What `act` returns, which may be done twice. Raises OSError: that of a disk that fails, such as ESTALE, after the
-    last try only."""
+    """What `act` returns; it may be called more than once. Raises OSError; the errors of a failing disk, such as
+    ESTALE, only after the last try."""
     for wait in WAITS:
         try:
             return act(*arguments)

@@ -1,8 +1,8 @@
 """Trials that share the beginning of their training: one constant phase of the learning rate, and a decay branch for
 every number of steps (warmup-stable-decay).
 
-Trials that differ in their evaluation alone share all of it. Sharing changes no result: a trial that goes on from
-another one's checkpoint ends with the same bytes as one that was trained alone (`hma_jax.training.branch`). Where the
+Trials that differ only in their evaluation share all of it. Sharing changes no result: a trial that continues from
+another one's checkpoint ends with the same bytes as one that was trained alone (`hma_jax.training.branch`). If the
 others' checkpoints are missing, a trial is trained from its first step.
 """
 
@@ -24,8 +24,8 @@ from hma_jax.config.json import stable_hash
 class SharedTraining:
     """The steps of training that a trial shares with others."""
 
-    before: tuple[tuple[str, int], ...] = ()  # (id, last common step) of those with fewer steps: it waits for them
-    keep: tuple[int, ...] = ()  # steps after which its checkpoint stays, for those with more
+    before: tuple[tuple[str, int], ...] = ()  # (id, last common step) of trials with fewer steps: it waits for them
+    keep: tuple[int, ...] = ()  # steps whose checkpoints are kept, for trials with more
 
 
 def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) -> dict[str, SharedTraining]:
@@ -50,19 +50,19 @@ def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) ->
 
 
 def common_steps(optimizer: OptimizerConfig, fewer: int, more: int) -> int:
-    """Up to which step two runs are the same; 0: they differ from the beginning."""
+    """The step up to which two runs are the same; 0: they differ from the beginning."""
     from hma_jax.training.optimizer import steps_in_common
 
-    if fewer == more:  # the trials are judged otherwise, or on others
+    if fewer == more:  # the trials are judged in another way, or on other datasets
         return fewer
     return int(min(steps_in_common(optimizer, fewer, more), fewer, more))
 
 
 def begin_shared(directory: Path, before: Iterable[tuple[str, int]]) -> tuple[str, int] | None:
-    """Starts the trial in `directory` from the latest checkpoint that it shares with those `before` it.
+    """Starts the trial in `directory` from the latest checkpoint that it shares with the trials `before` it.
 
-    Its record then has the sources and machines of both. Returns whose it was and its step; None if it begins by
-    itself, or has begun.
+    Its record then has the sources and machines of both. Returns whose checkpoint it was and its step; None if the
+    trial starts on its own, or has begun already.
     """
     from hma_jax.training.branch import begin_from, has_checkpoint
 
@@ -75,7 +75,7 @@ def begin_shared(directory: Path, before: Iterable[tuple[str, int]]) -> tuple[st
 
 
 def latest_common(trials: Path, before: Iterable[tuple[str, int]]) -> tuple[str, int]:
-    """Which of those `before` a trial has the latest checkpoint in common with it, and its step; 0 where none has
+    """Which of the trials `before` it has the latest checkpoint in common with a trial, and its step; 0 if none has
     any."""
     from hma_jax.training.branch import last_step
 

@@ -1,8 +1,8 @@
 """This machine cut into slots, one for each trial that runs at a time: its cores and its accelerators.
 
-Accelerators are found without JAX, which would take them for the process that asks. A slot owns its
-accelerators; where there are more slots than GPUs, several share one, each with its part of the memory. TPU chips
-belong to one process each.
+Accelerators are found without JAX, which would reserve them for the calling process. A slot owns its accelerators; if
+there are more slots than GPUs, several share one, each with its part of the memory. TPU chips belong to one process
+each.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MEMORY = 0.9
 """Share of a GPU's memory for all trials on it; the rest is for the driver and libraries."""
 
 CHIP_BOUNDS = {1: "1,1,1", 2: "1,2,1", 4: "2,2,1", 8: "2,4,1"}
-"""Layout of so many TPU chips of one host, in libtpu's notation."""
+"""Layout of this many TPU chips on one host, in libtpu's notation."""
 
 
 GOOGLE, TPU_DEVICES = "0x1ae0", ("0x0027", "0x0056", "0x005e", "0x0062", "0x0063", "0x006f", "0x0076")
@@ -45,7 +45,7 @@ class Slot:
 
     cores: tuple[int, ...] = ()  # (): all
     accelerators: Accelerators | None = None
-    sharers: int = 1  # slots on the same accelerators, this one too
+    sharers: int = 1  # number of slots on the same accelerators, including this one
 
     def environment(self) -> dict[str, str]:
         """Environment variables that limit a child to its accelerators."""
@@ -65,8 +65,8 @@ class Slot:
 
 
 def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerators | None:
-    """GPUs or TPU chips that `environment` lets this process use: those that it names, or else all that are here and
-    that JAX is installed for. None without any, or if JAX_PLATFORMS excludes them."""
+    """GPUs or TPU chips that `environment` lets this process use: those that it names, or else all that exist here and
+    that JAX is installed for. None if there are none, or if JAX_PLATFORMS excludes them."""
     platforms = environment.get("JAX_PLATFORMS", "")
     if platforms and not set(platforms.split(",")) & {"cuda", "gpu", "tpu"}:
         return None
@@ -79,15 +79,16 @@ def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerato
 
 
 def _jax_uses(kind: str) -> bool:
-    """Whether JAX has what it needs for them: without it, it computes on the processor, whatever is here."""
+    """Whether the plugin that JAX needs for them is installed: without it, JAX computes on the CPU, whatever hardware
+    is here."""
     if kind == "tpu":
         return find_spec("libtpu") is not None or "TPU_LIBRARY_PATH" in os.environ
     return any("cuda" in plugin.value for plugin in entry_points(group="jax_plugins"))
 
 
 def _named(visible: str) -> tuple[str, ...]:
-    """The names in a list as CUDA reads it: the first that is no device ends it, such as -1, or NoDevFiles, which Slurm
-    sets for a job without any."""
+    """The names in a list as CUDA reads it: the first one that is not a device ends the list, such as -1, or
+    NoDevFiles, which Slurm sets for a job without devices."""
     names = (name.strip() for name in visible.split(",") if name.strip())
     return tuple(takewhile(lambda name: name != "NoDevFiles" and not name.startswith("-"), names))
 
@@ -99,8 +100,8 @@ def _gpus(devices: Path = Path("/dev")) -> tuple[str, ...]:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
         return tuple(done.stdout.split())
     except (OSError, subprocess.SubprocessError):
-        # A container may have the devices alone, and numbers them anew. Or the driver is out of order, as after an
-        # update without a reboot: trials are then to say that JAX does not find what is there.
+        # A container may have only the devices, numbered anew. Or the driver does not work, for instance after an
+        # update without a reboot: then trials should report that JAX does not find the devices.
         found = [device for device in devices.glob("nvidia*") if device.name.removeprefix("nvidia").isdigit()]
         return tuple(map(str, range(len(found))))
 
@@ -125,10 +126,10 @@ def core_place(core: int, cores: Path = Path("/sys/devices/system/cpu")) -> tupl
 
 
 def cut(slots: int, accelerators: Accelerators | None, cores: Sequence[int]) -> list[Slot]:
-    """The machine in so many `slots`. Raises ConfigError where it cannot be cut that way.
+    """The machine cut into `slots`. Raises ConfigError if it cannot be cut that way.
 
-    Neighbours, accelerators and `cores` alike, stay together, since they are the best connected; accelerators that do
-    not divide stay idle.
+    Neighbouring accelerators, and neighbouring `cores`, stay together, since they are best connected; accelerators that
+    do not divide evenly stay idle.
     """
     ends = [i * len(cores) // slots for i in range(slots + 1)]
     shares = [

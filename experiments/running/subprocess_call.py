@@ -1,4 +1,4 @@
-"""A call in a process of its own: what that process took, memory and accelerators, is free when the call returns."""
+"""A call in a process of its own: the memory and accelerators that the process took are free when the call returns."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ T = TypeVar("T")
 
 
 def call_in_subprocess(what: str, function: Callable[..., T], *arguments: Any) -> T:
-    """What function(*arguments) returns or raises in a new process, which has ended when this returns.
+    """Returns or raises what function(*arguments) returns or raises in a new process, which has ended by then.
 
-    All are pickled. Ctrl-C and SIGTERM are passed on, and what the function makes of them is raised here. Raises
-    ChildProcessError if the process ends without an answer; `what` it was for ("prepares the data") is in the message.
+    Everything is pickled. Ctrl-C and SIGTERM are passed on, and what the function raises for them is raised here.
+    Raises ChildProcessError if the process ends without an answer; `what` it was for ("prepares the data") is in the
+    message.
     """
     context = multiprocessing.get_context("spawn")  # a fork would have what JAX's threads hold
     receiver, sender = context.Pipe(duplex=False)
@@ -50,8 +51,8 @@ def call_in_subprocess(what: str, function: Callable[..., T], *arguments: Any) -
 
 
 def _start(process: SpawnProcess) -> None:
-    """Starts it with SIGINT blocked: until the process has a session of its own, a terminal sends Ctrl-C to it too, and
-    with the one that is passed on it would get two."""
+    """Starts the process with SIGINT blocked: until it has a session of its own, a terminal sends Ctrl-C to it too, and
+    together with the one that is passed on it would get two."""
     resource_tracker.ensure_running()  # whose start unblocks SIGINT: before
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -87,16 +88,16 @@ def _receive(receiver: Connection, process: SpawnProcess, what: str) -> tuple[bo
 def _answer(
     sender: Connection, of_parent: tuple[int, bool], function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> None:
-    """The new process. `of_parent`: its number, and whether it is silent."""
+    """Runs in the new process. `of_parent`: the parent's process number, and whether it is silent."""
     parent, silent = of_parent
     try:
-        os.setsid()  # Ctrl-C in a terminal reaches the parent alone, which passes it on
+        os.setsid()  # Ctrl-C in a terminal reaches only the parent, which passes it on
         enter_child(parent)
         if silent:
             silence_background()
         with sigterm_as_interrupt(), plain_messages():
             answer = True, function(*arguments)
-    except BaseException as error:  # also what ends a process: the parent raises it
+    except BaseException as error:  # also exceptions that end a process: the parent raises them
         answer = False, _portable(error)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it is done
@@ -104,11 +105,11 @@ def _answer(
 
 
 def _portable(error: BaseException) -> BaseException:
-    """`error` with its traceback, as a note; a RuntimeError of the same words where it cannot be sent."""
+    """`error` with its traceback as a note; a RuntimeError with the same words if it cannot be sent."""
     trace = "".join(traceback.format_exception(error))
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:  # whatever its class raises when it is made anew
+    except Exception:  # whatever its class raises when it is rebuilt
         error = RuntimeError(f"{type(error).__name__}: {error}")
     error.add_note(f"in another process:\n{trace}")
     return error

@@ -1,7 +1,7 @@
-"""Finished trials in a study's directory besides those that are to be run, which can share their training.
+"""Finished trials in a study's directory whose training the trials to be run can share.
 
 They may be of the study's other axes, or of an earlier evaluation: a study whose `eval` was changed (`--replace study`)
-has trials of other names with the same training.
+has trials with other names but the same training.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def find_trained(
     """Finished trials in `trials` besides `ids`, by id, that have checkpoints, were trained on the same tokens, and
     have the id that today's code gives them.
 
-    `sources`: those that they have to have run; None: whichever. What cannot be read is nothing to go on from.
+    `sources`: the sources that they must have run; None: any. A trial that cannot be read is left out.
     """
     found = {}
     for directory in sorted(path.parent for path in trials.glob(f"*/{RESULT}") if path.parent.name not in ids):

@@ -1,4 +1,4 @@
-"""What a trial is: all that is chosen of it, and the name that follows from that."""
+"""What a trial is: everything about it that is chosen, and the name that follows from that."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 class Trial:
     """Everything about a trial that is chosen; `train.seed` also seeds its data order."""
 
-    datasets: tuple[str, ...]  # in the order of the embodiment axis
+    datasets: tuple[str, ...]  # in the order of the model's embodiment axis
     max_trajectories: int | None  # per dataset; None: all
     evaluated: tuple[str, ...]  # datasets whose validation windows are used
     model: ModelConfig
     train: TrainConfig
     eval: EvalConfig
     tau: float = 3.0
-    rate: float | None = 2.0  # of frames, in Hz; None: native
-    weighed: Literal["used", "all"] = "used"  # whose windows weigh in the mixture
+    rate: float | None = 2.0  # frame rate in Hz; None: native
+    weighed: Literal["used", "all"] = "used"  # which windows give the mixture's weights
     shuffle_actions: bool = False  # the control: actions from another episode
     measure_untrained: bool = False  # also evaluate the model before its first step
-    capped: tuple[str, ...] = later(())  # datasets that max_trajectories concerns; (): all of them
-    # A trained model that `datasets` are added to, and alone trained; None: a new one.
+    capped: tuple[str, ...] = later(())  # datasets to which max_trajectories applies; (): all of them
+    # A trained model to which `datasets` are added; only these are then trained. None: a new model.
     source: Trial | None = later(None)
 
     def with_source(self) -> tuple[Trial, ...]:
@@ -43,7 +43,7 @@ class Trial:
 
     @property
     def title(self) -> str:
-        """One line that tells this trial from the others of its study."""
+        """One line that distinguishes this trial from the others of its study."""
         cap = "all" if self.max_trajectories is None else f"{self.max_trajectories}"
         if self.capped:
             cap = f"{cap} of {len(self.capped)}, all other"
@@ -56,7 +56,8 @@ class Trial:
 
 
 def training_of(trial: Trial) -> dict[str, Any]:
-    """What determines a trial's training, but for its number of steps: not on what it is judged, nor how."""
+    """What determines a trial's training, except its number of steps; what it is judged on, and how, is not part of
+    it."""
     fields = to_dict(trial)
     for name in ("evaluated", "eval", "measure_untrained"):
         del fields[name]
@@ -69,8 +70,8 @@ def training_of(trial: Trial) -> dict[str, Any]:
 def trajectories_of(
     trial: Trial, available: Mapping[str, int], result: Mapping[str, Any] | None = None
 ) -> dict[str, int]:
-    """{robot: training trajectories that windows are drawn of}, as the trial's `result` counts them. Without such a
-    count, the `available` ones up to its cap: a few more than there were, where a subset contains damaged ones."""
+    """{robot: number of training trajectories from which windows are drawn}, as the trial's `result` counts them.
+    Without such a count, the `available` ones up to its cap: a few too many if a subset contains damaged ones."""
     if result and "trajectories" in result:
         return dict(result["trajectories"])
     capped, most = trial.capped or trial.datasets, trial.max_trajectories
@@ -100,7 +101,7 @@ def _identity(trial: Trial) -> dict[str, Any]:
 
 
 def _has(found: Any, wanted: Any) -> bool:
-    """Whether a field has the value, or one that the function `wanted` is true of."""
+    """Whether a field has the `wanted` value, or one for which the function `wanted` is true."""
     return wanted(found) if callable(wanted) else found == wanted
 
 

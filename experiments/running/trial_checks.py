@@ -1,4 +1,4 @@
-"""Checks of the trials of a study: each is the trial that its name says, and all ran the same sources."""
+"""Checks that each trial of a study is the trial that its name says, and that all ran the same sources."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Sources:
 
 
 def check_finished(trials: Path, ids: Iterable[str]) -> None:
-    """Raises ConfigError if a trial that has a result is not whole, or not the one that its name says.
+    """Raises ConfigError if a trial that has a result is incomplete, or is not the one that its name says.
 
-    It may have run here or have been copied from anywhere.
+    The trial may have run here or have been copied from anywhere.
     """
     for id in ids:
         directory = trials / id
@@ -45,7 +45,8 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
 
 
 def group_by_sources(trials: Path, ids: Iterable[str]) -> list[Sources]:
-    """The trials that began, by what they ran; one that went on under other sources is in several groups."""
+    """The trials that began, grouped by the sources that they ran; a trial that continued under other sources is in
+    several groups."""
     groups: list[Sources] = []
     for id in ids:
         record = read_record(trials / id)
@@ -57,7 +58,7 @@ def group_by_sources(trials: Path, ids: Iterable[str]) -> list[Sources]:
 
 
 def require_one_closure(trials: Path, ids: Iterable[str], now: Closure | None, accept: bool) -> None:
-    """Raises CodeChanged, unless the user accepts it, if trials ran other sources than each other or than those of
+    """Raises CodeChanged, unless the user accepts it, if trials ran different sources from each other or from those of
     `now` (None: no trial is to be run)."""
     groups = group_by_sources(trials, ids)
     if now is not None and not any(not changed(group.modules, now) for group in groups):
@@ -76,7 +77,7 @@ def require_one_closure(trials: Path, ids: Iterable[str], now: Closure | None, a
 
 
 def describe(groups: list[Sources]) -> list[str]:
-    """A line for each; from the second on, what differs from the first."""
+    """A line for each group; from the second on, what differs from the first."""
     lines = []
     for group in groups:
         count = f"{len(group.trials)} trial(s)" if group.trials else "to be run"
@@ -88,12 +89,12 @@ def describe(groups: list[Sources]) -> list[str]:
 
 
 def _began(directory: Path) -> bool:
-    """Whether something of what was computed is kept."""
+    """Whether any computed result is kept."""
     return (directory / RESULT).exists() or any((directory / RUN / CHECKPOINTS).glob("*"))
 
 
 def _join(groups: list[Sources], one: Sources) -> None:
-    """Adds the sources of one trial to the first group that has none of its modules in another form."""
+    """Adds the sources of one trial to the first group in which none of its modules has another hash."""
     group = next((group for group in groups if not changed(group.modules, one.modules)), None)
     if group is None:
         groups.append(one)

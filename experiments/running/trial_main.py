@@ -30,13 +30,14 @@ POLL_SECONDS = 30.0
 """Seconds between two checks that the trial is still ours."""
 
 DEVICE_FAILURES = ("FAILED_PRECONDITION", "INTERNAL", "UNAVAILABLE")
-"""How messages of JAX begin where a device or its driver fails; one whose memory is too small is no failure."""
+"""How JAX's messages begin if a device or its driver fails; a device with too little memory does not count as
+failing."""
 
 
 def main(directory: Path) -> int:
-    """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; LOST: its files could not be
-    written, its data not be read, or its accelerator failed; STOPPED or INTERRUPTED: the next attempt goes on from
-    here, or another one is running."""
+    """Runs the trial and returns the exit code. FAILED: see failure.json, also if it diverged; REFUSED: the sources
+    changed; LOST: its files could not be written, its data could not be read, or its accelerator failed; STOPPED or
+    INTERRUPTED: the next attempt continues from here, or another one is running."""
     enter_child()  # before anything imports JAX
     try:
         before = _read_failure(directory)
@@ -52,7 +53,7 @@ def main(directory: Path) -> int:
     except Held as held:
         print(f"another attempt at this trial is running: {held}", file=sys.stderr)
         return Exit.STOPPED
-    except OSError:  # before there was anything to record it with
+    except OSError:  # before there was anything in which to record it
         _print_traceback()
         return Exit.LOST
 
@@ -105,10 +106,10 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         _print_traceback()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
-        # A disk that is full or gone, or a device that fails, is no fault of the trial.
+        # A disk that is full or gone, or a device that fails, is not the trial's fault.
         lost = isinstance(error, (OSError, UnreachableError, NoAccelerator)) or _is_of_device(error)
         state = LOST if lost else DIVERGED if isinstance(error, DivergedError) else FAILED
-        with suppress(OSError):  # the same disk, most likely: then the code says it alone
+        with suppress(OSError):  # most likely on the same disk: then only the exit code says it
             write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
         return Exit.LOST if lost else Exit.FAILED
 
@@ -129,7 +130,8 @@ class TakenOver(Exception):
 
 
 def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, str] | None:
-    """The closure of what is run, imported; None if it is not what was given, of which failure.json is left."""
+    """Imports the closure of what is run and returns it; None, after writing failure.json, if it is not the given
+    one."""
     from experiments.running.provenance import CodeChanged, load_sources
 
     try:
@@ -142,7 +144,7 @@ def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, st
 class _ProgressFile:
     """Writes {phase, done, total} for the runner to show, a few times a second at most.
 
-    Raises TakenOver when `lost` says that the trial is another attempt's by now.
+    Raises TakenOver if `lost` says that another attempt has taken over the trial.
     """
 
     def __init__(self, path: Path, lost: Callable[[], bool]):
@@ -161,7 +163,7 @@ class _ProgressFile:
             return
         self.last = (phase, now)
         aside = self.path.with_suffix(".tmp")
-        with suppress(OSError):  # it is only shown; what must not be lost raises where it is written
+        with suppress(OSError):  # progress is only displayed; writes that must not be lost raise where they are made
             aside.write_text(json.dumps({"phase": phase, "done": done, "total": total}))
             aside.replace(self.path)
 

@@ -1,4 +1,4 @@
-"""The output directory of a study: where everything lies, and which study lives there."""
+"""The output directory of a study: where everything is, and which study it holds."""
 
 from __future__ import annotations
 
@@ -42,8 +42,7 @@ class _Under:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Paths under `root`. Deleting any of them is safe, the next run makes it again, but for predictions and
-    findings."""
+    """Paths under `root`. Deleting any of them except predictions and findings is safe: the next run makes it again."""
 
     root: Path
 
@@ -55,7 +54,7 @@ class Workspace:
     manifest = _Under("eval_manifest.json")
     """Frozen evaluation windows."""
     counterfactual = _Under("counterfactual.npz")
-    """Their true frames under other actions, where they are of the suite."""
+    """True frames of the windows under other actions, for robots of the suite."""
     data_summary = _Under("data.json")
     """Episodes and windows per dataset, as JSON."""
     trials = _Under("trials")
@@ -79,7 +78,7 @@ class Workspace:
     fits = _Under("fits.csv")
     """Coefficients of scaling fits."""
     registry = _Under("registry.toml")
-    """The registry entries of the user's own that its axes were planned with; there is none without any."""
+    """The user's own registry entries with which the axes were planned; no file if there are none."""
     predictions = _Under("predictions")
     """Predictions of trials, made before they ran."""
     findings = _Under("findings.md")
@@ -91,20 +90,20 @@ class Workspace:
 
     @classmethod
     def of_run(cls, run: Path) -> Workspace:
-        """The study that a run is of: STUDY/RUN, or the trial STUDY/trials/ID/run."""
+        """The study to which a run belongs: STUDY/RUN, or the trial STUDY/trials/ID/run."""
         parent = run.absolute().parent
         study = parent.parent.parent
         return cls(study if cls(study).trials == parent.parent else parent)
 
     @property
     def holder(self) -> Holder | None:
-        """Who holds the right to write in it; None if nobody does."""
+        """The process that holds the right to write in it; None if there is none."""
         return read_holder(self.root / LOCK)
 
     @contextmanager
     def locked(self, lock: str = LOCK) -> Iterator[Lock]:
-        """Makes the directory and holds the right to write in it, or what another `lock` is for; it dies with its
-        process. It has a lease, for machines that do not see each other's locks.
+        """Makes the directory and holds the right to write in it, or the right that another `lock` stands for. The lock
+        ends with its process, and has a lease for machines that do not see each other's locks.
 
         Raises ConfigError if the directory cannot be written, Busy if another process holds it.
         """
@@ -126,13 +125,13 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Record:
-    """The content of study.json, so that `hma report` and `hma sweep` need the study's directory alone."""
+    """The content of study.json, so that `hma report` and `hma sweep` need only the study's directory."""
 
     study: Study
     data: tuple[str, ...] = ()  # RLDS directories of the user; () for the suite
     axes: tuple[str, ...] = ()  # sweeps run so far
     command: str = ""
-    provenance: Provenance = field(kw_only=True)  # of the trials that the report shows
+    provenance: Provenance = field(kw_only=True)  # provenance of the trials that the report shows
 
 
 def save_record(workspace: Workspace, record: Record) -> None:
@@ -140,8 +139,8 @@ def save_record(workspace: Workspace, record: Record) -> None:
 
 
 def command_at(root: Path, record: Record) -> str:
-    """The study's command for its directory `root`, as the user wrote it. The recorded one names the path that it had,
-    where it would begin a new study if the directory was moved or copied since."""
+    """The study's command for its directory `root`, as the user wrote it. The recorded command names the former path,
+    and would begin a new study there if the directory has been moved or copied since."""
     words = shlex.split(record.command)
     at = words.index("--out") + 1 if "--out" in words else None
     recorded = words[at] if at else str(Path("runs") / record.study.name)
@@ -154,7 +153,7 @@ def command_at(root: Path, record: Record) -> str:
 
 
 def find_record(workspace: Workspace) -> Record | None:
-    """The study that lives there, as this or an earlier version recorded it; None without any, and where a file is in
+    """The study in the directory, as this or an earlier version recorded it; None if there is none, or if a file is in
     place of the directory.
 
     Raises ConfigError if its file cannot be read.
@@ -175,9 +174,9 @@ def find_record(workspace: Workspace) -> Record | None:
 
 
 def load_record(workspace: Workspace) -> Record:
-    """The study that lives there. For the rest of this process its own registry entries are added to the registry, and
-    the sizes of its datasets are those that its tokens say: its axes are planned with them. Raises
-    ConfigError if there is none, or one that does not say what its axes are."""
+    """The study in the directory. For the rest of this process its own registry entries are added to the registry, and
+    the sizes of its datasets are taken from its tokens: its axes are planned with them. Raises ConfigError if there is
+    no study, or one that does not say what its axes are."""
     record = find_record(workspace)
     if record is None:
         names = sorted(place.parent.name for place in workspace.root.glob(f"*/{CHECKPOINTS}"))
@@ -202,8 +201,7 @@ def load_record(workspace: Workspace) -> Record:
 
 
 def use_own_entries(workspace: Workspace) -> None:
-    """Adds the entries of the user's own that the study was planned with to the registry, for the rest of this
-    process."""
+    """Adds the user's own entries, with which the study was planned, to the registry for the rest of this process."""
     if workspace.registry.exists():
         from data_pipelines.registry.toml_file import load_entries
 

@@ -1,8 +1,8 @@
 """The interface by which the runner starts and stops trials, wherever they run.
 
-A launcher starts processes, says when they have ended and stops them. It knows nothing of what they do: they
-leave results, failures and progress in the directories of their trials (`experiments.running.attempts`), which
-every place must share.
+A launcher starts processes, says when they have ended and stops them. It knows nothing of what they do: they leave
+results, failures and progress in their trials' directories (`experiments.running.attempts`), which must be shared by
+every place.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ GRACE_SECONDS = 60.0
 """How long a trial may take to save its state when it is asked to stop."""
 
 Command = Callable[[Path], list[str]]
-"""The command of the process that makes an attempt in a trial's directory."""
+"""The command of the process that runs an attempt in a trial's directory."""
 
 
 def trial_command(directory: Path) -> list[str]:
@@ -28,11 +28,12 @@ def trial_command(directory: Path) -> list[str]:
 
 
 class Launcher(ABC):
-    """Starts trials on this machine, a cluster, ... `Settings` is a dataclass of what `--launcher-set` takes."""
+    """Starts trials on this machine, a cluster, ... `Settings` is a dataclass of the settings that `--launcher-set`
+    takes."""
 
     Settings: ClassVar[type]
     needs: ClassVar[str] = ""
-    """The package that it works through; the extra of the launcher's name brings it."""
+    """The package that it works through; the extra with the launcher's name installs it."""
     pause: ClassVar[float] = 0.1
     """Seconds between two checks of what has ended."""
 
@@ -41,21 +42,21 @@ class Launcher(ABC):
 
     @classmethod
     def limit(cls, workers: int | None, settings: Any) -> int | None:
-        """`at_once`, with so many `workers`; None: as many as there is room for. Needs no engine."""
+        """The value of `at_once` with this number of `workers`; None: as many as there is room for. Needs no engine."""
         return workers
 
     @classmethod
     @abstractmethod
     def share(cls, workers: int | None, settings: Any) -> float | None:
-        """How many accelerators a trial gets, with so many `workers`; below 1: several trials share one. None: neither
-        the settings nor the place say it. Needs no engine."""
+        """How many accelerators a trial gets with this number of `workers`; below 1: several trials share one. None:
+        neither the settings nor the place determine it. Needs no engine."""
 
     @abstractmethod
     def launch(self, directories: Sequence[Path]) -> list[Any]:
         """Asks for an attempt at the trial of each directory, and returns a handle for each.
 
-        Raises ConfigError if the place refuses them, and OSError; none of them then goes on, and all may be asked for
-        again.
+        Raises ConfigError if the place refuses them, and OSError; then none of them keeps running, and all may be asked
+        for again.
         """
 
     @abstractmethod
@@ -68,7 +69,7 @@ class Launcher(ABC):
 
     @abstractmethod
     def kill(self, handles: Sequence[Any]) -> None:
-        """Ends attempts at once, those that have ended already too."""
+        """Ends attempts at once; they may have ended already."""
 
     def stop(self, handles: Sequence[Any]) -> list[AttemptEnd]:
         """Asks, waits until all have ended, kills the rest after the grace period. Returns how each ended."""
@@ -82,7 +83,7 @@ class Launcher(ABC):
         return [ended if (ended := self.ended(h)) and h not in late else killed for h in handles]
 
     def place(self, handle: Any, start: Mapping[str, Any] | None) -> str | None:
-        """Where an attempt ran, of what its process said at its `start`; None if that is not known."""
+        """Where an attempt ran, as its process said at its `start`; None if that is not known."""
         return start and start["host"]
 
     def leave_out(self, handle: Any, place: str) -> bool:

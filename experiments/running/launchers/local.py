@@ -17,19 +17,20 @@ from experiments.running.slots import core_place, cut, find_accelerators
 
 @dataclass(frozen=True)
 class LocalSettings:
-    """Nothing: the machine's cores and accelerators are divided by --workers."""
+    """No settings: the machine's cores and accelerators are divided by --workers."""
 
 
 @dataclass(frozen=True)
 class Child:
-    """A process of ours."""
+    """A process that this launcher started."""
 
     process: subprocess.Popen
     slot: int
 
 
 class LocalLauncher(Launcher):
-    """`workers` trials at a time, each in a slot of its own. Raises ConfigError for more than there can be."""
+    """`workers` trials at a time, each in a slot of its own. Raises ConfigError for more workers than the machine can
+    hold."""
 
     Settings = LocalSettings
 
@@ -66,7 +67,7 @@ class LocalLauncher(Launcher):
             for directory in directories:
                 children.append(self._start(directory))
         finally:
-            if len(children) < len(directories):  # the caller has no handles of those that started
+            if len(children) < len(directories):  # the caller has no handles of the ones that did start
                 self.stop(children)
         return children
 

@@ -1,7 +1,7 @@
 """A Ray cluster: one task for each trial, on whichever machine has the cores and accelerators that it asks for.
 
-Machines may differ and may come and go. Ray tells each task which accelerators are its own. A task whose worker
-or machine dies is not tried again by Ray: the runner does that, with its bound.
+Machines may differ and may come and go. Ray tells each task which accelerators are its own. Ray does not retry a task
+whose worker or machine dies: the runner does that, within its limit.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from hma_jax.config import ConfigError, require
 
 @dataclass(frozen=True)
 class RaySettings:
-    """The cluster, and what each trial takes of it."""
+    """The cluster, and what each trial takes from it."""
 
     address: str = "auto"  # of the head, "host:6379" or "ray://host:10001"; auto: the one this machine is part of
     cpus: float = 1
     gpus: float = 0
     tpus: int = 0  # chips
     memory_gb: float | None = None
-    resources: tuple[str, ...] = ()  # others that the cluster names, such as "big_memory=1"
+    resources: tuple[str, ...] = ()  # further resources that the cluster names, such as "big_memory=1"
 
     def __post_init__(self):
         for name in ("cpus", "gpus", "tpus"):
@@ -83,7 +83,7 @@ class RayLauncher(Launcher):
         return settings.gpus or settings.tpus or None
 
     def launch(self, directories: Sequence[Path]) -> list[Task]:
-        # Before any is asked for: making one may raise.
+        # Made before any is asked for: making one may raise.
         attempts = [Attempt(d, self._root / "compiled", self._command, self._accelerator) for d in directories]
         return [Task(attempt.directory, self._run.remote(attempt)) for attempt in attempts]
 
@@ -100,8 +100,8 @@ class RayLauncher(Launcher):
 
     def ask_to_stop(self, handles: Sequence[Task]) -> None:
         for handle in handles:
-            unwant(handle.directory)  # what Ray does about a task that has just begun comes to nothing
-            self._ray.cancel(handle.reference, force=False)  # raises KeyboardInterrupt in the task, which asks too
+            unwant(handle.directory)  # Ray's own request has no effect on a task that has just begun
+            self._ray.cancel(handle.reference, force=False)  # raises KeyboardInterrupt in it, which also asks
 
     def kill(self, handles: Sequence[Task]) -> None:
         for handle in handles:
@@ -113,7 +113,7 @@ class RayLauncher(Launcher):
 
 
 def _may_be_alive(directory: Path) -> bool:
-    """Also true while the shared disk does not answer: whether the trial has ended is asked again soon."""
+    """Also true while the shared disk does not answer: the question is asked again soon."""
     try:
         return is_alive(directory)
     except OSError:
@@ -141,7 +141,7 @@ def _join(address: str) -> Any:
     try:
         ray.init(address=address, log_to_driver=False, logging_level="warning")
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, before)  # Ray's would abort this process, before trials are asked to save
+            signal.signal(signal.SIGTERM, before)  # Ray's would abort this process before trials are asked to save
     except (ConnectionError, TimeoutError, RuntimeError) as error:
         raise ConfigError(
             f"no Ray cluster at {address} ({error}); start one with `ray start --head`, or name its head with "

@@ -51,8 +51,8 @@ class LauncherOptions:
         return kind.share(self.workers, settings)
 
     def cores_each(self) -> float:
-        """The part of a core that each trial gets where more of them than there are cores run on this machine's
-        processor; otherwise 1."""
+        """The share of a core that each trial gets if more trials than there are cores run on this machine's CPU;
+        otherwise 1."""
         if self.name != "local" or self.share() is not None:
             return 1.0
         return min(usable_cores() / (self.at_once or 1), 1.0)
@@ -64,7 +64,7 @@ class LauncherOptions:
         require(installed, f"--launcher {self.name} needs {needs}: pip install 'hma-jax[{self.name}]'")
 
     def launcher(self, root: Path) -> Launcher:
-        """For the study in `root`. Raises ConfigError where it cannot work."""
+        """The launcher for the study in `root`. Raises ConfigError if it cannot work."""
         self.require_installed()
         kind, settings = self._parsed()
         return kind(root, self.workers, settings)
@@ -77,7 +77,7 @@ def launcher_class(name: str) -> type[Launcher]:
 
 
 def parse_settings(name: str, kind: type, settings: Sequence[str]) -> Any:
-    """A `kind` from 'key=value' strings; a key whose value is a list may be given several times."""
+    """An instance of `kind` from 'key=value' strings; a key whose value is a list may be given several times."""
     hints, known = typing.get_type_hints(kind), ", ".join(f.name for f in fields(kind)) or "none"
     values: dict[str, Any] = {}
     for setting in settings:

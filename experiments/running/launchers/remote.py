@@ -21,24 +21,25 @@ from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
 
 POLL_SECONDS = 0.1
-"""Seconds between two checks whether the child has ended, or is to."""
+"""Seconds between two checks of whether the child has ended, or should end."""
 
 WANTED_SECONDS = 1.0
-"""Seconds between two checks whether the attempt is still wanted."""
+"""Seconds between two checks of whether the attempt is still wanted."""
 
 WANTED = "wanted"
-"""A file in the trial's directory with the token of the one attempt that may run: any other stops, and one that an
-earlier command left in the queue does not begin."""
+"""A file in the trial's directory with the token of the one attempt that may run: any other attempt stops, and one that
+an earlier command left in the queue does not begin."""
 
 
 def unwant(directory: Path) -> None:
-    """Asks a trial's attempt to stop, where an engine's own way does not always arrive."""
+    """Asks a trial's attempt to stop, for engines whose own request does not always arrive."""
     (directory / WANTED).unlink(missing_ok=True)
 
 
 class Attempt:
-    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk. `accelerator`: the kind that
-    it is given, if any; `grace`: seconds to save. The newest one made for a directory is the one that is wanted."""
+    """`directory` is the trial's, `cache` that of compiled programs; both are on the shared disk. `accelerator`: the
+    kind that it is given, if any; `grace`: seconds to save. The newest attempt made for a directory is the one that is
+    wanted."""
 
     def __init__(
         self, directory: Path, cache: Path, command: Command, accelerator: str = "", grace: float = GRACE_SECONDS
@@ -54,8 +55,8 @@ class Attempt:
         return vars(self) | {"_child": None, "_code": None, "_stop_requested": False}
 
     def run(self) -> int:
-        """Makes the attempt and returns its exit code, as of `subprocess`."""
-        if self.directory.is_dir() and not self._is_wanted():  # without the shared disk, what follows fails
+        """Runs the attempt and returns its exit code, as in `subprocess`."""
+        if self.directory.is_dir() and not self._is_wanted():  # without the shared disk, the code below fails
             return Exit.STOPPED
         with open(self.directory / OUTPUT, "a") as output:
             self._child = subprocess.Popen(
@@ -66,8 +67,8 @@ class Attempt:
                 env=child_environment(self.cache, accelerator=self.accelerator),
                 start_new_session=True,  # signals come through here, once
             )
-        # Engines stop us by calls from signal handlers in this thread. Here and there it must hold no lock,
-        # as those of `subprocess` are, so another one waits for the child.
+        # Engines stop us by calls from signal handlers in this thread. It must hold no lock then, such as those of
+        # `subprocess`, so another thread waits for the child.
         threading.Thread(target=self._wait, daemon=True).start()
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, lambda *_: self._request_stop())
@@ -93,7 +94,7 @@ class Attempt:
         self._code = self._child.wait()
 
     def _request_stop(self) -> None:
-        if not self._stop_requested:  # the engine may say it by a signal, by interrupting the call and by the file
+        if not self._stop_requested:  # the engine may ask by a signal, by interrupting the call and by the file
             self._stop_requested = True
             self._child.send_signal(signal.SIGINT)
 

@@ -2,8 +2,8 @@
 
 Submitit writes and submits the batch script, runs the pickled attempt in the job, and puts it back into the queue
 when Slurm announces that it will be pre-empted or that its time is over (SIGUSR2, `grace` seconds before). A job
-that is cancelled, or pre-empted with a SIGTERM alone, has saved as well; the runner submits it again. Where jobs
-stand is asked of squeue, which every cluster has, with or without accounting.
+that is cancelled, or pre-empted with only a SIGTERM, has saved as well; the runner submits it again. The state of jobs
+comes from squeue, which every cluster has, with or without accounting.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LARGEST_ARRAY = 1000
 """Jobs in an array; Slurm's own default for MaxArraySize is 1001."""
 
 TIMEOUTS = 1000
-"""How often a trial may use up a job's time; it goes on from its checkpoint in the next."""
+"""How often a trial may use up a job's time; it continues from its checkpoint in the next job."""
 
 COMPLETED = "COMPLETED"
 ASKED_TO_STOP = {"CANCELLED", "PREEMPTED", "TIMEOUT"}
@@ -43,11 +43,11 @@ REQUEUE = 10.0
 """Seconds of a job's `grace` that submitit gets to put it back into the queue; the trial has the others to save."""
 
 LEAST_TO_SAVE = 20.0
-"""Seconds that a trial gets to save, however short `grace` is: before a pre-emption, of which SIGUSR2 tells too, the
-time is the partition's. If the job is over before them, the runner submits the trial again."""
+"""Seconds that a trial gets to save, however short `grace` is: before a pre-emption, which SIGUSR2 announces too, the
+time is the partition's. If the job ends earlier, the runner submits the trial again."""
 
 LINGER = 30.0
-"""Seconds for a job's last words to reach this machine through a shared disk."""
+"""Seconds for a job's last output to reach this machine through a shared disk."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class SlurmSettings:
     gpus: int | None = None  # on its node; None: as the partition gives them
     cpus: int | None = None
     memory_gb: float | None = None
-    minutes: int = 1440  # of one job; a trial that needs more goes on in the next
+    minutes: int = 1440  # time limit of one job; a trial that needs more continues in the next
     grace: int = 120  # seconds to save before the end of a job's time
     sbatch: tuple[str, ...] = ()  # further options, such as "gres=gpu:h100:1"
 
@@ -78,7 +78,7 @@ class SlurmSettings:
 
 
 class SlurmAttempt(Attempt):
-    """What submitit pickles, calls in the job, and asks for what to do after an announced end."""
+    """What submitit pickles, calls in the job, and asks what to do after an announced end."""
 
     def __call__(self) -> int:
         return self.run()
@@ -93,7 +93,7 @@ class SlurmAttempt(Attempt):
 class SlurmLauncher(Launcher):
     """`workers`: how many jobs are submitted at a time; None: all.
 
-    Raises ConfigError where Slurm is missing.
+    Raises ConfigError if Slurm is missing.
     """
 
     Settings = SlurmSettings
@@ -116,7 +116,7 @@ class SlurmLauncher(Launcher):
         self._executor = executor or _make_executor(root / "slurm", settings)
         self._left_out = [o.removeprefix("exclude=") for o in settings.sbatch if o.startswith("exclude=")]  # nodes
         self._polled = -math.inf
-        self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
+        self._states: dict[str, str] | None = None  # states of all jobs; None: not known since the last were submitted
         self._over: dict[str, float] = {}  # when a job was first seen to be over
 
     @classmethod
@@ -140,7 +140,7 @@ class SlurmLauncher(Launcher):
                 f"{len(attempts)}, submit fewer at a time with --workers N"
             ) from error
         finally:
-            if len(jobs) < len(attempts):  # the caller has no handles of those that Slurm took
+            if len(jobs) < len(attempts):  # the caller has no handles of the ones that Slurm took
                 self.ask_to_stop(jobs)
         self._polled, self._states = -math.inf, None
         return jobs
@@ -148,7 +148,7 @@ class SlurmLauncher(Launcher):
     def ended(self, handle: Any) -> AttemptEnd | None:
         result = self._result(handle)
         if result is not None:
-            if result.code != 0:  # Slurm might bring it back, beside the one that the runner submits
+            if result.code != 0:  # Slurm might requeue it, beside the one that the runner submits
                 self.ask_to_stop([handle])
             return result
         state = self._state(handle.job_id)
@@ -166,7 +166,7 @@ class SlurmLauncher(Launcher):
         """What the job's process left when it ended by itself."""
         try:
             kind, value = pickle.loads(job.paths.result_pickle.read_bytes())
-        except OSError:  # not there, or a shared disk that does not answer for a while
+        except OSError:  # missing, or a shared disk that does not answer for a while
             return None
         if kind == "success":
             return AttemptEnd(value)
@@ -180,7 +180,7 @@ class SlurmLauncher(Launcher):
             self._states = self._states if answer is None else answer
         if self._states is None:
             return "UNKNOWN"
-        return self._states.get(id, COMPLETED)  # squeue forgets what has been over for a while
+        return self._states.get(id, COMPLETED)  # squeue forgets jobs that ended a while ago
 
     def place(self, handle: Any, start: Mapping[str, Any] | None) -> str | None:
         return start and start.get("node")
@@ -199,13 +199,13 @@ class SlurmLauncher(Launcher):
             subprocess.run(["scancel", *(h.job_id for h in handles)], check=False)
 
     def kill(self, handles: Sequence[Any]) -> None:
-        """Slurm has done that by now."""
+        """Does nothing: Slurm has killed them by now."""
 
 
 @contextmanager
 def _no_job() -> Iterator[None]:
-    """Hides the environment of the job that this process may be in, which the jobs it submits would take for theirs;
-    not how Slurm is found, nor the user's own options of sbatch."""
+    """Hides the environment of the job that this process may be in, which the jobs it submits would take for their own.
+    Variables by which Slurm is found, and the user's own options of sbatch, stay."""
     from submitit.helpers import clean_env
 
     kept = {key: value for key, value in os.environ.items() if key == "SLURM_CONF" or key.startswith("SBATCH_")}
@@ -215,7 +215,7 @@ def _no_job() -> Iterator[None]:
 
 
 def ask_states() -> dict[str, str] | None:
-    """The state of each job of this user, {id: state}; None if Slurm does not answer now."""
+    """The state of each of this user's jobs, {id: state}; None if Slurm does not answer now."""
     command = ["squeue", "--me", "--array", "--noheader", "--states=all", "--format=%i %T"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
