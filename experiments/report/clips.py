@@ -1,8 +1,7 @@
 """Clips that play: what was recorded, what was predicted, and what was predicted under other actions.
 
-One animation per robot holds the three side by side, so that they cannot fall out of step, with a bar that fills as
-time passes: grey while frames are given, coloured while they are predicted. On paper, where nothing plays, frames
-stand in rows.
+One animation per robot shows the three side by side, so that they stay in step, with a bar that fills as time passes:
+grey while frames are given, coloured while they are predicted. On paper, where nothing plays, frames are shown in rows.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ KINDS = {"true": "recorded", "predicted": "predicted", "random": "other actions"
 """Keys of samples.npz, with their captions."""
 
 SHOWN, ON_PAPER = 12, 4
-"""Robots whose clips are visible at once (the others unfold), and those whose frames are printed."""
+"""Number of robots whose clips are visible at once (the others unfold), and of those whose frames are printed."""
 
 SHOW_MS, HOLD_MS = 260, 1100
 """Milliseconds of a frame, and of the last one."""
@@ -66,7 +65,7 @@ def _gap(width: int) -> int:
 
 
 def animate(clips: Sequence[np.ndarray], prompt: int) -> bytes:
-    """Clips uint8 [T, H, W, 3] side by side as an animated WebP, without loss: small pictures are shown enlarged."""
+    """Clips uint8 [T, H, W, 3] side by side as a lossless animated WebP: small images are shown enlarged."""
     count, height, width, _ = clips[0].shape
     gap = _gap(width)
     whole = len(clips) * width + (len(clips) - 1) * gap

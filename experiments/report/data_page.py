@@ -1,4 +1,4 @@
-"""One HTML page on what datasets hold: clips with their actions, statistics, windows and what stands out.
+"""One HTML page on what datasets hold: clips with their actions, statistics, windows and possible issues.
 
 Self-contained, readable on a phone. Owns the page; the facts are `data_pipelines.inspection`'s.
 """
@@ -24,7 +24,7 @@ from experiments.report.pieces import STILL, table
 from experiments.report.style import CSS
 
 FASTEST = 4.0
-"""Clips play at the recorded speed, faster if they would take longer than LONGEST, at most so much."""
+"""Clips play at the recorded speed, or faster (by at most this factor) if they would take longer than LONGEST."""
 
 LONGEST = 6.0
 """Seconds of a clip, as long as FASTEST allows."""
@@ -33,7 +33,7 @@ UNKNOWN_HZ = 10.0
 """Speed of clips whose rate is unknown."""
 
 OTHER_FRAMES = (2, 4, 8, 12, 16)
-"""Windows of so many frames are counted beside the one asked for."""
+"""Windows of these numbers of frames are counted besides the one asked for."""
 
 CLIP_FRAMES = 24
 """Frames of a clip."""
@@ -70,8 +70,8 @@ class DatasetView:
     """One dataset as the page shows it."""
 
     sample: Sample
-    entry: DatasetSpec | None  # how it would be read
-    registered: bool  # the entry is the registry's, not one that its contents suggest
+    entry: DatasetSpec | None  # the entry by which it would be read
+    registered: bool  # the entry is the registry's, not one suggested by the contents
     hz: float | None
     stride: int | None
     issues: tuple[Issue, ...]
@@ -82,7 +82,7 @@ class DatasetView:
 
 
 def draw_page(datasets: Sequence[DatasetView], frames: int, command: str) -> str:
-    """The page. `frames`: T of the windows that are counted; `command`: what makes the page again."""
+    """The page. `frames`: T of the windows that are counted; `command`: the command that makes the page again."""
     title = ", ".join(d.facts.name for d in datasets)
     body = [_summary(datasets, frames), STILL]
     body += [part for i, dataset in enumerate(datasets) for part in _dataset(i, dataset, frames)]
@@ -197,7 +197,7 @@ def _episode(d: DatasetView, example: ExampleEpisode) -> str:
 
 
 def _corrected(d: DatasetView, camera: str, frames: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
-    """Frames of the camera in use as a model is shown them."""
+    """Frames of the camera in use, as a model sees them."""
     used = d.entry is not None and camera == d.entry.image_key
     return [d.entry.correct(frame) for frame in frames] if used else frames
 

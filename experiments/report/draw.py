@@ -1,4 +1,4 @@
-"""CSV, figures and page of a study, from whatever trials are finished."""
+"""CSV, figures and page of a study, from the trials that are finished."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def draw(workspace: Workspace, record: Record) -> None:
-    """CSV, figures and page from whatever trials are finished, by one process at a time: others wait."""
+    """Writes CSV, figures and page from the trials that are finished, in one process at a time: others wait."""
     for pause in backoff():
         try:
             with workspace.locked(".report.lock"):
@@ -53,7 +53,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     written, _ = place_rows(read_rows(workspace) if workspace.results.exists() else [], sweeps)
     numbers = compute_numbers(workspace, sweeps, provenance)
     write_rows(workspace, collect(sweeps, provenance, workspace.trials, states, numbers.results))
-    rows = read_rows(workspace)  # figures show what the files say
+    rows = read_rows(workspace)  # figures show what is in the files
     checked = check_numbers(written, rows, numbers.results, numbers.windows, record.study.eval.perplexity_group)
     if checked.verdict == "bad":
         say(f"note: {checked.text}")
@@ -85,7 +85,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
             write_csv(path, kind, table_rows)
             tables.append(path)
         else:
-            path.unlink(missing_ok=True)  # of other trials, drawn before
+            path.unlink(missing_ok=True)  # figures of other trials, drawn before
     write_report(workspace, record, sweeps, rows, along, states, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 
@@ -93,9 +93,10 @@ def _draw(workspace: Workspace, record: Record) -> None:
 def draw_figures(
     workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row], numbers: Numbers | None = None
 ) -> None:
-    """A figure for each sweep, one of the scaling ones together, and of fits, where there are `numbers` for them.
+    """A figure for each sweep, one for the scaling sweeps together, and figures of fits if `numbers` are given for
+    them.
 
-    Those of axes that the study no longer has are removed.
+    Figures of axes that the study no longer has are removed.
     """
     from experiments.report.plot_fits import plot_fits, plot_isoflop
     from experiments.report.plots import plot_overview, plot_sweep
@@ -113,9 +114,9 @@ def draw_figures(
 
 
 def draw_again(out: Path) -> None:
-    """Report of a study that ran before, without touching its data or trials.
+    """Draws the report of a study that ran before, without touching its data or trials.
 
-    Without its trials, as of results that are kept for the record, only figures are drawn, from its table.
+    If its trials are missing, as in results that are kept for the record, only figures are drawn, from its table.
     """
     from experiments.analysis.rows import place_rows, read_rows
 

@@ -1,4 +1,4 @@
-"""Small drawings inside a page: clips that play, curves, histograms. Self-contained HTML, nothing is fetched."""
+"""Small drawings inside a page: clips that play, curves, histograms. Self-contained HTML; nothing is fetched."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDTH = 300
 def clip(frames: Sequence[np.ndarray], seconds: float, height: int, title: str) -> str:
     """Frames uint8 [H, W, 3] as an animated WebP of `height` pixels that takes `seconds` and starts again."""
     width = max(round(frames[0].shape[1] * height / frames[0].shape[0]), 1)
-    # Small pictures keep their pixels; large ones are averaged.
+    # Small images keep their pixels; large ones are averaged.
     way = Image.Resampling.NEAREST if frames[0].shape[0] < height else Image.Resampling.BOX
     pictures = [Image.fromarray(frame).resize((width, height), way) for frame in frames]
     buffer = io.BytesIO()

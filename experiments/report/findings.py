@@ -7,8 +7,8 @@ page, a section per axis, shown with its curves:
 
     Everything improves with width ...
 
-A section whose heading names several axes in backticks is shown with the last of them; one that names none, and what
-stands before all sections, comes at the end. No other line may begin with `## `.
+A section whose heading names several axes in backticks is shown with the last of them; sections that name none, and
+text before all sections, come at the end. No other line may begin with `## `.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def read_findings(path: Path, axes: Sequence[str]) -> Findings:
         rest.append(section("Findings", f"<div class=findings>{_as_html(before)}</div>"))
     for part in parts:
         title, _, text = part.partition("\n")
-        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")  # as where Markdown is read as a page
+        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")  # as in rendered Markdown pages
         content = f'<div class=findings id="{anchor}">{_as_html(text)}</div>'
         named = [axis for axis in axes if f"`{axis}`" in title]
         if named:
@@ -90,7 +90,8 @@ def describe_expected(sweep: Sweep, outcomes: Sequence[ExpectationOutcome]) -> s
 
 
 def _as_html(text: str) -> str:
-    """Markdown with tables. Pictures are left out: they are the study's figures, which the page shows itself."""
+    """Markdown, with tables, as HTML. Pictures are left out: they are the study's figures, which the page shows
+    itself."""
     from markdown_it import MarkdownIt
 
     reader = MarkdownIt("commonmark", {"html": False}).enable("table")

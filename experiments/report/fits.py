@@ -18,12 +18,13 @@ from experiments.terminal.words import counted
 VERDICTS = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}
 
 DIGITS = 6
-"""Significant ones in the table of fits: it is the same bytes on machines that round the rest otherwise."""
+"""Significant digits in the table of fits: few enough that the file has the same bytes on machines that round
+differently."""
 
 
 @dataclass(frozen=True)
 class FitRow:
-    """A line of fits.csv: one coefficient, or with none of them why there is no fit."""
+    """A line of fits.csv: one coefficient or, if there is no fit, the reason."""
 
     curve: str
     axes: str
@@ -97,9 +98,9 @@ def _with_interval(c: Coefficient) -> str:
 
 
 def with_constant(fitted: CurveFit) -> tuple[str, str, str]:
-    """(formula, E, interval of E) of a fit that is not refused. What lies below `zero` is the bound of the search, and
-    no measurement: the formula lacks it."""
-    e, zero = fitted.fit["E"], 10 * FLOOR * float(fitted.measured.value.min())  # as where doubts count bootstraps
+    """(formula, E, interval of E) of a fit that is not refused. An E below `zero` is the bound of the search, not a
+    measurement, and is left out of the formula."""
+    e, zero = fitted.fit["E"], 10 * FLOOR * float(fitted.measured.value.min())  # as when doubts count bootstraps
     value, low, high = ("0" if v < zero else f"{v:.3g}" for v in (e.value, e.low, e.high))
     at_bound = e.value < zero
     interval = f"[{low}, {high}]" if e.high >= zero else ""
@@ -135,7 +136,7 @@ def _isoflop(isoflop: IsoFlop | None) -> str:
 
 
 def _best_size(isoflop: IsoFlop) -> str:
-    """How it grows, by both forms, and what is doubtful of that."""
+    """How the best size grows, by both forms, and what is doubtful about it."""
 
     def power(a: Coefficient) -> str:
         return f"C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>".replace("-", "\u2212")

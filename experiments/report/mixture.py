@@ -18,21 +18,21 @@ from experiments.sweeps.sweep import POINT, Sweep
 from experiments.terminal.words import OF_MIXTURE, counted, mixture_rows
 
 NOTABLE = 0.01
-"""Change of a dataset's share of the draws along an axis from which on it is told."""
+"""A dataset's share of the draws is reported if it changes along an axis by at least this much."""
 
 
 @dataclass(frozen=True)
 class PointData:
-    """What the finished trials at one position of an axis were trained on, those of all seeds together."""
+    """What the finished trials at one position of an axis were trained on, all seeds together."""
 
     x: float
     trajectories: Counter[str]
-    shares: Mapping[str, float]  # of the draws, their mean over seeds; {} where results do not say it
+    shares: Mapping[str, float]  # shares of the draws, mean over seeds; {} if results do not say it
 
 
 def describe_mixture(trial: Trial, result: Mapping[str, Any]) -> str:
-    """A line per dataset of how much there is of it and how often it was drawn; '' for one dataset, and for results of
-    earlier versions, which do not say it."""
+    """A line per dataset on the amount of data and how often it was drawn; '' for one dataset, and for results of
+    earlier versions, which do not record it."""
     draws = trial.train.steps * trial.train.batch
     drawn = {name: Drawn(result["trajectories"][name], **one) for name, one in result.get("mixture", {}).items()}
     if len(drawn) < 2:
@@ -49,8 +49,8 @@ def describe_mixture(trial: Trial, result: Mapping[str, Any]) -> str:
 def describe_data_along(
     sweep: Sweep, provenance: Provenance, results: Mapping[str, Mapping[str, Any]], available: Mapping[str, int]
 ) -> str:
-    """Which points of an axis that caps trajectories had no more of them than the one before, and how the mixture
-    changes along it; '' for other axes."""
+    """Which points of an axis that caps trajectories had no more trajectories than the point before, and how the
+    mixture changes along the axis; '' for other axes."""
     points = _points(sweep, provenance, results, available)
     text = ""
     if same := [(a.x, b.x) for a, b in pairwise(points) if a.trajectories == b.trajectories]:

@@ -23,15 +23,16 @@ from hma_jax.evaluation.windows import FILE, WindowTable
 
 @dataclass(frozen=True)
 class Numbers:
-    results: Mapping[str, dict[str, Any]]  # of finished trials, by id
-    windows: Mapping[str, WindowTable]  # of those that kept them
+    results: Mapping[str, dict[str, Any]]  # results of finished trials, by id
+    windows: Mapping[str, WindowTable]  # windows of trials that kept them
     fits: Sequence[CurveFit]
     isoflop: IsoFlop | None
     outcomes: Sequence[Outcome]
 
 
 def read_results(workspace: Workspace, ids: Iterable[str]) -> tuple[dict[str, dict[str, Any]], dict[str, WindowTable]]:
-    """Results and windows of the finished ones of trials `ids`. Raises ConfigError for one that was changed."""
+    """Results and windows of those of the trials `ids` that are finished. Raises ConfigError for one that was
+    changed."""
     finished = [id for id in ids if (workspace.trials / id / RESULT).exists()]
     results = {id: read_result(workspace.trials / id) for id in finished}
     windows = {
@@ -41,7 +42,7 @@ def read_results(workspace: Workspace, ids: Iterable[str]) -> tuple[dict[str, di
 
 
 def result_hashes(results: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """What each result is sealed with."""
+    """The hash with which each result is sealed."""
     return {id: stable_hash(result) for id, result in results.items()}
 
 
@@ -59,7 +60,8 @@ def compute_numbers(
 
 
 def find_fewer(trials: Mapping[str, Trial], results: Mapping[str, Any], available: Mapping[str, int]) -> list[str]:
-    """Subsets of which finished trials found only a part, since the others were skipped when tokenising, in words."""
+    """In words, the subsets of which finished trials found only a part, since other episodes were skipped when
+    tokenising."""
     found = []
     for id, trial in trials.items():
         asked, used = trajectories_of(trial, available), trajectories_of(trial, available, results.get(id))
@@ -71,7 +73,8 @@ def find_fewer(trials: Mapping[str, Trial], results: Mapping[str, Any], availabl
 def find_other_x(
     sweeps: Sequence[Sweep], provenance: Provenance, results: Mapping[str, Any], available: Mapping[str, int]
 ) -> list[str]:
-    """Points of the axis `episodes` whose finished trials were trained on another number of trajectories, in words."""
+    """In words, points of the axis `episodes` whose finished trials were trained on a number of trajectories other than
+    x."""
     found = []
     for p in (p for sweep in sweeps if sweep.name == "episodes" for p in sweep.points):
         result = results.get(trial_id(p.trial, provenance), {})

@@ -1,7 +1,7 @@
 """The report: one HTML page with the curves, frames, tables and everything needed to repeat it.
 
-Self-contained: pictures are embedded, nothing is fetched. Numbers come from the rows of the
-CSV; only frames and run records are read from the trials' directories.
+Self-contained: images are embedded, nothing is fetched. Numbers come from the rows of the CSV; only frames and run
+records are read from the trials' directories.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ from hma_jax.runtime.files import write_file
 REFERENCE = "reference"
 
 ONCE = {"--replace": True, "--accept-code": False, "--retry-failed": False}
-"""Flags that hold for one command, and whether a value follows: who repeats a study does not mean them."""
+"""Flags that hold for one command, and whether a value follows: they are left out of the command that repeats a
+study."""
 
 
 def write_report(
@@ -64,7 +65,8 @@ def write_report(
     numbers: Numbers,
     checked: Check,
 ) -> None:
-    """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
+    """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is what `check_numbers`
+    returned."""
     shown, provenance = _choose_shown(sweeps, record.study), record.provenance
     first = trial_id(_defaults(shown.sweep)[0], provenance) if shown else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
@@ -112,11 +114,11 @@ class _ShownTrials:
     """The trials, one a seed, whose numbers, clips and robots the page shows: those at the default of a sweep."""
 
     sweep: Sweep
-    name: str  # what they are
+    name: str  # what the trials are
 
     @property
     def aside(self) -> str:
-        """What a heading adds where they are not what a reader takes them for."""
+        """What a heading adds if they are not the trials that a reader would expect."""
         return "" if self.name == REFERENCE else f" ({self.name})"
 
 
@@ -166,7 +168,7 @@ def _headline(
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
                  f"dB; a control: should be zero within {EACH:g} standard errors"),
         ]  # fmt: skip
-    if quality := _tokenizer_quality(workspace):  # earlier versions did not judge one that was given
+    if quality := _tokenizer_quality(workspace):  # earlier versions did not judge a tokenizer that was given
         cards.append(card("tokenizer PSNR", quality, "dB, reconstruction of held-out frames"))
     unfinished = sum(state.event != FINISHED for state in states.values())
     lacking = f"{counted(unfinished, 'trial')} {'has' if unfinished == 1 else 'have'} no result"
@@ -184,7 +186,8 @@ def _headline(
 
 
 def _name(workspace: Workspace, study: Study) -> str:
-    """The study's name: its preset's, with the directory's where studies of one preset would otherwise share a name."""
+    """The study's name: its preset's, with the directory's added if studies of one preset would otherwise share a
+    name."""
     directory = workspace.root.absolute().name
     return study.name if directory == study.name else f"{study.name} ({directory})"
 
@@ -213,7 +216,7 @@ def _curves(
     findings: Findings,
 ) -> list[str]:
     """A section for the scaling curves, which share a figure, and one for each other sweep: numbers, what `data` says
-    of those that it was trained on, preregistered expectations and the author's findings."""
+    about the data it was trained on, preregistered expectations and the author's findings."""
 
     def say(sweep: Sweep) -> str:
         said = findings.of_axes.get(sweep.name, "")
@@ -252,7 +255,8 @@ def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
 
 
 def _fits(workspace: Workspace, numbers: Numbers) -> str:
-    """Nothing where no trial has the loss that is fitted, as of policies and latents; fits.csv says so."""
+    """The section on fits; '' if no trial has the loss that is fitted, as for policies and latents, which fits.csv then
+    states."""
     if not any(fitted.fit.trials for fitted in numbers.fits) and not numbers.outcomes:
         return ""
     figures = {
@@ -330,13 +334,13 @@ def _origin(
 
 
 def _processor(machine: Mapping[str, Any]) -> str:
-    """What one trial ran on: its slot has a part of the machine's cores where several ran at a time."""
+    """What one trial ran on: if several ran at a time, its slot had a part of the machine's cores."""
     name, cores = machine.get("processor", "unknown"), machine.get("cores")
     return f"{name}, {counted(cores, 'core') if cores else '? cores'} per trial"
 
 
 def _repeatable(command: str) -> str:
-    """A command less what was meant for that one time: earlier versions recorded it as it was typed."""
+    """A command without the options meant for one run only: earlier versions recorded it as it was typed."""
     kept, words = [], iter(shlex.split(command))
     for word in words:
         flag, _, value = word.partition("=")
@@ -349,7 +353,7 @@ def _repeatable(command: str) -> str:
 
 
 def _each(values: Sequence[str]) -> str:
-    """What trials ran on: once if it is the same for all, otherwise with the number of trials of each."""
+    """What trials ran on: one value if it is the same for all, otherwise each value with its number of trials."""
     counts = Counter(values).most_common()
     if len(counts) == 1:
         return counts[0][0]

@@ -19,7 +19,8 @@ from experiments.terminal.words import number
 STILL = (
     "<p class=pause><input type=checkbox id=pause> <label for=pause>clips stand still, at their last frame</label></p>"
 )
-"""What stops all clips of a page (`moving`); without it they stand still where the system asks for less motion."""
+"""The element that stops all clips of a page (`moving`); without it they stand still if the system asks for less
+motion."""
 
 
 def section(title: str, *parts: str) -> str:
@@ -65,7 +66,7 @@ def pm(mean: float, error: float) -> str:
 
 
 def picture(path: Path, alt: str) -> str:
-    """A figure; '' without its file. `alt`: what stands in its place for who does not see it."""
+    """A figure; '' without its file. `alt`: the text for readers who do not see it."""
     if not path.exists():
         return ""
     content = path.read_bytes()
@@ -78,7 +79,7 @@ def picture(path: Path, alt: str) -> str:
 
 
 def moving(animation: bytes, alt: str, attributes: str, lossless: bool = True) -> str:
-    """An animated WebP, and its last frame for readers whom motion disturbs. `attributes`: of both elements."""
+    """An animated WebP, and its last frame for readers who prefer less motion. `attributes`: those of both elements."""
     still = io.BytesIO()
     with Image.open(io.BytesIO(animation)) as film:
         film.seek(film.n_frames - 1)

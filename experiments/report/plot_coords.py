@@ -16,8 +16,8 @@ ROWS = {"size": "size (RMS)", "change": "change since step 0 (RMS)"}
 
 
 def plot_coords(rows: Sequence[Size], path: Path) -> None:
-    """A column per activation: above its size, below its change since step 0; a line per training step, the mean over
-    seeds. What does not depend on the width is level."""
+    """A column per activation: at the top its size, at the bottom its change since step 0; a line per training step,
+    the mean over seeds. A line is level if the value does not depend on the width."""
     quantities, widths = list(dict.fromkeys(r.quantity for r in rows)), sorted({r.width for r in rows})
     last, lines = max(r.step for r in rows), defaultdict(lambda: defaultdict(list))
     for r in rows:
@@ -45,7 +45,7 @@ def plot_coords(rows: Sequence[Size], path: Path) -> None:
             drawn = np.array([line.get_ydata() for line in panel.lines])
             if (np.isfinite(drawn) & (drawn > 0)).any():
                 plain_log(panel, panel.yaxis)
-            else:  # an axis of logarithms needs a number
+            else:  # a log axis needs a number
                 panel.text(0.5, 0.5, "zero or not finite", transform=panel.transAxes, ha="center", color=MUTED)
         for panel in panels[-1]:
             panel.set_xlabel("width")

@@ -37,7 +37,7 @@ DRAWN = {
     TRAINING_LOSS: (TRAINING, "training loss, last tenth of steps"),
     **{metric: (OVERALL, LABELS[metric]) for metric in ON_LOG},
 }
-"""Metrics with their scope and label, where curves are compared by where they are lowest."""
+"""Metrics, with scope and label, for curves that are compared by the position of their minimum."""
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
 PAIRED = "; points are paired, on the same windows"
 OF_BASE = (
@@ -78,7 +78,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
 def _draw(
     panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]
 ) -> list[CurvePoint]:
-    """The points that are drawn."""
+    """Draws one panel; returns the points that are drawn."""
     drawn = []
     scope, metric_label = (DRAWN if sweep.base else CURVES)[metric]
     xs = sorted({r.x for r in rows if r.sweep == sweep.name})
@@ -86,7 +86,7 @@ def _draw(
         style = style_of(i, len(series))
         colour = style["color"]
         lost = diverged(rows, sweep.name, role, name)
-        for x in lost:  # on the upper edge: beyond any loss
+        for x in lost:  # on the upper edge: above any loss
             panel.plot(x, 0.97 - 0.05 * i, "x", color=colour, transform=panel.get_xaxis_transform())
         points = [p for p in drawn_curve(rows, sweep, metric, role, scope, name) if p.x not in lost]
         best = lowest(points, lost)

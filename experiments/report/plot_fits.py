@@ -33,7 +33,7 @@ from experiments.report.plot_style import (
 
 LINE, BAND = COLOURS["perplexity"], 0.16
 ABREAST = 3
-"""Curves beside each other: of more, a page shows nothing that can be read."""
+"""Number of curves beside each other: with more, nothing on a page would be readable."""
 DOUBTED = {False: "-", True: "--"}
 """Lines by whether something is doubtful of them."""
 ASIDE = 0.04
@@ -66,7 +66,7 @@ def plot_fits(fits: Sequence[CurveFit], outcomes: Sequence[Outcome], path: Path)
 
 def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outcome]) -> None:
     above, below = panels
-    # Of each doubt what comes before its explanation, which the table has.
+    # Of each doubt, the part before its explanation, which the table has.
     doubts = [line for d in fitted.fit.doubts for line in textwrap.wrap(d.split(":")[0], 66)]
     measured, fit = fitted.measured, fitted.fit
     x, loss = measured.x[:, 0], measured.value
@@ -98,8 +98,9 @@ def _draw_fit(panels: Sequence[Axes], fitted: CurveFit, outcomes: Sequence[Outco
 
 
 def _draw_outcome(panel: Axes, outcome: Outcome, line: np.ndarray, fitted: float | None = None) -> None:
-    """The interval stands beside what was observed, which would hide it, by a part of the axis along `line`. Where the
-    loss that is `fitted` there is given, both are in per cent of it: among other losses they are too small to judge."""
+    """The interval is drawn beside the observed value, which would hide it, shifted by a part of the axis along `line`.
+    If the `fitted` loss at that position is given, both are in per cent of it: among other losses they would be too
+    small to judge."""
     p, observed = outcome.prediction, outcome.observed
     values = np.array([p.mean, p.low, p.high, math.nan if observed is None else observed])
     mean, low, high, came = values if fitted is None else 100 * np.log(values / fitted)

@@ -38,7 +38,7 @@ DOTS: dict[bool, dict[str, Any]] = {
     True: dict(alpha=0.45, markersize=4, markeredgewidth=0),
     False: dict(markersize=4.5, markerfacecolor="white", zorder=4),
 }
-"""Style of the dots of seeds, by whether there are several: a single one lies on the mean."""
+"""Style of the seeds' dots, by whether there are several: a single one lies on the mean."""
 
 
 def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
@@ -60,7 +60,7 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
 
 
 def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> list[CurvePoint]:
-    """The points that are drawn."""
+    """Draws one panel; returns the points that are drawn."""
     points = drawn_curve(rows, sweep, metric)
     for p, bar in zip(points, bars_of(points), strict=True):
         colour = DEFAULT if p.x == sweep.reference_x else MUTED

@@ -26,7 +26,7 @@ from hma_jax.runtime.files import write_file
 
 INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
 COLOURS = {"perplexity": "#2b5c8a", "delta_psnr": "#b3541e"}
-COLOURS |= dict.fromkeys(("diffusion_loss", "action_error"), COLOURS["perplexity"])  # in its place, never beside it
+COLOURS |= dict.fromkeys(("diffusion_loss", "action_error"), COLOURS["perplexity"])  # in place of it, never beside it
 DEFAULT = "#6b3fa0"
 """Colour of the variant that the presets use, as in the paper's figure 5."""
 LABELS = {
@@ -43,13 +43,13 @@ EXP_OF = {"perplexity": HELD_OUT_LOSS}
 """{what is drawn: the metric of which it is exp of the mean}. The release's perplexity, which tables have, is a mean of
 exponentials: of a few hard robots, so that it may rank models otherwise than nats do."""
 OVER = {False: "seeds and episodes", True: "seeds, each with its own robots"}
-"""What errors of several seeds are over, by whether judged robots are drawn anew for every seed."""
+"""What the errors of several seeds are taken over, by whether judged robots are drawn anew for every seed."""
 ONE_SEED = "one seed: s.e. over episodes"
 CAPTION_LETTERS = 15.5
 """Letters of a caption that fit into an inch."""
 MARKERS = "o^DvPXs"
 SHADES = 0.55
-"""Where the colours of curves end on viridis: beyond it they are too light for white paper."""
+"""Where the colours of curves end on the viridis scale: beyond it they are too light for white paper."""
 CONTROL_LINE = dict(color=MUTED, linewidth=1.3, linestyle=(0, (4, 2)), zorder=1)
 STYLE = {
     "font.size": 10,
@@ -80,14 +80,14 @@ def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
 
 
 def choose_metrics(measured: list[str], usual: list[str]) -> list[str]:
-    """Errors of actions are shown where no frames are predicted; the `usual` ones while nothing is measured."""
+    """Action errors are shown if no frames are predicted; the `usual` metrics while nothing is measured."""
     return [m for m in measured if m != "action_error"] or measured or usual
 
 
 def drawn_curve(
     rows: Iterable[Row], sweep: Sweep, metric: str, role: str = POINT, scope: str = OVERALL, series: str = ""
 ) -> list[CurvePoint]:
-    """`curve` of a metric of LABELS, as all figures draw it: bars are `sem`."""
+    """`curve` of a metric in LABELS, as all figures draw it: bars are `sem`."""
     points = curve(rows, sweep.name, EXP_OF.get(metric, metric), role, scope, series, sweep.robots_vary)
     return [_exp(p) for p in points] if metric in EXP_OF else points
 
@@ -102,8 +102,8 @@ def _exp(p: CurvePoint) -> CurvePoint:
 def show_means(
     panel: Axes, points: Sequence[CurvePoint], xs: Sequence[float], several: str, one: str, **style: Any
 ) -> None:
-    """Means at `xs` with their standard errors, joined by a line; hollow where there is one seed, since what its error
-    lacks would make it the surest of all. `several` and `one` are what the legend calls them."""
+    """Means at `xs` with their standard errors, joined by a line; hollow for a single seed, whose error lacks the
+    scatter of seeds and would look smallest. `several` and `one` are the legend's names for the two kinds."""
     line = {name: style[name] for name in ("color", "zorder")} | {"linewidth": style.pop("linewidth")}
     panel.plot(xs, [p.mean for p in points], **line)
     for label, face, alone in ((several, style["color"], False), (one, "white", True)):
@@ -126,19 +126,20 @@ def say_bars(points: Collection[CurvePoint], robots_vary: bool, what: str = "hol
 
 
 def in_unit(words: str, points: Iterable[CurvePoint]) -> str:
-    """`words` on errors over episodes, as the errors of `points` are."""
+    """`words` about errors over episodes; 'windows' replaces 'episodes' unless the errors of `points` are clustered."""
     return words if all(p.clustered for p in points) else words.replace("episodes", "windows")
 
 
 def show_caption(figure: plt.Figure, words: str) -> None:
-    """Below all panels, each of its lines in as many as it needs: a longer one would be cut off at both edges."""
+    """Puts a caption below all panels, with its lines broken as needed: a longer line would be cut off at both
+    edges."""
     room = int(CAPTION_LETTERS * figure.get_figwidth())
     lines = [part for line in words.split("\n") for part in textwrap.wrap(line, room)]
     figure.supxlabel("\n".join(lines), fontsize=8.5, color=MUTED)
 
 
 def bars_of(points: Iterable[CurvePoint]) -> list[float]:
-    """Standard errors, none where they are unknown."""
+    """Standard errors, 0 if they are unknown."""
     return [p.sem if p.sem > 0 else 0.0 for p in points]
 
 
@@ -148,7 +149,7 @@ def style_of(i: int, count: int) -> dict[str, Any]:
 
 
 def dodge(xs: Sequence[float], i: int, count: int, ends: Sequence[float]) -> list[float]:
-    """Moved a little aside, for one of `count` curves on a log axis between `ends`, so that bars do not hide each
+    """`xs` moved a little aside, for one of `count` curves on a log axis between `ends`, so that bars do not hide each
     other."""
     if min(ends) <= 0:
         return list(xs)
@@ -164,11 +165,11 @@ def save(figure: plt.Figure, path: Path) -> None:
 
 
 class LogTicks(Locator):
-    """Three to nine ticks: at the fewest round numbers of each decade, or evenly spaced ones, that have one near each
-    end of the axis; on a long one at every second decade, or third, ..."""
+    """Three to nine ticks: at the fewest round numbers of each decade, or evenly spaced numbers, that give a tick near
+    each end of the axis; on a long axis at every second or third decade, and so on."""
 
     DECADES = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 5), (1, 1.5, 2, 3, 4, 5, 7))
-    NEAR = 0.2  # of the length of the axis
+    NEAR = 0.2  # as a share of the axis's length
 
     def __call__(self):
         return self.tick_values(*self.axis.get_view_interval())
@@ -185,7 +186,7 @@ class LogTicks(Locator):
         each = [ticks for ticks in each if 3 <= len(ticks) <= 9]
 
         def bare(ticks: Sequence[float]) -> float:
-            """The longer part beyond the outermost ticks, of the length of the axis."""
+            """The longer part beyond the outermost ticks, as a share of the axis's length."""
             return math.log(max(ticks[0] / low, high / ticks[-1])) / math.log(high / low)
 
         return next((ticks for ticks in each if bare(ticks) <= self.NEAR), None) or min(each, key=bare)
@@ -198,7 +199,7 @@ def plain_number(value: float) -> str:
 def count(n: float) -> str:
     """1234567 -> '1.2M'."""
     for unit, size in (("E", 1e18), ("P", 1e15), ("T", 1e12), ("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if n >= 0.9995 * size and n >= 1000:  # what rounds to a thousand of a unit is one of the next
+        if n >= 0.9995 * size and n >= 1000:  # a value that rounds to a thousand of a unit is one of the next unit
             return f"{n / size:.3g}{unit}" if n / size >= 100 or n % size == 0 else f"{n / size:.1f}{unit}"
     return f"{n:g}"
 
@@ -212,8 +213,8 @@ def plain_log(panel: Axes, axis: Axis, label: Callable[[float], str] = plain_num
 
 
 def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room: float | None = None) -> None:
-    """Ticks are the points themselves, and `room` the factor that is left beyond the ends, where it matters. A log
-    axis, but where one of them has no logarithm: it would be left out."""
+    """Puts the ticks at the points themselves; `room`: the factor that is left beyond the ends, if it matters. The axis
+    is logarithmic unless a point has no logarithm: that point would be left out."""
     if min(xs) > 0:
         panel.set_xscale("log")
         if room:
@@ -223,9 +224,8 @@ def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room:
 
 
 def show_control(panel: Axes, points: list[CurvePoint], series: str = "") -> None:
-    """The trials on shuffled actions, where on the axis they stand, with their standard errors; `series`: the curve
-    that they stand beside. One seed of them, as there mostly is, stands beside means over several, so the legend says
-    so."""
+    """Draws the trials on shuffled actions at their positions on the axis, with standard errors; `series`: the curve
+    beside which they are drawn. They mostly have one seed beside means over several, so the legend says so."""
     if points:
         words = "shuffled actions" + ", one seed" * all(len(p.seeds) == 1 for p in points)
         panel.errorbar(
@@ -241,8 +241,8 @@ def show_tally(panel: Axes, rows: Iterable[Row], sweep: str) -> None:
 
 
 def show_legend(figure: plt.Figure, panels: Iterable[Axes]) -> None:
-    """What the lines of `panels` are, above all of them: within one, words would lie on what they are about. The first
-    may be empty, or lack what others have, while trials run."""
+    """A legend of the lines of `panels`, above all of them: inside a panel it would cover the curves. While trials run,
+    the first panel may be empty, or lack lines that others have."""
     shown: dict[str, Artist] = {}
     for panel in panels:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -254,7 +254,8 @@ def show_legend(figure: plt.Figure, panels: Iterable[Axes]) -> None:
 
 
 def name_axis(panel: Axes, name: str) -> None:
-    """Below the panel, in as many lines as it needs: a longer one would be cut off at the figure's edge."""
+    """Puts the axis's name below the panel, broken into as many lines as needed: a longer line would be cut off at the
+    figure's edge."""
     panel.set_xlabel(textwrap.fill(name, 44))
 
 

@@ -1,4 +1,4 @@
-"""Figures of sweeps as PNG: numbers from rows of the tidy CSV and nothing else.
+"""Figures of sweeps as PNG, with numbers only from rows of the tidy CSV.
 
 Curves over one number are drawn here, axes of names in `plot_names`, families of curves in
 `plot_families`.
@@ -63,7 +63,7 @@ def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
 def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> None:
     """All scaling curves in one figure: a column per sweep, laid out as figure 6 of the paper.
 
-    Without any, there is no file.
+    Without any scaling curve, no file is written.
     """
     path.unlink(missing_ok=True)
     if not sweeps:

@@ -1,4 +1,4 @@
-"""One configuration robot by robot, the most controllable first."""
+"""The numbers of one configuration robot by robot, the most controllable first."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class Robot:
 
     name: str
     errors: float  # standard errors of ORDER from zero; nan if it was not measured
-    ahead: float  # dB of PSNR ahead of copying the last given frame
+    ahead: float  # PSNR in dB above copying the last given frame
     ahead_sem: float
-    follows: Mapping[str, Controllability]  # by metric; {} without per-window numbers
+    follows: Mapping[str, Controllability]  # values by metric; {} without per-window numbers
 
 
 def robots_of(
     rows: Sequence[Row], sweep: Sweep, provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[Robot]:
-    """The robots in the scope of a sweep, measured in the trials at its default, the most controllable first. Where
-    each seed judges robots of its own, only seeds that judge all of the scope are used."""
+    """The robots in the scope of a sweep, measured in the trials at its default, the most controllable first. If each
+    seed judges robots of its own, only seeds that judge all of the scope are used."""
     judging = _judging(sweep)
     ids = {seed: trial_id(trial, provenance) for seed, trial in judging.items()}
     tables = {seed: windows[id] for seed, id in ids.items() if id in windows}
@@ -63,7 +63,7 @@ def robots_of(
 
 
 def _judging(sweep: Sweep) -> dict[int, Trial]:
-    """{seed: its trial at the default}, of the seeds that judge the robots of the sweep's scope and no others."""
+    """{seed: its trial at the default}, for the seeds that judge exactly the robots of the sweep's scope."""
     scope = set(sweep.scope)
     return {
         p.trial.train.seed: p.trial
@@ -73,20 +73,21 @@ def _judging(sweep: Sweep) -> dict[int, Trial]:
 
 
 def _rows_of(rows: Sequence[Row], sweep: Sweep) -> list[Row]:
-    """Rows of one sweep, of the seeds whose robots are shown: these judge one set of windows."""
+    """Rows of one sweep, for the seeds whose robots are shown: these seeds judge one set of windows."""
     seeds = _judging(sweep)
     return [r for r in of_sweep(rows, sweep.name) if r.seed in seeds]
 
 
 def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
-    """Standard errors from zero of the first of ORDER, for trials that kept no numbers of their windows."""
+    """Distance from zero, in standard errors, of the first metric in ORDER, for trials that kept no numbers of their
+    windows."""
     points = (_at_reference(rows, sweep, metric, name) for metric in ORDER)
     return next((p.mean / p.sem for p in points if p and p.sem > 0), math.nan)
 
 
 def _ahead(rows: Sequence[Row], sweep: Sweep, name: str, tables: Sequence[WindowTable]) -> tuple[float, float]:
-    """dB ahead of copying, window by window, seeds averaged, clustered by episode; from means where there are no
-    windows, and then without an error."""
+    """dB above copying, window by window, averaged over seeds, clustered by episode; without windows from means, and
+    then without an error."""
     own = [t.of(name) for t in tables]
     own = [t for t in own if len(t) and {"psnr", "psnr_copy"} <= t.metrics.keys()]
     if own:
@@ -103,7 +104,7 @@ def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) ->
 
 
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:
-    """A line per robot, and the mean; data.json says how much there was of each."""
+    """A line per robot, and the mean; data.json says how much data each had."""
     data, rows = read_data(data_summary), _rows_of(rows, sweep)
     measured = {r.metric for r in rows}
     metrics = [m for m in COLUMNS if m in measured]
@@ -139,7 +140,8 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
 
 
 def are_sorted(robots: Sequence[Robot]) -> bool:
-    """Whether there is an order: what predicts no frames has none, since nothing says how well actions are followed."""
+    """Whether the robots have an order: models that predict no frames give none, since nothing says how well actions
+    are followed."""
     return not all(math.isnan(robot.errors) for robot in robots)
 
 

@@ -59,7 +59,7 @@ def describe(sweep: Sweep, rows: Sequence[Row], along: AxisStatistics = AxisStat
 
 
 def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
-    """A line per point of an axis of several numbers of steps, at the number that suits it."""
+    """A line per point of an axis with several numbers of steps, at the point's best number of steps."""
     points: dict[float, dict[str, BestSteps]] = {}
     for row in rows:
         if row.sweep == sweep.name:
@@ -87,7 +87,7 @@ def _at_best(sweep: Sweep, rows: Sequence[BestSteps]) -> str:
 
 
 def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
-    """A line per step from one cap to the next, curve and group of robots."""
+    """A line per step from one cap to the next, per curve and per group of robots."""
     steps: dict[tuple[str, float, float, str], dict[str, Growth]] = {}
     for row in rows:
         if row.sweep == sweep.name:
@@ -114,14 +114,14 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
 
 
 def _columns(sweep: Sweep, rows: Sequence[Row], role: str = POINT) -> dict[str, dict[float, CurvePoint]]:
-    """{metric: {x: point}} of the metrics that there are, as `choose_metrics` says."""
+    """{metric: {x: point}} of the metrics that exist, as `choose_metrics` chooses."""
     measured = {r.metric for r in rows if r.sweep == sweep.name}
     metrics = choose_metrics([m for m in COLUMNS if m in measured], [HELD_OUT_LOSS, *USUAL])
     return {m: {p.x: p for p in curve(rows, sweep.name, m, role, robots_vary=sweep.robots_vary)} for m in metrics}
 
 
 def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Change]) -> str:
-    """The numbers of one curve of several, as of a sweep that has it alone."""
+    """The numbers of one curve of several, as if the sweep had only this curve."""
     own = [r for r in rows if r.sweep == sweep.name and r.series == name and not r.of_robot]
     own = [dataclasses.replace(r, series="") for r in own]
     return f"<h4>{html.escape(name)}</h4>{_curve(sweep, own, changes, name)}" if own else ""
@@ -170,7 +170,7 @@ def _lines(sweep: Sweep, rows: Sequence[Row], role: str = POINT, remark: str = "
 
 
 def _parameters(point: CurvePoint) -> str:
-    """The number of parameters, or the fewest to the most: in designs over robots each seed has robots of its own."""
+    """The number of parameters, or a range from fewest to most: in designs over robots each seed has its own robots."""
     return " to ".join(f"{n:,}" for n in dict.fromkeys((point.parameters[0], point.parameters[-1])))
 
 
@@ -191,7 +191,7 @@ def _change(changes: Sequence[Change], robots_vary: bool) -> str:
 
 
 def _with_interval(estimate: BestSteps | Change | Growth, sign: str = "", words: str = "") -> str:
-    """'0.31 (`words`0.22 to 0.4)', the mean alone where its error is unknown; `sign`: "+" for one before every
+    """'0.31 (`words`0.22 to 0.4)', or the mean alone if its error is unknown; `sign`: "+" to put a sign before every
     value."""
     low, high = (f"{end:{sign}.3g}" for end in (estimate.low, estimate.high))
     interval = f" ({words}{low} to {high})" if math.isfinite(estimate.low) else ""
@@ -199,7 +199,8 @@ def _with_interval(estimate: BestSteps | Change | Growth, sign: str = "", words:
 
 
 def _names(sweep: Sweep, rows: Sequence[Row], differences: Sequence[Change]) -> str:
-    """A line per variant with its difference to the default: not of the perplexity, which windows have none of."""
+    """A line per variant with its difference from the default; none for the perplexity, which single windows do not
+    have."""
     columns = _columns(sweep, rows)
     apart = {(c.metric, c.last): c for c in differences}
     controls = {m: list(column.values()) for m, column in _columns(sweep, rows, CONTROL).items()}
@@ -246,7 +247,7 @@ def _bold(text: str, wanted: bool) -> str:
 
 
 def _difference(point: CurvePoint | None, default: CurvePoint | None, paired: Change | None) -> str:
-    """Without an error where trials kept no numbers of their windows."""
+    """The difference, without an error if trials kept no numbers of their windows."""
     if point is None or default is None or point is default:
         return ""
     mean, error = (paired.mean, paired.sem) if paired else (difference(point, default)[0], math.nan)
@@ -298,7 +299,7 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
         own = [o for o in optima if o.role == role and o.metric == "cross_entropy" and not math.isnan(o.moved)]
         if own:
             far = max(own, key=lambda o: abs(o.moved))
-            # Whichever reaches an end: what is best beyond it may have moved further than `far`.
+            # Any that reaches an end: the true best beyond it may have moved further than `far`.
             reaches = ", some at an end of the grid or not told from it, so perhaps further"
             open_ended = reaches if any(o.edge for o in own) else ""
             alone = [math.isnan(o.seed_sem) for o in own]

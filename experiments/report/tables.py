@@ -24,8 +24,8 @@ def write_tables(
     states: Mapping[str, State],
     results: Mapping[str, dict[str, Any]],
 ) -> list[Path]:
-    """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
-    and of their controls."""
+    """Writes trials.parquet and, if reference trials kept the numbers of their windows, controllability.csv on them and
+    their controls."""
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
 
@@ -47,7 +47,7 @@ def write_tables(
             controllability(dict(sorted(seeds.items())), role, rate=record.study.rate) if seeds else []
         )
     if not controllability_rows:
-        workspace.controllability.unlink(missing_ok=True)  # of trials that are no longer the reference
+        workspace.controllability.unlink(missing_ok=True)  # from trials that are no longer the reference
         return [workspace.trial_table]
     write_csv(workspace.controllability, Controllability, controllability_rows)
     return [workspace.trial_table, workspace.controllability]

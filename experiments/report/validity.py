@@ -1,6 +1,6 @@
-"""The checks by which a reader can tell whether a study's numbers may be believed, at the top of its page.
+"""The checks, at the top of a study's page, by which a reader can tell whether its numbers can be trusted.
 
-Each is a sentence with a verdict. What is not decided says why and counts as open, never as passed.
+Each is a sentence with a verdict. A check that cannot be decided says why and counts as open, never as passed.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ SEEDS = 3
 """Per point, at least: below, an error over seeds is a guess."""
 
 EACH, MEAN = 3.0, 2.0
-"""Standard errors that each control, and their mean, may be from zero."""
+"""Number of standard errors that each control, and their mean, may be from zero."""
 
 CONTROLLED = ("delta_psnr", "action_nats")
 """What has to vanish for a model trained on shuffled actions."""
 
 EXACT = 1e-6
-"""Relative difference that recomputing a mean or its error may make: windows are kept in float32."""
+"""Relative difference that recomputing a mean or its error may give: windows are kept in float32."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def check_numbers(
     windows: Mapping[str, WindowTable],
     group: int,
 ) -> Check:
-    """Whether the table as it was found (`written`) says of finished trials what their results do (`rows`), and these
+    """Whether the table as it was found (`written`) agrees with the results of finished trials (`rows`), and these with
     what follows from their windows. `group` is the evaluation's perplexity_group."""
     name = "Every number follows from those of single windows."
     known, drawn = {_key(r): r for r in rows}, {(r.sweep, r.trial) for r in rows}
@@ -132,8 +132,8 @@ def check_numbers(
 
 
 def _without_numbers(windows: Mapping[str, WindowTable]) -> dict[tuple[str, str], int]:
-    """{(trial, metric): windows} of which the trial has no number though every sound model has one; trials of the same
-    windows are compared."""
+    """{(trial, metric): windows} for which the trial has no number although every sound model has one; trials with the
+    same windows are compared."""
     same: dict[tuple[str, ...], dict[str, np.ndarray]] = defaultdict(dict)
     for id, table in windows.items():
         judged = stable_hash([column.tolist() for column in (table.dataset, table.episode, table.start)])
@@ -202,7 +202,7 @@ def _seeds(sweeps: Sequence[Sweep], rows: Sequence[Row]) -> Check:
 
 
 def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
-    """At its first step a model has learnt nothing: log V per token, to the rounding of its own numbers."""
+    """Before its first step a model has learnt nothing: its loss must be log V per token, up to rounding."""
     if vocabulary is None:
         return []
     name, expected = "An untrained model is at chance.", math.log(vocabulary)
@@ -219,12 +219,12 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
     label = METRICS[metric].label
     name = f"Trained without true actions, {label} is zero."
     controls: dict[str, Row] = {}
-    for r in rows:  # a trial that stands on several axes is tested over the most windows
+    for r in rows:  # a trial that is on several axes is tested over the most windows
         if (r.role, r.scope, r.metric) == (CONTROL, OVERALL, metric):
             controls[r.trial] = max(controls.get(r.trial, r), r, key=lambda row: row.n)
     if not controls:
         return Check(name, "open", "No control, trained on shuffled actions, is finished.")
-    # What rounding leaves is no effect, though its standard error is as small.
+    # A rounding residue is no effect, even if its standard error is as small.
     controls = {id: replace(r, mean=0.0, sem=0.0) if abs(r.mean) < ROUNDING else r for id, r in controls.items()}
     unknown = [r.trial for r in controls.values() if math.isfinite(r.mean) and math.isnan(r.sem)]
     known = [r for id, r in controls.items() if id not in unknown]
@@ -261,9 +261,9 @@ def _copying(robots: Sequence[Robot], whose: str) -> Check:
 def _optima(optima: Sequence[Optimum], rows: Sequence[Row]) -> list[Check]:
     """Checks of the optimal learning rate of muP's curves, on held-out data where there is a likelihood.
 
-    Where the standard parametrisation is best is a finding, not a condition. An optimum is inside the grid where on
-    either side a rate is significantly worse. It is open where the seeds do not tell it from an end of the grid: more
-    seeds may.
+    The best rate of the standard parametrisation is a finding, not a condition. An optimum is inside the grid if on
+    both sides a rate is significantly worse. It is open if the seeds cannot distinguish it from an end of the grid:
+    more seeds may.
     """
     judged_by = HELD_OUT_LOSS if any(o.metric == HELD_OUT_LOSS for o in optima) else TRAINING_LOSS
     mup = [o for o in optima if (o.role, o.metric) == (POINT, judged_by)]
@@ -301,8 +301,7 @@ def _prediction(outcome: Outcome) -> Check:
 
 
 def check_expected(outcomes: Sequence[ExpectationOutcome]) -> list[Check]:
-    """All of the author's intervals together: they have no stated level, so one that misses its outcome is one too
-    many."""
+    """Checks all of the author's intervals together: they have no stated level, so a single miss is one too many."""
     if not outcomes:
         return []
     inside, known = count_inside(outcomes)

@@ -51,7 +51,7 @@ def clip(spec: EmbodimentSpec, seconds: float = SECONDS) -> np.ndarray:
 
 
 def animation(frames: np.ndarray, hz: int) -> str:
-    """An <img> that plays the frames at their rate, for ever."""
+    """An <img> that plays the frames at their rate, in an endless loop."""
     images = [Image.fromarray(f) for f in frames]
     file = io.BytesIO()
     images[0].save(file, "webp", save_all=True, append_images=images[1:], duration=round(1000 / hz), loop=0, quality=80)
@@ -59,7 +59,7 @@ def animation(frames: np.ndarray, hz: int) -> str:
 
 
 def caption(spec: EmbodimentSpec) -> str:
-    """What a reader wants to know of a robot, in a line."""
+    """What a reader wants to know about a robot, in one line."""
     actions = "video alone" if spec.video_only else f"{spec.action_dim} values, {spec.convention}"
     delay = f", delayed {spec.delay}" if spec.delay else ""
     return f"{actions}{delay}; {spec.hz} Hz; {spec.episodes} episodes"

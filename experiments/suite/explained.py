@@ -1,4 +1,4 @@
-"""Question: how much of what changes in the pictures do a robot's actions explain?
+"""Question: how much of the change in the images do a robot's actions explain?
 Command: python -m experiments.suite.explained [--out experiments/results/suite/explained.csv]
 Cost: about two minutes of one core.
 
@@ -7,10 +7,10 @@ one step at the model's rate (2 Hz):
 
     share = E |x' - mean of x' over actions|^2 / E |x' - x|^2
 
-with frames at 32 pixels. What is not explained is decided before: momentum, what an old
-command still does, and where the robot was, since a thing that moves also uncovers its old
-place. A disc that jumps anywhere has a share near one half for that reason; small motions in random
-directions come near one. What a trained model's controllability is judged against.
+with frames at 32 pixels. What is not explained is determined earlier: by momentum, by commands that still have an
+effect, and by where the robot was, since a thing that moves also uncovers its old place. For this last reason a disc
+that jumps anywhere has a share near one half; small motions in random directions come near one. A trained model's
+controllability is judged against this share.
 """
 
 from __future__ import annotations

@@ -6,10 +6,9 @@ than the same siblings with their actions shuffled.
 
 A ridge regression on fixed features, not a neural network, predicts where a robot's first tool will
 be half a second later, in pixels. It sees the configuration (sines and cosines of the joints), the
-tool's place and last displacement, the actions until then, normalised by the robot's own
-statistics as the models do it, and products of configuration and actions. It is never given a
-frame of the robot that it is judged on. Strangers are robots of the other family with equally
-many action values, of which the one left out takes turns.
+tool's place and last displacement, the actions until then, normalised by the robot's own statistics as in the models,
+and products of configuration and actions. It is never given a frame of the robot on which it is judged. Strangers are
+robots of the other family with the same number of action values; each of them is left out in turn.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class Result:
     siblings: float
     strangers: float
     shuffled: float
-    over_strangers: tuple[float, float, float]  # gain, low, high
+    over_strangers: tuple[float, float, float]  # (gain, low, high)
     over_shuffled: tuple[float, float, float]
 
 
@@ -127,7 +126,7 @@ def judge(family: str, samples: dict[str, Samples]) -> Result:
 
 def gain(control: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """(mean of control - own, low, high) of errors per episode of each robot; the 95 % interval is Student's t of the
-    robots' means: how far episodes scatter is in them. nan around the gain of a single robot."""
+    robots' means, which include the scatter of episodes. The bounds are nan for a single robot."""
     i = interval_of(mean_and_sem([(c - o).mean() for c, o in zip(control, own, strict=True)]))
     return i.mean, i.low, i.high
 
@@ -155,7 +154,7 @@ def main() -> None:
 
 
 def _padded(spec: EmbodimentSpec) -> int:
-    """Entries of the longest configuration among those it is compared with."""
+    """Number of entries of the longest configuration among the robots with which it is compared."""
     return max(s.body.size for s in (spec, *siblings(spec), *strangers(spec)))
 
 

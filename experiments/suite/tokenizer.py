@@ -1,9 +1,9 @@
-"""Question: how well does a tokenizer give back the suite, and what moves in it?
+"""Question: how well does a tokenizer reconstruct the suite, and what moves in it?
 Command: python -m experiments.suite.tokenizer RUN [--out experiments/results/suite/tokenizer.csv]
 Cost: about half a minute of one core, after `hma tokenizer train --preset cpu --out RUN`.
 
-Pairs of frames half a second apart, from the validation split of every robot in RUN/suite: PSNR of
-the later one, and of those of its pixels that changed by more than a little.
+Pairs of frames half a second apart, from the validation split of every robot in RUN/suite: PSNR of the later frame, and
+of those of its pixels that changed noticeably.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PAIRS = 48
 """Per robot, spread evenly over its validation episodes."""
 
 CHANGED = 12
-"""Grey levels in any channel from which on a pixel counts as changed."""
+"""A pixel counts as changed from this difference on, in grey levels of any channel."""
 
 
 def frame_pairs(spec: DatasetSpec, directory: Path, size: int) -> np.ndarray:

@@ -37,11 +37,11 @@ def exit_code_of(
     keeps: str = "",
     skipping: str = "",
 ) -> int:
-    """Does `work` and returns the exit code; what a user can mend is one message on stderr, with `debug` or HMA_DEBUG=1
-    a traceback, as of a bug. `own_process`: the process has nothing else to do; `arguments`: the program's, of which
-    none may be a path that is not UTF-8, by default those of the process; `resumes`: after a stop the same command goes
-    on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves out records
-    that cannot be read."""
+    """Does `work` and returns the exit code. Errors that a user can fix become one message on stderr; with `debug` or
+    HMA_DEBUG=1 they give a traceback, as bugs do. `own_process`: the process has nothing else to do. `arguments`: the
+    program's, by default those of the process; none may be a path that is not UTF-8. `resumes`: after a stop the same
+    command continues where it was; otherwise it begins anew and keeps what `keeps` names. `skipping`: the option that
+    leaves out records that cannot be read."""
     open_closed_output()
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
@@ -52,10 +52,10 @@ def exit_code_of(
                 _require_utf8(sys.argv[1:] if arguments is None else arguments)
                 with raising_as_called():
                     work()
-            except SystemExit:  # of --help
+            except SystemExit:  # as by --help
                 _flush()
                 raise
-            _flush()  # not later, where nothing catches what is wrong with it
+            _flush()  # not later, where nothing catches its errors
             _end_together()
         return Exit.DONE
     except BrokenPipeError as error:
@@ -78,7 +78,8 @@ def exit_code_of(
 
 
 def _require_utf8(arguments: Sequence[str]) -> None:
-    """Raises ConfigError for a path that is not UTF-8, also of the working directory: checkpoints cannot lie there."""
+    """Raises ConfigError for a path that is not UTF-8, including the working directory: checkpoints cannot be kept
+    there."""
     here = ""
     with suppress(OSError):  # the working directory was removed
         here = os.getcwd()
@@ -94,7 +95,7 @@ def _require_utf8(arguments: Sequence[str]) -> None:
 
 
 def _failed(error: Exception, debug: bool, skipping: str) -> int:
-    """Says what is wrong, and returns the exit code. Raises `error` again if it is a bug, or with `debug`."""
+    """Prints what is wrong, and returns the exit code. Raises `error` again if it is a bug, or with `debug`."""
     code = _exit_code(error)
     if debug or code is None:
         _end_together(error, code or Exit.FAILED, show=True)
@@ -110,12 +111,12 @@ def _flush() -> None:
 
 
 def _discard_output() -> None:
-    """What is left in its buffers goes nowhere; Python would try to write it when it ends."""
+    """Discards what is left in the output's buffers; Python would try to write it when it ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _unread() -> bool:
-    """Whether standard output is a pipe or socket whose reader is gone; other pipes can break, too."""
+    """Whether standard output is a pipe or socket whose reader is gone; other pipes can break too."""
     try:
         number = sys.stdout.fileno()
     except (OSError, ValueError):  # a test's
@@ -126,18 +127,18 @@ def _unread() -> bool:
 
 
 def _end_together(error: BaseException | None = None, code: int = Exit.DONE, show: bool = False) -> None:
-    """With other processes, where there are any: none is left waiting for one that ends."""
+    """Ends together with the other processes, if there are any: none is left waiting for one that ends."""
     if "hma_jax.runtime.processes" not in sys.modules:  # none was started
         return
     from hma_jax.runtime.processes import end
     from hma_jax.training.loop import Interrupted
 
-    # A stop that was asked for is one of all processes, after the same step.
+    # A requested stop stops all processes, after the same step.
     end(None if isinstance(error, Interrupted) else error, code, show)
 
 
 def _exit_code(error: Exception) -> Exit | None:
-    """None for what is not the user's business: a bug, shown with its traceback."""
+    """The exit code of an error that a user can fix; None for a bug, which is shown with its traceback."""
     if isinstance(error, ConfigError):
         return Exit.REFUSED
     if isinstance(error, TrialsFailed):

@@ -44,7 +44,7 @@ FOLDED = 16
 """The least width of a table's column whose words may be broken."""
 
 SAY_EVERY = 30.0
-"""Seconds between lines about work that goes on, where there is no terminal for a bar."""
+"""Seconds between lines about ongoing work if there is no terminal for a bar."""
 
 Update = Callable[[int, int, str], None]
 """Called as update(done, total, note)."""
@@ -64,7 +64,7 @@ def short(path: Path) -> str:
 
 
 def wrote(*paths: Path, then: str = "", about: str = "") -> None:
-    """Says what was written, the whole command that comes `then`, and a remark `about` it all."""
+    """Prints what was written, the whole command that comes `then`, and a remark `about` it all."""
     for path in paths:
         console.print("wrote", Text(short(path), "bold"), soft_wrap=True)
     if then:
@@ -88,7 +88,7 @@ def _bars() -> Progress:
 
 @contextmanager
 def step(title: str) -> Iterator[Update]:
-    """A bar while the block runs, in a log a line now and then; one with the duration after it."""
+    """Shows a bar while the block runs (in a log, a line now and then), and afterwards a line with the duration."""
     began = time.monotonic()
     if not console.is_terminal:
         console.print(f"{title} ...")
@@ -130,8 +130,8 @@ class Eta:
 
 
 class TidyTable(Table):
-    """A plain table that cuts no cell short: columns that do not fit beside the others stand in further tables below,
-    each after the first column again."""
+    """A plain table that cuts no cell short: columns that do not fit beside the others are put into further tables
+    below, each of which repeats the first column."""
 
     def __init__(self, title: str | None = None):
         super().__init__(
@@ -140,7 +140,7 @@ class TidyTable(Table):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         sizes = [_sizes(column, console, options) for column in self.columns]
-        room = options.max_width - 1  # of each column 2 beside its words: padding, and a line or an edge
+        room = options.max_width - 1  # 2 for each column besides its words: padding, and a line or an edge
         parts = [[0]]
         for i in range(1, len(sizes)):
             if len(parts[-1]) > 1 and sum(sizes[k].minimum + 2 for k in (*parts[-1], i)) > room:
@@ -170,7 +170,7 @@ class TidyTable(Table):
 
 
 def _narrowed(sizes: Sequence[Measurement], room: int) -> list[int]:
-    """Widths that come to `room`: the widest columns become narrower first."""
+    """Widths that add up to `room`: the widest columns become narrower first."""
     widths = [min(size.maximum, room) for size in sizes]
     while sum(widths) > room:
         wider = [i for i, size in enumerate(sizes) if widths[i] > size.minimum]
@@ -179,13 +179,13 @@ def _narrowed(sizes: Sequence[Measurement], room: int) -> list[int]:
 
 
 def _sizes(column: Column, console: Console, options: ConsoleOptions) -> Measurement:
-    """The width below which a column's words are broken, or cut, and the one that it takes if it can."""
+    """The width below which a column's words are broken or cut, and the width that it takes if it can."""
     whole = options.update(width=sys.maxsize)
     cells = [Measurement.get(console, whole, cell) for cell in (column.header, *column.cells)]
     most = max(column.min_width or 1, *(cell.maximum for cell in cells))
     if column.no_wrap:
         return Measurement(most, most)
-    # One that folds may break words.
+    # A column that folds may break words.
     least = FOLDED if column.overflow == "fold" else max(cell.minimum for cell in cells)
     return Measurement(min(max(column.min_width or 1, least), most), most)
 
@@ -199,7 +199,7 @@ def tidy_table(title: str, *columns: str) -> TidyTable:
 
 
 class SweepMonitor(Monitor):
-    """A bar per running trial under one for all of them; a line for each that ends."""
+    """A bar for each running trial below one for all trials; a line for each trial that ends."""
 
     def __init__(self, total: int, done: int = 0):
         self.total, self.ended_count = total, done

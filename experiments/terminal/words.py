@@ -14,7 +14,7 @@ OF_MIXTURE = ("dataset", "trajectories", "windows", "share of draws", "passes")
 
 
 def few(names: Sequence[str]) -> str:
-    """The first names of a list that may be long."""
+    """The first names of a list that may be long, as words."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
@@ -34,7 +34,7 @@ def times(passes: float) -> str:
 
 
 def mixture_rows(drawn: Mapping[str, Drawn], draws: int) -> list[list[str]]:
-    """How much there is of each dataset, and how often a training run of `draws` windows sees it."""
+    """The amount of data in each dataset, and how often a training run of `draws` windows sees it."""
     return [
         [name, f"{one.trajectories:,}", f"{one.windows:,}", f"{one.share:.1%}", times(one.passes(draws))]
         for name, one in drawn.items()
@@ -50,14 +50,14 @@ def duration(seconds: float) -> str:
 
 
 def number(value: float, error: float, sign: str = "") -> str:
-    """`value` to two digits of its standard error, and four after the point at most; what rounds to zero has no minus.
-    `sign`: "+" for one before every value."""
+    """`value` to two digits of its standard error, and at most four after the point; a value that rounds to zero has no
+    minus. `sign`: "+" to put a sign before every value."""
     digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
     return f"{value:{sign}z.{digits}f}"
 
 
 def plus_minus(mean: float, error: float, sign: str = "") -> str:
-    """A mean with its standard error, or alone where none is known."""
+    """A mean with its standard error, or alone if the error is unknown."""
     if 0 < error < math.inf:
         return f"{number(mean, error, sign)} ± {number(error, error)}"
     return f"{mean:{sign}.4g}" + (" ± 0" if error == 0 else "")

@@ -26,12 +26,12 @@ OF_A_TRIAL = "train.seed"
 
 
 def override(study: Study, settings: Sequence[str], model: ModelConfig | None = None) -> Study:
-    """`study`, of another `model` where one is given, with fields changed by 'path=value' strings, such as
+    """`study` (with `model` in place of its own, if given), with fields changed by 'path=value' strings such as
     'model.frames=4'.
 
     Values are JSON; lists may be written '4,8,16'. Raises ConfigError for an unknown path
-    (with the closest known one) or a value of the wrong kind. 'help' and 'model.help' show what settings there are, as
-    the ones before change them, and end the program as --help does.
+    (with the closest known one) or a value of the wrong kind. 'help' and 'model.help' show the settings, as changed by
+    the strings before, and end the program as --help does.
     """
     values = to_dict(study) | ({} if model is None else {"model": to_dict(model)})
     before = leaves(values)
@@ -59,8 +59,8 @@ def _show(values: dict[str, Any], group: str) -> None:
 
 
 def _assign(values: dict[str, Any], before: Mapping[str, Any], path: str, text: str) -> None:
-    """Puts the parsed `text` at `path`, in place, of the kind that stood there `before` any override: an earlier one of
-    the same path may have left a whole number in the place of a fraction."""
+    """Puts the parsed `text` at `path`, in place. Its type is that of the value `before` any override: an earlier
+    override of the same path may have left a whole number in place of a fraction."""
     known = leaves(values)
     if path not in known:
         raise ConfigError(f"--set {path}: {_instead(values, path, known)}")
@@ -78,7 +78,7 @@ def _instead(values: dict[str, Any], path: str, known: Collection[str]) -> str:
         node = node[rest[0]]
         at.append(rest.pop(0))
     group = ".".join(at)
-    if not isinstance(node, dict):  # the path goes on where a value is
+    if not isinstance(node, dict):  # the path continues below a value
         if node is None and group == "model.diffusion":
             return f"{group} is null in this study, whose tokens are ids; use a preset that ends in -continuous"
         return f"no such setting; {group} is a value, {json.dumps(node)}"
@@ -91,7 +91,7 @@ def _instead(values: dict[str, Any], path: str, known: Collection[str]) -> str:
 
 
 def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Collection[str]) -> list[str]:
-    """Settings probably meant by the rest of a path below `group`, by the first rule that finds any."""
+    """Settings that the rest of a path below `group` probably means, by the first rule that finds any."""
     last = ABBREVIATED.get(rest[-1], rest[-1])
     known = [k for k in known if k != OF_A_TRIAL]
     last_parts = {k.split(".")[-1] for k in known}
@@ -127,7 +127,7 @@ def _of_names(config: type, path: str) -> bool:
 
 
 def _parse(path: str, text: str, old: Any) -> Any:
-    """A value of the kind of `old` from command line text."""
+    """A value of the same type as `old`, from command-line text."""
     if isinstance(old, str):
         return text
     if isinstance(old, list) and not text.startswith("["):
@@ -148,7 +148,7 @@ def _parse(path: str, text: str, old: Any) -> Any:
 
 
 def _json(path: str, text: str, expected: str) -> Any:
-    """`expected`: what may stand there, for the message."""
+    """The value of JSON `text`. `expected`: what is allowed there, for the message."""
     try:
         return json.loads(text.lower() if text in ("True", "False", "None") else text)
     except json.JSONDecodeError:

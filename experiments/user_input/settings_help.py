@@ -34,7 +34,7 @@ def show_settings(found: list[SettingHelp], title: str) -> None:
 
 
 def describe_settings(config: Any, prefix: str = "") -> Iterator[SettingHelp]:
-    """Help on every setting of a dataclass of values and further such dataclasses, in their order."""
+    """Help on every setting of a dataclass, whose fields are values or further such dataclasses, in order."""
     kinds, texts = typing.get_type_hints(type(config)), comments(type(config))
     for field in fields(config):
         path, value = prefix + field.name, getattr(config, field.name)
@@ -48,7 +48,7 @@ def describe_settings(config: Any, prefix: str = "") -> Iterator[SettingHelp]:
 
 
 def comments(config: type) -> dict[str, str]:
-    """The first sentence of each field's comment, which stands behind it or in the lines above."""
+    """The first sentence of each field's comment, which is behind the field or in the lines above."""
     source = textwrap.dedent(inspect.getsource(config))
     lines, found = source.splitlines(), {}
     (declared,) = ast.parse(source).body
