@@ -1,8 +1,8 @@
-"""Every point of an axis at the number of steps that suits it, chosen on other episodes than those it is judged on.
+"""Every point of an axis at its best number of steps, chosen on episodes other than those on which it is judged.
 
-Where data is scarce a model is best after fewer steps. To take the lowest of several losses on the windows that judge
-it would flatter every point, the noisiest most. So the episodes of every robot are halved: steps are chosen by the loss
-on the one half and judged on the other, both ways, and every window is judged once (two-fold cross-fitting).
+Where data is scarce a model is best after fewer steps. Taking the lowest of several losses on the windows that judge it
+would favour every point, and the noisiest most. So the episodes of every robot are halved: steps are chosen by the loss
+on one half and judged on the other, both ways, and every window is judged once (two-fold cross-fitting).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hma_jax.evaluation.windows import WindowTable
 class BestSteps:
     """A point judged at the number of steps chosen on other episodes; `chosen` lists numbers and how often each was
     chosen, 'steps x times'.
-    `edge`: "edge" where the fewest or the most steps that were tried were chosen, so that others may suit it better."""
+    `edge`: "edge" if the fewest or the most steps tried were chosen, so that other numbers may be better."""
 
     sweep: str
     x: float
@@ -48,8 +48,8 @@ class BestSteps:
 def judge_at_best(
     sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[BestSteps]:
-    """Every point and seed whose trials differ in the number of steps alone, of which there are at least two, where its
-    episodes can be halved and none lacks a loss. Raises NotComparable."""
+    """Every point and seed with at least two trials that differ only in the number of steps, if the episodes can be
+    halved and no loss is missing. Raises NotComparable."""
     rows = []
     for sweep in sweeps:
         if not (sweep.fittable and sweep.has_series) or sweep.interior_minimum:
@@ -98,7 +98,7 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
     """({steps: table} as one table in which every window is judged at steps chosen without it, the steps chosen by each
     half of the episodes). The loss by which they are chosen is the mean over `robots` that the half has.
 
-    Raises NotComparable unless all tables are of the same windows, of at least two episodes.
+    Raises NotComparable unless all tables have the same windows, from at least two episodes.
     """
     first = next(iter(tables.values())).among(robots)
     matched = {}
@@ -118,14 +118,14 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
         losses = {steps: _mean_of_robots(t, half == h) for steps, t in matched.items()}
         chosen.append(min(sorted(losses), key=losses.__getitem__))
     shared = [m for m in first.metrics if all(m in t.metrics for t in matched.values())]
-    by_other = [matched[chosen[1]], matched[chosen[0]]]  # windows of half 0 are judged by the choice of half 1
+    by_other = [matched[chosen[1]], matched[chosen[0]]]  # windows of half 0 are judged at the steps chosen by half 1
     metrics = {m: np.where(half == 0, by_other[0].metrics[m], by_other[1].metrics[m]) for m in shared}
     return replace(first, metrics=metrics), (chosen[0], chosen[1])
 
 
 def halves(table: WindowTable) -> np.ndarray:
-    """int [n], 0 or 1: the episodes of each robot alternate, by number; robots of a single episode alternate, too, or
-    half 1 would be empty where no robot has two."""
+    """int [n], 0 or 1: the episodes of each robot alternate, by number. Robots with a single episode alternate too, or
+    half 1 would be empty if no robot has two."""
     half, alone = np.zeros(len(table), int), 0
     for robot in table.datasets:
         own = table.dataset == robot
@@ -136,7 +136,7 @@ def halves(table: WindowTable) -> np.ndarray:
 
 
 def _can_choose(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> bool:
-    """Whether the episodes can be halved, and every table has a loss of every window."""
+    """Whether the episodes can be halved, and every table has a loss for every window."""
     own = [table.among(robots) for table in tables.values()]
     return bool(halves(own[0]).any()) and not any(np.isnan(table.metrics[HELD_OUT_LOSS]).any() for table in own)
 

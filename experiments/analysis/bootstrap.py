@@ -1,13 +1,13 @@
-"""Resampling over seeds and episodes: the error of a result that several seeds were judged for on the same windows.
+"""Resampling over seeds and episodes: the error of a result for which several seeds were judged on the same windows.
 
-Seeds and episodes are crossed: every seed sees every episode. Both are drawn again, independently, the episodes
-within each robot (Owen 2007, "The pigeonhole bootstrap", Annals of Applied Statistics 1: never too small an error
-for crossed effects, a little too large one where a seed and an episode interact). Of n one draws n - 1 with
-replacement, which makes the variance of a mean unbiased also for three seeds (Rao and Wu 1988, "Resampling
-inference with complex survey data", JASA 83); drawing n would give two thirds of it. The robots are fixed.
+Seeds and episodes are crossed: every seed sees every episode. Both are resampled independently, the episodes within
+each robot (Owen 2007, "The pigeonhole bootstrap", Annals of Applied Statistics 1: for crossed effects the error is
+never too small, and a little too large if a seed and an episode interact). Of n, n - 1 are drawn with replacement,
+which makes the variance of a mean unbiased even for three seeds (Rao and Wu 1988, "Resampling inference with complex
+survey data", JASA 83); drawing n would give two thirds of it. The robots are fixed.
 
 All points of a curve are judged on the same windows: one draw takes the same episodes at every point, and the same
-seeds wherever two points have seeds of the same names, so that differences between points, and fits, are paired.
+seeds if two points have seeds with the same names, so that differences between points, and fits, are paired.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hma_jax.evaluation.windows import WindowTable
 DRAWS = 1000
 
 ROUNDED = 1e-12
-"""Share of the largest value: draws that scatter less do so by rounding alone, and are equal."""
+"""Share of the largest value: draws that scatter less do so only by rounding, and count as equal."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Panel:
     robot: np.ndarray  # str [n]
     episode: np.ndarray  # int [n]: number within the robot
     points: tuple[np.ndarray, ...]  # float64 [seeds of the point, n]
-    seeds: tuple[tuple[int, ...], ...]  # of each point, in the order of its rows
+    seeds: tuple[tuple[int, ...], ...]  # seeds of each point, in the order of its rows
 
     def __post_init__(self):
         require(len(self.points) == len(self.seeds) > 0, "a panel needs points and their seeds")
@@ -50,18 +50,18 @@ class Panel:
             )
 
     def rows(self, index: np.ndarray) -> Panel:
-        """Some of its windows."""
+        """The panel of some of its windows."""
         return Panel(self.robot[index], self.episode[index], tuple(p[:, index] for p in self.points), self.seeds)
 
     @property
     def known(self) -> np.ndarray:
-        """bool [n]: every seed of every point has a value there."""
+        """bool [n]: whether every seed of every point has a value there."""
         return ~np.isnan(np.concatenate(self.points)).any(0)
 
     def minus(self, other: Panel) -> Panel:
         """Point by point and window by window, over the seeds that both have: a panel of differences.
 
-        Raises NotComparable for other windows, and for points without a common seed.
+        Raises NotComparable for different windows, and for points without a common seed.
         """
         same = np.array_equal(self.robot, other.robot) and np.array_equal(self.episode, other.episode)
         if not same or len(self.points) != len(other.points):
@@ -123,8 +123,8 @@ def resample(
 ) -> Draws:
     """The mean over robots of each point, as measured and in `draws` resamples; a pure function of its arguments.
 
-    A point of one seed keeps it: its draws say nothing of seeds. A robot of one episode cannot be resampled; it
-    takes the deviation of another robot, drawn anew each time and scaled to one episode, as `stratified` does.
+    A point with one seed keeps it: its draws say nothing about seeds. A robot with one episode cannot be resampled; it
+    takes the deviation of another robot, drawn anew each time and scaled to one episode, as in `stratified`.
     """
     return _resample(panel.seeds, _by_episode(panel), draws, seed, over_seeds, over_episodes)
 
@@ -161,11 +161,11 @@ def _resample(
 def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list[Interval]:
     """For each point the mean, the standard deviation of its draws, and an interval.
 
-    The interval joins those of the two levels resampled alone, each with its own Student's t: half its width squared
-    is (t sem)^2 of the seeds plus (t sem)^2 of the episodes (the method of variance estimates recovery; Zou and Donner
-    2008, Statistics in Medicine 27). Degrees of freedom are the seeds less one, and for episodes Satterthwaite's, as of
-    one seed (`intervals.overall`). Three seeds that happen to agree then make no interval narrow, as one from the
-    quantiles of the draws would be.
+    The interval combines those of the two levels, each resampled alone and with its own Student's t: half its width
+    squared is (t sem)^2 of the seeds plus (t sem)^2 of the episodes (the method of variance estimates recovery; Zou and
+    Donner 2008, Statistics in Medicine 27). Degrees of freedom are the seeds less one, and for episodes
+    Satterthwaite's, as of one seed (`intervals.overall`). Three seeds that happen to agree then do not make the
+    interval narrow, as they would with quantiles of the draws.
     """
     sums, counts, ends = summed = _by_episode(panel)
     equal = ROUNDED * np.array([np.abs(values).max() for values in panel.points])
@@ -180,7 +180,7 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list
         own = slice(row, row + len(seeds))
         row += len(seeds)
         mean = float(value[own].mean())
-        # nan, as the interval, if no robot has two episodes
+        # nan, like the interval, if no robot has two episodes
         t_episode = critical(_freedom(sums[own].mean(0), counts, ends))
         t_seed = critical(len(seeds) - 1) if len(seeds) > 1 else 0.0
         half = math.hypot(t_seed * by_seed[i], t_episode * by_episode[i])
@@ -228,7 +228,7 @@ def _freedom(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> float:
 def _resample_episodes(
     sums: np.ndarray, counts: np.ndarray, ends: np.ndarray, weights: Sequence[np.ndarray], rng: np.random.Generator
 ) -> np.ndarray:
-    """[draws, all seeds]: the mean over robots, of which each has other episodes in every draw."""
+    """[draws, all seeds]: the mean over robots, each with different episodes in every draw."""
     means, known, alone, draws = [], [], [], len(weights[0])
     for start, end, weight in zip(_starts(ends), ends, weights, strict=True):
         own_sums, own_counts = sums[:, start:end], counts[start:end]
@@ -238,7 +238,7 @@ def _resample_episodes(
             means.append(np.tile(measured, (draws, 1)))
             continue
         drawn = weight @ own_sums.T / (weight @ own_counts)[:, None]
-        known.append((drawn - measured) * math.sqrt(end - start))  # of one episode
+        known.append((drawn - measured) * math.sqrt(end - start))  # robots with one episode
         means.append(drawn)
     if known:
         deviations = np.stack(known)
@@ -249,10 +249,10 @@ def _resample_episodes(
 
 @lru_cache(maxsize=8)
 def _episode_weights(counts: tuple[int, ...], draws: int, seed: int) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
-    """The weights of the episodes of each robot, which has so many, and the state of their generator afterwards.
+    """The weights of each robot's episodes (`counts`: how many it has), and the state of their generator afterwards.
 
-    Every metric and pair of models that is judged on some windows has the same ones, and drawing them takes longer
-    than what is done with them."""
+    They are cached: all metrics and pairs of models that are judged on the same windows share them, and drawing them
+    takes longer than using them."""
     rng = np.random.default_rng(seed)
     weights = tuple(_weights(count, draws, rng) for count in counts)
     return weights, rng.bit_generator.state

@@ -1,9 +1,8 @@
 """The difference between the two ends of an axis, or of a variant from the default, window by window.
 
-Trials of both sides were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
-every seed judges robots of its own, each seed's difference is taken on these, and the error is over seeds. Where a
-model has no number of a metric that it should have, there is no difference: the page names the model
-(`report.validity`).
+Trials of both sides were judged on the same windows, so what makes a window hard for both cancels (`compare`). If every
+seed judges its own robots, each seed's difference is taken on these, and the error is over seeds. If a model lacks a
+number that it should have for a metric, there is no difference: the page names the model (`report.validity`).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ OF_VARIANTS = ("cross_entropy", "diffusion_loss", "delta_psnr", "action_error")
 
 @dataclass(frozen=True)
 class Change:
-    """The mean at `last` less that at `first`, over robots, with its interval; `seeds` that both ends have."""
+    """The mean at `last` minus that at `first`, over robots, with its interval; `seeds`: those that both ends have."""
 
     sweep: str
     series: str
@@ -40,7 +39,7 @@ class Change:
     sem: float
     low: float
     high: float
-    errors: float  # standard errors from zero
+    errors: float  # distance from zero in standard errors
     seeds: int
     n: int
     episodes: int
@@ -86,8 +85,8 @@ def finished_by_x(points: Iterable[Point], provenance: Provenance, windows: Mapp
 
 
 def _changes(sweep: Sweep, series: str, ends: Ends, metrics: Sequence[str]) -> list[Change]:
-    """The change of each of `metrics` between two ends, first the one that the others are compared with; none unless
-    these share a seed."""
+    """The change of each of `metrics` between two ends, of which the first is the one to compare with; none unless they
+    share a seed."""
     if not set.intersection(*map(set, ends.values())):
         return []
     return [c for metric in metrics if (c := _change(sweep, series, ends, metric)) is not None]

@@ -1,7 +1,7 @@
-"""Two models, or two studies' reference models over their seeds, on the windows that both saw.
+"""Two models, or two studies' reference models over their seeds, compared on the windows that both were evaluated on.
 
 Differences are paired window by window. With one seed on either side the error is clustered by episode (`intervals`),
-with several it is over seeds and episodes (`bootstrap`), seeds of one name paired.
+with several it is over seeds and episodes (`bootstrap`), with seeds of the same name paired.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from hma_jax.evaluation.windows import WindowTable
 
 @dataclass(frozen=True)
 class Side:
-    """What is compared: {seed: every window's numbers} of one model, and the tokens that it was judged on."""
+    """One side of a comparison: {seed: every window's numbers}, and the tokens on which it was judged."""
 
     name: str
     seeds: Mapping[int, WindowTable]
     tokenizer: str  # "": unknown
     says_seed: bool = True  # False: its seed is unknown, and the key of `seeds` stands in
-    of_study: bool = False  # whether `seeds` are those of a study's reference that are finished
-    step: int = 0  # of its training at which it was evaluated; 0: unknown
-    steps: int = 0  # that its training was to have; 0: unknown
+    of_study: bool = False  # whether `seeds` are the finished ones of a study's reference
+    step: int = 0  # step of its training at which it was evaluated; 0: unknown
+    steps: int = 0  # planned number of training steps; 0: unknown
 
 
 @dataclass(frozen=True)
 class Difference:
-    """a - b of one metric, over one robot or all, with its interval; of nats also the ratio of perplexities."""
+    """a - b for one metric, over one robot or all, with its interval; for nats also the ratio of perplexities."""
 
     scope: str  # a robot, or OVERALL
     metric: str
@@ -44,7 +44,7 @@ class Difference:
     sem: float
     low: float
     high: float
-    errors: float  # standard errors from zero
+    errors: float  # distance from zero in standard errors
     seeds: int
     n: int
     episodes: int
@@ -54,12 +54,12 @@ class Difference:
 
 
 def compare(a: Side, b: Side) -> list[Difference]:
-    """Every metric, nats first, overall and by robot, of the robots that both were judged on.
+    """Every metric, nats first, overall and by robot, for the robots on which both were judged.
 
-    Metrics of tokens are left out where the tokenizers are known to differ, since the same nats are then of other
-    things, and retrieval where the two sides ranked the true actions among different numbers of others.
-    Raises NotComparable, naming the first window that differs, and NoNumbers, naming the first that lacks what it has
-    in every sound model.
+    Metrics of tokens are left out if the tokenizers are known to differ, since nats then measure different things.
+    Retrieval is left out if the two sides ranked the true actions among different numbers of others. Raises
+    NotComparable, naming the first window that differs, and NoNumbers, naming the first window that lacks a number
+    which every sound model has.
     """
     pairs = _pairs(a, b)
     first = pairs[0][0]
@@ -75,7 +75,8 @@ def compare(a: Side, b: Side) -> list[Difference]:
 
 
 def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
-    """Whether retrieval ranks the true actions among as many others on both sides, in every window of `robots`."""
+    """Whether retrieval ranks the true actions among the same number of others on both sides, in every window of
+    `robots`."""
     if not all("retrieval_chance" in table.metrics for table in (a, b)):
         return True
     of_a, of_b = make_panel([{0: a}, {0: b}], "retrieval_chance", robots).points
@@ -83,7 +84,8 @@ def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
 
 
 def other_sequences(side: Side, robots: Sequence[str]) -> list[int]:
-    """Under how many action sequences of other episodes windows of `robots` were evaluated; [] where none says so."""
+    """The numbers of action sequences from other episodes under which windows of `robots` were evaluated; [] if
+    unknown."""
     tables = [table.among(robots).metrics for table in side.seeds.values()]
     chances = [metrics["retrieval_chance"] for metrics in tables if "retrieval_chance" in metrics]
     found = np.unique(np.concatenate([np.zeros(0), *chances]))
@@ -91,9 +93,9 @@ def other_sequences(side: Side, robots: Sequence[str]) -> list[int]:
 
 
 def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:
-    """The difference of one metric, averaged over `robots`; None where no window of either model has it. Raises
-    NotComparable, and NoNumbers where the windows of one model alone have it, or where none has a metric that every
-    sound model has."""
+    """The difference of one metric, averaged over `robots`; None if no window of either model has it. Raises
+    NotComparable, and NoNumbers if only one model's windows have it, or if neither has a metric that every sound model
+    has."""
     pairs = _pairs(a, b)
     if not all(metric in table.metrics for pair in pairs for table in pair):
         return None
@@ -103,8 +105,8 @@ def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> 
 
 
 def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
-    """The pairs of tables that are compared: one for each seed that both sides have. Two models of one seed each are
-    paired whatever their seeds are, unless both are of studies."""
+    """The pairs of tables that are compared: one for each seed that both sides have. Two models with one seed each are
+    paired whatever their seeds are, unless both come from studies."""
     if len(a.seeds) == len(b.seeds) == 1 and not (a.of_study and b.of_study):
         return [(*a.seeds.values(), *b.seeds.values())]
     shared = [seed for seed in a.seeds if seed in b.seeds]
@@ -119,7 +121,7 @@ def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
 def _panels(
     sides: Sequence[Side], pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robots: Sequence[str]
 ) -> list[Panel]:
-    """One of each side, of the same windows in the same order. Raises NoNumbers."""
+    """One panel for each side, with the same windows in the same order. Raises NoNumbers."""
     both = make_panel([dict(enumerate(side)) for side in zip(*pairs, strict=True)], metric, robots)
     lacking = lacks_numbers(metric, np.concatenate(both.points))  # [seeds of both, n]
     if lacking.any():
@@ -137,14 +139,16 @@ def _panels(
 
 
 def lacks_numbers(metric: str, values: np.ndarray) -> np.ndarray:
-    """bool [models, n], of `values` [models, n] of the same windows: where a model has none though every sound one has,
-    or, of OPTIONAL_METRICS, though another of them has. Such windows, left out, would favour the model that broke."""
+    """bool [models, n] for `values` [models, n] on the same windows: where a model lacks a number that every sound
+    model has or, for OPTIONAL_METRICS, that another of these models has. Leaving such windows out would favour the
+    model that failed there."""
     none = np.isnan(values)
     return none & ~none.all(0) if metric in OPTIONAL_METRICS else none
 
 
 def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
-    """The difference overall, where there are several robots, and of each, over the windows that have the metric."""
+    """The difference overall, if there are several robots, and for each robot, over the windows that have the
+    metric."""
     known = a.known & b.known
     rows = [(robot, known & (a.robot == robot)) for robot in dict.fromkeys(a.robot[known].tolist())]
     if len(rows) > 1:
@@ -164,7 +168,7 @@ def _difference(scope: str, metric: str, a: Panel, b: Panel) -> Difference:
 
 
 def _interval(panel: Panel) -> Interval:
-    """The interval of one point's mean; in closed form where there is one seed."""
+    """The interval of one point's mean; in closed form if there is one seed."""
     if len(panel.seeds[0]) > 1:
         return bootstrap_intervals(panel)[0]
     values = panel.points[0][0]

@@ -30,16 +30,16 @@ METRICS = ("delta_psnr", "action_nats", RETRIEVAL, "counterfactual_gain")
 """The others are 0 for a deaf model."""
 
 FOLLOWING_SEMS = 2.0
-"""Standard errors above a deaf model beyond which a robot counts as following actions."""
+"""A robot counts as following actions if it is more than this many standard errors above a deaf model."""
 
 ROUNDING = 1e-5
-"""dB or nats below which a mean counts as 0: rounding differs by as much between devices, and scatters so little that
+"""dB or nats below which a mean counts as 0: rounding differs by this much between devices, and scatters so little that
 it would look significant."""
 
 
 @dataclass(frozen=True)
 class Controllability:
-    """A line of the table; `mean` less `deaf` is `errors` standard errors from zero."""
+    """A line of the table; `mean` minus `deaf` is `errors` standard errors from zero."""
 
     robot: str
     metric: str
@@ -47,7 +47,7 @@ class Controllability:
     sem: float
     low: float
     high: float
-    deaf: float  # of a model that is deaf to actions: 0, or the chance of retrieval
+    deaf: float  # value of a model that is deaf to actions: 0, or the chance level of retrieval
     errors: float
     seeds: int
     n: int

@@ -23,7 +23,8 @@ from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, fit_values, p
 
 DRAWS, FIT_LEVEL = 1000, 0.90
 MIN_POSITIONS = 4
-"""Distinct positions on an axis that a power law with a constant needs: one more than its three parameters."""
+"""Number of distinct positions on an axis that a power law with a constant needs: one more than its three
+parameters."""
 
 NAMES = (("A", "alpha"), ("B", "beta"))
 WIDE_RATIO = 4.0
@@ -33,7 +34,7 @@ LACK_OF_FIT_P = 0.05
 """p-value of the F test below which a lack of fit is reported."""
 
 OPEN_SHARE = 0.05
-"""Share of the bootstraps at a bound above which a coefficient's interval counts as open there."""
+"""If more than this share of the bootstraps is at a bound, a coefficient's interval counts as open there."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class PowerFit:
         return interval(self.all_at(x))
 
     def formula(self, constant: bool = True) -> str:
-        """In words: 'L = 1.5 + 98 x^-0.5'; without E where it is no `constant` worth saying."""
+        """In words: 'L = 1.5 + 98 x^-0.5'; without E if `constant` is False."""
         names = ("N", "D") if len(self.axes) == 2 else ("x",)
         powers = zip(NAMES, names, strict=False)
         terms = [f"{self[scale].value:.3g} {x}^-{self[exponent].value:.3g}" for (scale, exponent), x in powers]
@@ -90,8 +91,8 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def fit_power(measured: Measurements, draws: int = DRAWS, episodes: bool = True) -> PowerFit:
     """The saturating power law of a loss over one axis or two, or the reason why there is none.
 
-    `episodes`: whether bootstraps draw episodes too. Without, intervals are conditional on the frozen windows, as
-    what is compared on the same windows needs them.
+    `episodes`: whether bootstraps draw episodes too. Without this, intervals are conditional on the frozen windows, as
+    needed for what is compared on the same windows.
     """
     refused = _unfit(measured)
     if refused:
@@ -142,16 +143,16 @@ def _unfit(measured: Measurements) -> str:
 
 
 def _lines(measured: Measurements, k: int) -> list[np.ndarray]:
-    """[n] each: the trials that differ on axis `k` alone, at two positions of it or more. None where no two share a
-    position on the other axis, as at equal compute no two sizes see as many windows."""
+    """[n] each: the trials that differ only on axis `k`, at two or more positions. There are none if no two trials
+    share a position on the other axis: for instance, at equal compute no two sizes see the same number of windows."""
     others = np.delete(measured.x, k, axis=1)
     lines = [(others == rest).all(1) for rest in np.unique(others, axis=0)]
     return [line for line in lines if len(np.unique(measured.x[line, k])) > 1]
 
 
 def _rising(measured: Measurements) -> str:
-    """Why no power law can be fitted where the loss does not fall from the first position of an axis to the last by
-    more than seeds scatter; '' where it does."""
+    """Why no power law can be fitted if the loss does not fall from the first position of an axis to the last by more
+    than seeds scatter; '' if it does."""
     logs, noise = np.log(measured.value), np.nan_to_num(measured.noise())
     for k, name in enumerate(measured.axes):
         falls, errors = [], []
@@ -172,7 +173,8 @@ def _rising(measured: Measurements) -> str:
 
 
 def _inferred(measured: Measurements) -> tuple[str, ...]:
-    """Doubts about axes along which no two trials differ alone: that the loss falls there is inferred from the form."""
+    """Doubts about an axis if no two trials differ only along it: that the loss falls there is then inferred from the
+    form."""
     alone = [name for k, name in enumerate(measured.axes) if not _lines(measured, k)]
     return tuple(
         f"no two trials differ in {name} alone: what it does is told by the form, not compared" for name in alone
@@ -180,7 +182,7 @@ def _inferred(measured: Measurements) -> tuple[str, ...]:
 
 
 def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> tuple[Coefficient, ...]:
-    """In units of x: A = A at the centre times exp(alpha centre)."""
+    """Coefficients in units of x: A = A at the centre times exp(alpha centre)."""
 
     def named(t: np.ndarray) -> dict[str, np.ndarray]:
         coefficients = {"E": np.exp(t[..., 0])}
@@ -194,7 +196,7 @@ def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> 
 
 
 def _misfit(measured: Measurements, residuals: np.ndarray) -> tuple[str, ...]:
-    """A doubt if positions lie off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
+    """A doubt if positions are off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
     assumes independent trials, which branches of one run are not quite."""
     points, count = measured.points, np.bincount(measured.points)
     left, free = len(count) - 1 - 2 * len(measured.axes), measured.freedom

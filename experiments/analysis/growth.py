@@ -2,8 +2,8 @@
 
 The paper explains the plateau over trajectories by robots that have no more of them. If so, from each point of an axis
 that caps trajectories to the next, only robots that get more of them should gain. Differences are paired window by
-window, as in `changes`. Computed only where every robot keeps its share of the windows drawn: under a mixture that
-weighs robots by the trajectories used, those without more lose windows to the others.
+window, as in `changes`. Computed only if every robot keeps its share of the windows drawn: under a mixture that weights
+robots by the trajectories used, robots without more trajectories lose windows to the others.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ GROWS, EXHAUSTED = "grows", "exhausted"
 
 @dataclass(frozen=True)
 class Growth:
-    """The mean at `last` less that at `first`, over the robots whose data grows between them, or is exhausted."""
+    """The mean at `last` minus that at `first`, over the robots whose data grows between them, or over those whose data
+    is exhausted."""
 
     sweep: str
     series: str
@@ -53,7 +54,7 @@ def find_growth(
     results: Mapping[str, Mapping[str, Any]],
     episodes: Mapping[str, int],
 ) -> list[Growth]:
-    """The growth of data between neighbouring points that share seeds, along axes that change the cap of
+    """The effect of growing data between neighbouring points that share seeds, along axes that change the cap on
     trajectories. A trial's trajectories are those that its entry of `results` counts, else its robots' training
     `episodes` up to the cap. Raises NotComparable."""
     found = []
@@ -86,7 +87,7 @@ def _along(
         seeds = trials[first].keys() & trials[last].keys()
         if not seeds:
             continue
-        # Subsets of one seed are nested, so a sum over seeds is larger where any seed has more.
+        # Subsets of one seed are nested, so a sum over seeds is larger if any seed has more.
         before, after = (sum((Counter(used[trials[x][s][0].trial]) for s in seeds), Counter()) for x in (first, last))
         known = [name for name in sweep.scope if name in before and name in after]
         groups = {

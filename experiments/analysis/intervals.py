@@ -2,8 +2,8 @@
 
 Standard errors are `hma_jax.evaluation.statistics.stat_of`: cluster-robust over episodes (Cameron and Miller 2015,
 "A Practitioner's Guide to Cluster-Robust Inference", for a regression on a constant, with G / (G - 1)). Intervals
-take Student's t with G - 1 degrees of freedom for G episodes (ibid., section VI), and for the mean over robots as
-many as Satterthwaite 1946 approximates for a sum of variances that are themselves estimated.
+take Student's t with G - 1 degrees of freedom for G episodes (ibid., section VI), and for the mean over robots the
+number that Satterthwaite 1946 gives for a sum of estimated variances.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ LEVEL = 0.95
 """Confidence level of intervals of means and differences; fits have `fits.FIT_LEVEL`."""
 
 HELD_OUT_LOSS = "cross_entropy"
-"""Nats per held-out token, which models of latents have not: what is fitted. Its exponential, the perplexity, is no sum
-of powers."""
+"""Nats per held-out token, which models of latents do not have: the metric that is fitted. Its exponential, the
+perplexity, is not a sum of powers."""
 
 NATS = (HELD_OUT_LOSS, "diffusion_loss", "action_nats")
 """Metrics in nats per token (the diffusion loss in its own unit), which come first in every table."""
@@ -43,7 +43,7 @@ class Interval:
     low: float
     high: float
     n: int = 0  # windows
-    episodes: int = 0  # that they are of
+    episodes: int = 0  # episodes that these windows come from
 
     @property
     def errors(self) -> float:
@@ -51,11 +51,11 @@ class Interval:
         return standard_errors(self.mean, self.sem)
 
     def of_share(self) -> Interval:
-        """The interval of a mean of shares, each from 0 to 1, which it does not leave.
+        """The interval of a mean of shares, each from 0 to 1; the interval stays within that range.
 
         Windows that are all 0, or all 1, do not scatter, and Student's t would be sure after a few of them. Their
-        interval is that of Clopper and Pearson 1934 for as many independent trials as there are episodes, all of which
-        failed or succeeded. nan stays nan.
+        interval is that of Clopper and Pearson 1934 for one independent trial per episode, all of which failed or
+        succeeded. nan stays nan.
         """
         low, high = max(self.low, 0.0), min(self.high, 1.0)
         if self.sem == 0 and self.mean in (0, 1):
@@ -71,14 +71,14 @@ class Interval:
 
 
 def standard_errors(mean: float, sem: float) -> float:
-    """How many standard errors a mean is from zero; 0 where it is zero exactly, nan for an unknown error."""
+    """How many standard errors a mean is from zero; 0 if it is exactly zero, nan for an unknown error."""
     if mean == 0:
         return 0.0
     return mean / sem if sem else math.copysign(math.inf, mean)
 
 
 def interval_of(stat: Stat) -> Interval:
-    """Student's t interval of the mean over one robot's windows, with one degree of freedom less than it has
+    """Student's t interval of the mean over one robot's windows, with one degree of freedom fewer than it has
     episodes."""
     return _around(stat, stat.clusters - 1)
 
@@ -95,14 +95,14 @@ def overall(stats: Iterable[Stat]) -> Interval:
 
 
 def satterthwaite(estimates: Iterable[tuple[float, float]]) -> float:
-    """Degrees of freedom of a sum of (variance, its own degrees of freedom); infinite where nothing varies."""
+    """Degrees of freedom of a sum of (variance, its own degrees of freedom); infinite if nothing varies."""
     known = list(estimates)
     total, squares = add_up(v for v, _ in known), add_up(v**2 / df for v, df in known)
     return total**2 / squares if squares else math.inf
 
 
 def nats_first(metrics: Iterable[str]) -> list[str]:
-    """In the order in which tables show them."""
+    """The metrics in the order in which tables show them."""
     metrics = list(metrics)
     return [m for m in NATS if m in metrics] + [m for m in metrics if m not in NATS]
 
@@ -118,7 +118,7 @@ def _around(stat: Stat, df: float) -> Interval:
 
 
 def _exp(x: float) -> float:
-    """Infinite beyond what a float holds."""
+    """exp(x); infinite beyond what a float holds."""
     try:
         return math.exp(x)
     except OverflowError:

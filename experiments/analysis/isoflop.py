@@ -4,13 +4,14 @@ Each size's run gives its loss at several budgets, by its decay branches; betwee
 the logarithm (modified Akima, no further out than TOLERANCE). At one budget the loss over log N is fitted by a
 parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A budget at which the smallest or the largest size
 has the lowest loss, or whose parabola has no minimum between them, is refused: the best size may lie beyond. A parabola
-through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter, that
-is reported: the error of its minimum is then larger than the bootstrap's.
+through losses that only flatten also has a minimum. If sizes are off the parabola by more than seeds scatter, that is
+reported: the error of its minimum is then larger than the bootstrap's.
 
-The parabola is a choice, and no bootstrap knows of it. So the exponent is given a second time, of the parabola through
-the best size and its two neighbours alone. It is doubted where bootstraps, whose draws both share, tell the two apart
-(that of three sizes is so much noisier that it often lies outside the other's interval by chance), and where one size
-has the lowest loss at every budget: then the form alone says that the best size grows or shrinks.
+The parabola is a choice that no bootstrap accounts for. So the exponent is given a second time, from the parabola
+through only the best size and its two neighbours. The exponent is reported as doubtful if bootstraps, whose draws both
+share, distinguish the two (the one from three sizes is so much noisier that it often lies outside the other's interval
+by chance), and if one size has the lowest loss at every budget: then only the form says that the best size grows or
+shrinks.
 """
 
 from __future__ import annotations
@@ -26,16 +27,18 @@ from experiments.analysis.measured import Measurements
 from experiments.terminal.words import counted
 
 TOLERANCE = 0.1
-"""By which share of a budget a size's nearest measured FLOPs may miss it, beyond the first or last of them."""
+"""Share of a budget by which a size's first or last measured FLOPs may miss it."""
 
 MIN_SIZES, MIN_BUDGETS = 4, 3
-"""Sizes at one budget, one more than a parabola has parameters; budgets with a minimum, for the power law."""
+"""Least number of sizes at one budget (one more than a parabola has parameters), and of budgets with a minimum for the
+power law."""
 
 BUDGETS = 4
 """At most: no more than were measured."""
 
 NEIGHBOURS = 2
-"""Sizes on either side of the best one that the parabola is fitted to: further out the curve is no parabola."""
+"""Number of sizes on either side of the best one to which the parabola is fitted: further out the curve is not a
+parabola."""
 
 
 @dataclass(frozen=True)
@@ -48,24 +51,24 @@ class Budget:
     parabola: np.ndarray | None = None  # of log loss over log size - `centre`, highest power first
     centre: float = 0.0
     best: Coefficient | None = None  # N_opt
-    near: Coefficient | None = None  # N_opt of the best size and its two neighbours alone, wherever there is a best
+    near: Coefficient | None = None  # N_opt from only the best size and its two neighbours, if there is a best one
     refused: str = ""
     doubt: str = ""
-    misfit: str = ""  # whether sizes lie off the parabola by more than seeds scatter
+    misfit: str = ""  # whether sizes are off the parabola by more than seeds scatter
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is doubtful of the best size."""
+        """What is doubtful about the best size."""
         return tuple(filter(None, (self.doubt, self.misfit)))
 
     @property
     def remarks(self) -> str:
-        """Why there is no best size, or what is doubtful of it."""
+        """Why there is no best size, or what is doubtful about it."""
         return self.refused or "; ".join(self.doubts)
 
     @property
     def lowest(self) -> float:
-        """The size that was measured to have the lowest loss."""
+        """The size with the lowest measured loss."""
         return float(self.sizes[np.argmin(self.loss)])
 
     def at(self, sizes: np.ndarray) -> np.ndarray:
@@ -75,19 +78,20 @@ class Budget:
 
 @dataclass(frozen=True)
 class IsoFlop:
-    """N_opt = k C^a through the best sizes, and the same (`near`) through those that their neighbours alone give."""
+    """N_opt = k C^a through the best sizes, and the same (`near`) through those from the best size and its neighbours
+    only."""
 
     budgets: tuple[Budget, ...] = ()
     exponent: Coefficient | None = None  # a
     scale: float = float("nan")  # k
-    near: Coefficient | None = None  # a, wherever there is an exponent
+    near: Coefficient | None = None  # a, if there is an exponent
     near_scale: float = float("nan")  # k
-    apart: Coefficient | None = None  # a less that of three sizes, draw by draw, wherever there is an exponent
+    apart: Coefficient | None = None  # a minus that of three sizes, draw by draw, if there is an exponent
     refused: str = ""
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is doubtful of the exponent, beside what is of the best size of a single budget."""
+        """What is doubtful about the exponent, besides doubts about the best size of a single budget."""
         a, apart, found = self.exponent, self.apart, []
         if a is None:
             return ()
@@ -133,13 +137,13 @@ def fit_isoflop(measured: Measurements, budgets: np.ndarray | None = None, draws
 
 
 def _law(flops: np.ndarray, optima: np.ndarray) -> tuple[np.ndarray, float]:
-    """(a [1 + R], k of the values) of N_opt = k C^a, of log C [b] and log N_opt [b, 1 + R]."""
+    """(a [1 + R], k of the values) of N_opt = k C^a, from log C [b] and log N_opt [b, 1 + R]."""
     slope, level = np.polyfit(flops - flops.mean(), optima, 1)
     return slope, float(np.exp(level[0] - slope[0] * flops.mean()))
 
 
 class _Line:
-    """log loss of one size over log C, of the values and of every draw, its seeds averaged."""
+    """log loss of one size over log C, for the values and for every draw, averaged over seeds."""
 
     def __init__(self, measured: Measurements, values: np.ndarray, size: float):
         own = measured.x[:, 0] == size
@@ -153,7 +157,7 @@ class _Line:
         return self.flops[0] * (1 - TOLERANCE) <= flops <= self.flops[-1] * (1 + TOLERANCE)
 
     def seeds_near(self, flops: float) -> int:
-        """At the budget that was measured nearest to it."""
+        """Number of seeds at the measured budget nearest to `flops`."""
         return int(self._seeds[np.argmin(np.abs(np.log(self.flops / flops)))])
 
     def at(self, flops: float) -> np.ndarray:
@@ -167,8 +171,9 @@ class _Line:
 
 
 def _common_budgets(lines: list[_Line]) -> np.ndarray:
-    """Evenly spread in log C between the lowest and the highest that enough sizes cover: as many as were measured, up
-    to BUDGETS. Those within TOLERANCE of each other are one: steps are whole, so sizes miss a budget by a little."""
+    """Budgets evenly spread in log C between the lowest and the highest that enough sizes cover: as many as were
+    measured, up to BUDGETS. Budgets within TOLERANCE of each other count as one: steps are whole numbers, so sizes miss
+    a budget slightly."""
     ends = np.unique(np.concatenate([line.flops for line in lines]))
     covered = [f for f in ends if sum(line.covers(f) for line in lines) >= MIN_SIZES]
     if not covered:
@@ -220,21 +225,21 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
 
 
 def _lowest_of_three(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """[1 + R]: where the parabola through the least of `logs` [m, 1 + R] and its two neighbours over `x` [m] is lowest,
-    which is between these; where the least is at an end, that end."""
+    """[1 + R]: the minimum, between the neighbours, of the parabola through the least of `logs` [m, 1 + R] and its two
+    neighbours over `x` [m]; if the least is at an end, that end."""
     least, draw = np.argmin(logs, 0), np.arange(logs.shape[1])
     middle = np.clip(least, 1, len(x) - 2)
     (x0, x1, x2), (y0, y1, y2) = ([v(middle + i) for i in (-1, 0, 1)] for v in (x.take, lambda i: logs[i, draw]))
     left, right = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of three on a line the least is at an end
+    with np.errstate(divide="ignore", invalid="ignore"):  # if three are on a line, the least is at an end
         lowest = (x0 + x1) / 2 - left * (x2 - x0) / (2 * (right - left))
     return np.where(least == middle, lowest, x[least])
 
 
 def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:
-    """Says that sizes lie off the parabola; empty where they do not. `residuals` [m, 1 + R] of log losses: column 0
-    is of the measured values, the others are of the draws, which scatter around it as means over `seeds` [m] do. An
-    F test of lack of fit, as `fits` makes it of a power law."""
+    """Says that sizes are off the parabola; empty if they are not. `residuals` [m, 1 + R] of log losses: column 0 is
+    from the measured values, the others are from the draws, which scatter around it as means over `seeds` [m] do. An F
+    test of lack of fit, as in `fits` for a power law."""
     scatter = float(((residuals[:, 1:] - residuals[:, :1]) ** 2).sum(0).mean())
     if min(seeds) < 2 or scatter == 0:
         return ""

@@ -1,13 +1,13 @@
-"""The measured losses that a curve is fitted to, and bootstrap draws of them over seeds and episodes.
+"""The measured losses to which a curve is fitted, and bootstrap draws of them over seeds and episodes.
 
-Episodes are drawn by `bootstrap`: all trials are judged on the same frozen windows, so that a draw takes the same ones
-for all of them, and what makes an episode hard moves the whole curve and not its shape. Seeds are drawn here, since a
-fit is made to every trial and not to the mean over seeds: an outlier among them then weighs little.
+Episodes are drawn by `bootstrap`: all trials are judged on the same frozen windows, so a draw takes the same episodes
+for all of them, and what makes an episode hard shifts the whole curve but does not change its shape. Seeds are drawn
+here, since a fit is made to every trial, not to the mean over seeds: an outlier among them then has little weight.
 
-Where every seed is judged on robots of its own, how hard these are is taken out: each seed is shifted, in the
-logarithm, to the mean level of all. Their windows differ, so that seeds alone are drawn. Levels are estimated from the
-same losses, which makes the seeds of a position scatter less than they do: their spread is put right by the degrees of
-freedom that the levels took.
+If every seed is judged on its own robots, the difficulty of these is removed: each seed is shifted, in the logarithm,
+to the mean level of all. Their windows differ, so only seeds are drawn. Levels are estimated from the same losses,
+which makes the seeds of a position appear to scatter less: their spread is corrected for the degrees of freedom that
+the levels took.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
 
 PRIOR = 4.0
-"""Observations that the pooled variance over seeds counts as, beside those of a point: three seeds say little."""
+"""Number of observations that the pooled variance over seeds counts as, beside those of a point: three seeds say
+little."""
 
 
 class NoLevel(NotComparable):
-    """Seeds of robots of their own, of which nothing that has finished says how hard these are."""
+    """Every seed has its own robots, and no finished trials show how hard these are."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class Measurements:
     trial: tuple[str, ...]  # n ids
     seed: np.ndarray  # [n], int
     value: np.ndarray  # [n]: mean over windows, then over robots
-    panel: Panel | None  # of their windows, each trial a point with one seed; None where seeds have other windows
-    levels: int = 0  # differences between seeds that were estimated from these losses and taken out of `value`
+    panel: Panel | None  # of their windows, each trial a point with one seed; None: seeds have different windows
+    levels: int = 0  # differences between seeds that were estimated from these losses and removed from `value`
 
     def __post_init__(self):
         lengths = {len(x) for x in (self.x, self.run, self.trial, self.seed, self.value)}
@@ -52,29 +53,29 @@ class Measurements:
 
     @cached_property
     def points(self) -> np.ndarray:
-        """[n]: the number of the distinct position that each trial stands at."""
+        """[n]: the number of the distinct position of each trial."""
         return np.unique(self.x, axis=0, return_inverse=True)[1].ravel()
 
     def seeds_per_point(self) -> int:
-        """The least that any position has."""
+        """The smallest number of seeds at any position."""
         return int(np.bincount(self.points).min())
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom of the scatter of S seeds at each of P positions, P (S - 1); (P - 1)(S - 1) where levels
-        were taken out."""
+        """Degrees of freedom of the scatter of S seeds at each of P positions, P (S - 1); (P - 1)(S - 1) if levels were
+        removed."""
         return len(self.value) - len(np.unique(self.points)) - self.levels
 
     def _stretch(self) -> float:
-        """How many times too small a seed's deviation from the mean of its position is, since levels were taken out:
+        """Factor by which a seed's deviation from the mean of its position is too small because levels were removed:
         sqrt(P / (P - 1)) with all seeds at each of P positions."""
         return float(np.sqrt((self.freedom + self.levels) / self.freedom)) if self.freedom > 0 else 1.0
 
     def noise(self) -> np.ndarray:
         """[n]: standard deviation over seeds of the logarithm of a trial's loss, at its position.
 
-        The variance of a position is joined with that of all, which counts as PRIOR more observations. nan where no
-        position has two seeds, or levels left nothing of their scatter.
+        The variance of a position is combined with that of all, which counts as PRIOR further observations. nan if no
+        position has two seeds, or if levels left nothing of their scatter.
         """
         logs, points = np.log(self.value), self.points
         count = np.bincount(points)
@@ -90,9 +91,8 @@ class Measurements:
         """[draws, n]: the losses with seeds, and unless told otherwise episodes, drawn with replacement.
 
         Seeds are drawn per run, so that branches of a run move together. A seed's deviation from the mean of its
-        position is taken sqrt(m / (m - 1)) times for m seeds, and `_stretch` times where levels were taken out:
-        otherwise the spread of few would come out too small. With a single seed nothing is known of the spread, and the
-        loss keeps it.
+        position is multiplied by sqrt(m / (m - 1)) for m seeds, and by `_stretch` if levels were removed: otherwise the
+        spread of few seeds would be too small. With a single seed the spread is unknown, and the loss stays as it is.
         """
         number = int(rng.integers(2**31))
         if self.panel is None:
@@ -110,7 +110,7 @@ class Measurements:
                 m = len(at)
                 if m < 2:
                     continue
-                # Where some seeds of the run are missing, those that there are are drawn on their own.
+                # If some seeds of the run are missing, the existing ones are drawn on their own.
                 chosen = chosen_RS if m == len(seeds) else rng.integers(0, m, (draws, m))
                 own = means_Rn[:, at]
                 centre = own.mean(1, keepdims=True)
@@ -135,8 +135,8 @@ def measure(
 ) -> Measurements:
     """The losses of trials at `positions` from their `tables` of windows, each over its own robots.
 
-    Raises NotComparable unless trials of the same robots were judged on the same windows, and NoLevel where they are of
-    several robots that nothing makes comparable.
+    Raises NotComparable unless trials of the same robots were judged on the same windows, and NoLevel if they are of
+    different robots that nothing makes comparable.
     """
     require(len(positions) > 0, "there is no finished trial")
     groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
@@ -159,8 +159,8 @@ def measure(
 
 
 def _levelled(value: np.ndarray, x: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """Values [n], those of each seed times a factor that gives all seeds one level, over the positions that all of them
-    have. Raises NoLevel where there is none."""
+    """Values [n], those of each seed multiplied by a factor that gives all seeds the same level over the positions that
+    all of them have. Raises NoLevel if there is no such position."""
     points = np.unique(x, axis=0, return_inverse=True)[1].ravel()
     shared = set.intersection(*(set(points[seed == s].tolist()) for s in np.unique(seed)))
     if not shared:

@@ -1,9 +1,9 @@
 """Where each of several curves is lowest, and what it costs to take another's best point.
 
-For learning rates: how far off the rate that is best at the base width is at the others. Only
-points of the grid are compared: an optimum between them is not interpolated. The lowest of several noisy losses is a
-choice with an error of its own: which rates are as good as the best is told from the seeds, and what a choice costs is
-judged on seeds that it was not made by, where there are several.
+For learning rates: how far the best rate of the base width is from the best rates of the other widths. Only points of
+the grid are compared: an optimum between them is not interpolated. The lowest of several noisy losses is a choice with
+an error of its own. Therefore the seeds decide which rates are as good as the best, and if there are several seeds, the
+cost of a choice is judged on seeds that did not make it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from experiments.sweeps.sweep import Sweep
 from hma_jax.evaluation.sums import add_up
 
 LOSSES = {HELD_OUT_LOSS: OVERALL, TRAINING_LOSS: TRAINING}
-"""What optima are taken of, with scopes: nats per held-out token, and the training objective."""
+"""The metrics whose optima are taken, with scopes: nats per held-out token, and the training objective."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Optimum:
     # x with one seed (seed_sem is nan), which is told from nothing.
     edge: str
     loss: float
-    seed_sem: float  # over seeds, nan for one
+    seed_sem: float  # standard error over seeds, nan for one
     near_low: float  # the lowest and highest x that are `as_good` as the best; x itself with one seed
     near_high: float
     moved: float  # steps of the grid from the best x of the base series, downwards negative; nan without one
@@ -64,7 +64,7 @@ class Optimum:
 
 
 def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
-    """One for every curve with a finished trial, of sweeps that have a base series."""
+    """One optimum for every curve with a finished trial, in sweeps that have a base series."""
     found = []
     for sweep in sweeps:
         if not sweep.base:
@@ -141,10 +141,11 @@ def _optimum(
 
 
 def as_good(points: Sequence[CurvePoint], best: CurvePoint, grid: set[float]) -> tuple[float, float]:
-    """(lowest, highest x) of the candidates around `best` that seeds do not tell from it: paired, 95 % and one side.
+    """(lowest, highest x) of the candidates around `best` that seeds cannot distinguish from it: paired, 95 %,
+    one-sided.
 
-    The range ends before the first point that they do tell or that has no error, and before an x of the `grid` without
-    a candidate.
+    The range ends before the first point that they do distinguish or that has no error, and before an x of the `grid`
+    without a candidate.
     """
     known = {p.x for p in points if p.x == best.x or math.isfinite(difference(p, best)[1])}
     apart = grid - known | told_worse(points, best)
@@ -155,10 +156,10 @@ def as_good(points: Sequence[CurvePoint], best: CurvePoint, grid: set[float]) ->
 
 
 def told_worse(points: Iterable[CurvePoint], best: CurvePoint) -> set[float]:
-    """The x of the candidates that the seeds tell to be worse than `best`: paired, 95 % and one side.
+    """The x of the candidates that the seeds show to be worse than `best`: paired, 95 %, one-sided.
 
-    Of a point that scatters more than the curve's median one, the median error counts: where training is about to
-    diverge, seeds scatter so much that no loss could be told from the best. It takes two seeds in common.
+    For a point that scatters more than the curve's median point, the median error is used: if training is about to
+    diverge, seeds scatter so much that no loss could be distinguished from the best. Two seeds in common are needed.
     """
     beside = {p.x: (*difference(p, best), len(by_seed(p, best))) for p in points if p.x != best.x}
     known = {x: of_seeds for x, of_seeds in beside.items() if math.isfinite(of_seeds[1])}
@@ -167,8 +168,8 @@ def told_worse(points: Iterable[CurvePoint], best: CurvePoint) -> set[float]:
 
 
 def cross_validated_penalties(points: Sequence[CurvePoint], of_base: Sequence[CurvePoint]) -> list[float]:
-    """What each seed of a curve loses by the base's best x instead of its own curve's, where both are chosen by the
-    other seeds from the candidates of each. [] with fewer than two seeds that every candidate has."""
+    """What each seed of a curve loses with the base's best x instead of its own curve's, if both are chosen by the
+    other seeds from the candidates of each curve. [] if fewer than two seeds are common to all candidates."""
     own = {p.x: p.seeds for p in points}
     base = {p.x: p.seeds for p in of_base if p.x in own}
     shared = set.intersection(*(set(seeds) for seeds in (*own.values(), *base.values()))) if base else set()

@@ -13,7 +13,7 @@ from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import WindowTable
 
 TRUTH = "psnr_copy"
-"""A metric of the recorded images alone, equal for equal windows whatever the model."""
+"""A metric of the recorded images only, equal for equal windows whatever the model."""
 
 SAME = 1e-3
 """dB by which two programs may differ on equal images."""
@@ -24,11 +24,11 @@ class NotComparable(ConfigError):
 
 
 class NoNumbers(NotComparable):
-    """A model has no number of a window where every sound one has: what it predicts there is none."""
+    """A model has no number for a window although every sound model has one: its prediction there is not a number."""
 
 
 def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
-    """The robots that both have, in the order of `a`.
+    """The robots that both tables have, in the order of `a`.
 
     Raises NotComparable, naming the first window that differs, unless both saw the same windows of each.
     """
@@ -50,7 +50,7 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
 
 
 def agree(a: WindowTable, b: WindowTable) -> bool:
-    """Whether both saw the same windows in the same order: quicker than to find the one that differs."""
+    """Whether both saw the same windows in the same order: quicker than finding the one that differs."""
     if not a.has_windows_of(b) or not np.array_equal(a.frames, b.frames):
         return False
     both = TRUTH in a.metrics and TRUTH in b.metrics

@@ -1,11 +1,10 @@
 """The saturating power law L = E + sum_k A_k x_k^-alpha_k, fitted to many draws of the same points at once.
 
-Owns the form, its gradient and the minimisation; what a fit means, and whether it can be believed, is `fits`'s.
+Owns the form, its gradient and the minimisation; `fits` decides what a fit means and whether it can be trusted.
 
-Minimised is sum_i huber(w_i (log L(x_i) - log y_i)) with a Huber threshold of DELTA in the logarithm, as in
-Hoffmann et al. 2022, "Training Compute-Optimal Large Language Models": small residuals count as squares, large ones
-as absolute values, so that one run that went wrong does not bend the curve. Residuals are taken with the parameters in
-logarithms,
+The objective is sum_i huber(w_i (log L(x_i) - log y_i)) with a Huber threshold of DELTA in the logarithm, as in
+Hoffmann et al. 2022, "Training Compute-Optimal Large Language Models": small residuals count as squares, large ones as
+absolute values, so that one failed run does not bend the curve. Residuals use the logarithms of the parameters,
 
     log L = logsumexp(e, a_1 - alpha_1 z_1, ...),   z_k = log(x_k / geometric mean of x_k),
 
@@ -24,18 +23,18 @@ from dataclasses import dataclass
 import numpy as np
 
 DELTA = 1e-3
-"""Where the Huber loss turns from squares to absolute values, in the logarithm of the loss."""
+"""Residual, in the logarithm of the loss, at which the Huber loss changes from squares to absolute values."""
 
 ALPHA = (0.02, 4.0)
 """Bounds of exponents. At the lower one the law is a logarithm, at the upper one a step after the first point."""
 
 FLOOR = 1e-4
-"""Lowest E and A, as parts of the lowest value: below it they are as good as zero."""
+"""Lowest E and A, as parts of the lowest value: below this they are effectively zero."""
 
 START_ALPHA = (0.05, 0.15, 0.3, 0.5, 0.8, 1.3, 2.2)
 START_E = (0.01, 0.4, 0.7, 0.85, 0.95, 0.99)
 START_SHARE = (0.15, 0.5, 0.85)
-"""Grid of starts: exponents; E as part of the lowest value; for two terms, the first one's part of what is above E."""
+"""Grid of starts: exponents; E as part of the lowest value; for two terms, the first term's part of what is above E."""
 
 STEPS = 300
 
@@ -71,7 +70,7 @@ def huber(r: np.ndarray) -> np.ndarray:
 
 
 def objective(theta: np.ndarray, z: np.ndarray, log_y: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """What is minimised, for parameters [..., p] and values [..., n]: [...]."""
+    """The objective [...] for parameters [..., p] and values [..., n]."""
     return _objective(predict_log(theta, z), log_y, weight)
 
 
@@ -80,7 +79,7 @@ def _objective(log_prediction: np.ndarray, log_y: np.ndarray, weight: np.ndarray
 
 
 def bounds_of(log_y: np.ndarray, terms: int) -> Bounds:
-    """For values [..., n]: E and each A_k (at the centre) from FLOOR of the lowest to above the highest."""
+    """Bounds for values [..., n]: E and each A_k (at the centre) from FLOOR of the lowest to above the highest."""
     low, high = np.log(FLOOR) + log_y.min(), log_y.max() + 3.0
     return Bounds(
         np.array([low] * (1 + terms) + [ALPHA[0]] * terms), np.array([high] * (1 + terms) + [ALPHA[1]] * terms)
@@ -104,7 +103,7 @@ def starts(log_y: np.ndarray, z: np.ndarray) -> np.ndarray:
 def minimise(
     theta: np.ndarray, z: np.ndarray, log_y: np.ndarray, weight: np.ndarray, bounds: Bounds
 ) -> tuple[np.ndarray, np.ndarray]:
-    """From starts [R, p] for values [R, n], each on its own: (parameters [R, p], objective [R])."""
+    """Minimises from starts [R, p] for values [R, n], each independently: (parameters [R, p], objective [R])."""
     theta = np.clip(theta, bounds.low, bounds.high)
     shares, log_prediction = _terms(theta, z)
     best = _objective(log_prediction, log_y, weight)
@@ -135,8 +134,8 @@ def _step(
     theta: np.ndarray, shares: np.ndarray, r: np.ndarray, z: np.ndarray, weight: np.ndarray, bounds: Bounds,
     damping: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """A damped step on the reweighted squares, for each of [R, p]; none across a bound that it stands at. `shares`
-    [1 + K, R, n] as `_terms` has them, weighted residuals `r` [R, n]."""
+    """A damped step on the reweighted squares, for each of [R, p]; it does not cross a bound at which a parameter is.
+    `shares` [1 + K, R, n] as `_terms` has them, weighted residuals `r` [R, n]."""
     terms = len(shares)
     jacobian = np.empty((*r.shape, theta.shape[-1]))  # [R, n, p]
     for i, share in enumerate(shares):

@@ -2,9 +2,9 @@
 
 A prediction is a small JSON file, sealed with a hash of itself: the fit, the hash of every result it was made from,
 which trials were finished then, and the loss that the trials of one position will have on the frozen windows, with an
-interval. The interval holds the bootstraps of the fit over seeds and the noise of the new trials' own seeds; not that
-of episodes, since the windows are the same, and not that of the form, which is what the prediction puts to the test.
-Its date is that of the commit that brings it.
+interval. The interval includes the bootstraps of the fit over seeds and the noise of the new trials' own seeds; not the
+noise of episodes, since the windows are the same, and not the uncertainty of the form, which the prediction tests. Its
+date is that of the commit that brings it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Prediction:
     level: float
     formula: str
     coefficients: dict[str, tuple[float, float, float]]  # value and interval
-    inputs: dict[str, str]  # {trial id: hash of its result} of the fit
+    inputs: dict[str, str]  # {trial id: hash of its result} for the trials of the fit
     finished: tuple[str, ...]  # every trial of the study that had a result when this was written
 
     @property
@@ -55,13 +55,14 @@ class Outcome:
     """A prediction and its outcome; `marks` say why it may count for less."""
 
     prediction: Prediction
-    observed: float | None  # None: none of its trials is finished, or nothing says how hard their robots are
+    observed: float | None  # None: none of its trials is finished, or it is unknown how hard their robots are
     seeds: int
     marks: tuple[str, ...]
 
     @property
     def inside(self) -> bool | None:
-        """None before all its trials are finished: the interval is of the mean of them all."""
+        """Whether the outcome is inside the interval; None before all its trials are finished, since the interval is
+        for their mean."""
         if self.observed is None or self.seeds < len(self.prediction.trials):
             return None
         return self.prediction.low <= self.observed <= self.prediction.high
@@ -75,8 +76,8 @@ def predict(
 ) -> Prediction:
     """Predicts the loss of the `held_out` trials at one position from the other finished trials of the curve.
 
-    `windows` are those of all finished trials of the study, `hashes` of their results. Raises ConfigError if one of the
-    held-out trials is finished already, or if the others identify no power law.
+    `windows` are those of all finished trials of the study, `hashes` those of their results. Raises ConfigError if one
+    of the held-out trials is finished already, or if the others identify no power law.
     """
     ids = tuple(p.trial for p in held_out)
     finished = [id for id in ids if id in windows]
@@ -107,8 +108,8 @@ def predict(
 def compare(
     prediction: Prediction, curves: Sequence[Curve], windows: Mapping[str, WindowTable], hashes: Mapping[str, str]
 ) -> Outcome:
-    """The outcome of a prediction, measured together with the trials that it was made from: where seeds have robots of
-    their own, its level is then that of the prediction's, and not of the seeds that happen to have finished."""
+    """The outcome of a prediction, measured together with the trials from which it was made. If seeds have their own
+    robots, its level is then that of the prediction, not that of the seeds that happen to have finished."""
     curve = next((c for c in curves if c.name == prediction.curve), None)
     there = curve.finished(windows) if curve else ()
     finished = [p for p in there if p.trial in prediction.trials]
@@ -131,7 +132,7 @@ def compare(
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
-    """Raises ConfigError where there is one already: what was said is not said again."""
+    """Raises ConfigError if the file exists: a prediction is never overwritten."""
     require(not path.exists(), f"{path} is an earlier prediction, which is not overwritten. Give another --out")
     path.parent.mkdir(parents=True, exist_ok=True)
     values = to_dict(prediction)
@@ -139,8 +140,8 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def load_predictions(folder: Path) -> dict[str, Prediction]:
-    """By file name; of copies the first, or their outcome would count twice. Raises ConfigError for one that was
-    edited or cannot be read."""
+    """Predictions by file name; of copies only the first, or their outcome would count twice. Raises ConfigError for
+    one that was edited or cannot be read."""
     found: dict[str, Prediction] = {}
     for path in sorted(folder.glob("*.json")):
         if (prediction := _load(path)) not in found.values():

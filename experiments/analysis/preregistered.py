@@ -1,8 +1,8 @@
 """The author's preregistered expectations of a study, and their outcomes.
 
-A study keeps it in predictions/preregistered.csv, a line per number, by hand: from whatever was known and thought then,
-where `predictions` holds what a fit says by itself. No seal tells when it was written: the column `commit` names the
-commit that brought the numbers, whose date and place in the history are the evidence.
+A study keeps them in predictions/preregistered.csv, a line per number, written by hand from everything that was known
+and thought at the time. (`predictions` holds what a fit alone says.) No seal tells when it was written: the column
+`commit` names the commit that brought the numbers, whose date and place in the history are the evidence.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.measures import METRICS
 
 FILE = "preregistered.csv"
-"""In the folder of predictions, beside the sealed ones of fits."""
+"""File in the folder of predictions, beside the sealed predictions of fits."""
 
 
 @dataclass(frozen=True)
@@ -31,21 +31,21 @@ class Expected:
 
     sweep: str
     series: str  # the curve, in a sweep of several
-    x: str  # a position on the axis, or its name on an axis of names
-    against: str  # another one, of which it is the difference; '': the value itself
+    x: str  # position on the axis, or its name on an axis of names
+    against: str  # another position: the value is the difference from it; '': the value itself
     metric: str
     mean: float
     low: float
     high: float
     commit: str
-    seeds: tuple[int, ...] = ()  # of these alone; (): of all. This column and those after it may be left out.
-    known: tuple[int, ...] = ()  # seeds of x that had run when it was written
+    seeds: tuple[int, ...] = ()  # seeds that are averaged; (): all. This column and those after it may be left out.
+    known: tuple[int, ...] = ()  # seeds of x that had run when this was written
 
 
 @dataclass(frozen=True)
 class ExpectationOutcome:
-    """An expectation and its outcome: `observed`, the mean over `seeds` of the `planned` ones; None without any, for
-    the reason that `lacks` says.
+    """An expectation and its outcome: `observed`, the mean over those `seeds` of the `planned` ones that are finished;
+    None if there are none, for the reason in `lacks`.
 
     `seed_sem` is its standard error over seeds."""
 
@@ -64,14 +64,15 @@ class ExpectationOutcome:
 
 
 def read_expected(path: Path) -> list[Expected]:
-    """[] where there is no file. Raises ConfigError, with the line, for one that cannot be read."""
+    """The expectations in a file; [] if there is no file. Raises ConfigError, with the line, for a file that cannot be
+    read."""
     if not path.exists():
         return []
     columns, numbers = [f.name for f in fields(Expected)], ("mean", "low", "high")
     optional = [f.name for f in fields(Expected) if f.default is not MISSING]
     needed = columns[: -len(optional)]
     try:
-        text = path.read_text(encoding="utf-8-sig")  # as spreadsheets save it, too
+        text = path.read_text(encoding="utf-8-sig")  # also as spreadsheets save it
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not UTF-8 ({error}); save it in this encoding") from error
     with io.StringIO(text, newline="") as file:
@@ -81,7 +82,7 @@ def read_expected(path: Path) -> list[Expected]:
             f"{path}: its columns must be {','.join(needed)}, and optionally, in this order, {','.join(optional)}",
         )
         found: list[Expected] = []
-        lines: dict[tuple, int] = {}  # of each number that is spoken of
+        lines: dict[tuple, int] = {}  # line of each number
         for record in reader:
             number = reader.line_num
             try:
@@ -100,7 +101,7 @@ def read_expected(path: Path) -> list[Expected]:
                 some,
                 f"{where}: known must name some of the seeds, not others and not all, of which nothing is predicted",
             )
-            # A difference the other way round is the same number.
+            # A difference in the other direction is the same number.
             positions = frozenset(map(_position, (e.x, e.against)))
             require(len(positions) > 1, f"{where}: x must name a point, and against, if given, another point")
             require(e.metric in METRICS, f"{where}: no metric {e.metric!r}; known: {', '.join(METRICS)}")
@@ -114,8 +115,8 @@ def read_expected(path: Path) -> list[Expected]:
 
 
 def find_unplanned(expected: Sequence[Expected], sweeps: Sequence[Sweep]) -> list[str]:
-    """What of the axes of `sweeps` is expected and not planned, each with what there is, and axes that are neither
-    among them nor the project's: of the user's own, or mistyped."""
+    """Expectations on the axes of `sweeps` that are not planned, each with what is planned instead, and axes that are
+    neither among these nor the project's: the user's own, or mistyped."""
     known = {*AXES, *(s.name for s in sweeps)}
     lines = [f"no axis {name!r}" for name in dict.fromkeys(e.sweep for e in expected) if name not in known]
     for sweep in sweeps:
@@ -126,7 +127,7 @@ def find_unplanned(expected: Sequence[Expected], sweeps: Sequence[Sweep]) -> lis
 
 def compare_expected(expected: Sequence[Expected], rows: Sequence[Row]) -> list[ExpectationOutcome]:
     """The outcome of every expectation of an axis that is in `rows`; others may still be run."""
-    points: dict[str, list[Row]] = defaultdict(list)  # once, of a hundred thousand rows
+    points: dict[str, list[Row]] = defaultdict(list)  # once, out of a hundred thousand rows
     for row in rows:
         if row.role == POINT and not row.of_robot:
             points[row.sweep].append(row)
@@ -140,7 +141,7 @@ def count_inside(outcomes: Sequence[ExpectationOutcome]) -> tuple[int, int]:
 
 
 def _why_unplanned(e: Expected, points: Collection[tuple[str, float, str, int]]) -> str:
-    """What is expected and not among the axis's `points` (series, x, label, seed); '' if all is."""
+    """What is expected but not among the axis's `points` (series, x, label, seed); '' if everything is."""
     where = f"{e.sweep}, {e.series}" if e.series else e.sweep
     own = [(x, label, seed) for series, x, label, seed in points if series == e.series]
     if not own:

@@ -1,8 +1,8 @@
 """From finished trials to tidy rows: one row per (sweep, x, seed, role, scope, metric).
 
-results.csv has those of the means over robots; robots.parquet has those of each robot, which are forty times as many.
-They hold what is determined by the trials only (no clocks), so a study that was killed and resumed writes the same
-bytes as one that was not. Plots and tables are made from them.
+results.csv has the rows of means over robots; robots.parquet has those of single robots, which are forty times as many.
+They hold only what is determined by the trials (no times), so a study that was killed and resumed writes the same bytes
+as one that was not. Plots and tables are made from them.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ TRAINING, TRAINING_LOSS = "training", "loss"
 class Row:
     """One number with its standard error, and where it comes from.
 
-    It is a mean over `n` windows of `episodes` episodes, which the error counts (the training loss: over
-    `n` steps, `episodes` 0). A trial without a result has one row per sweep, with `metric` empty. Fields with a
-    default are missing in tables of earlier versions.
+    It is a mean over `n` windows of `episodes` episodes, over which the error is taken (the training loss: over `n`
+    steps, `episodes` 0). A trial without a result has one row per sweep, with `metric` empty. Fields with a default are
+    missing in tables of earlier versions.
     """
 
     sweep: str
     x: float
     label: str = ""  # the name of x, on an axis of names
-    role: str  # one of `sweep`, or UNTRAINED
-    series: str = ""  # the curve, in a sweep of several
+    role: str  # a role of `sweep`, or UNTRAINED
+    series: str = ""  # the curve, if the sweep has several
     seed: int
     trial: str
     status: str  # a state of `ledger`
@@ -71,7 +71,7 @@ class Row:
 
     @property
     def of_robot(self) -> bool:
-        """Whether it is of one robot, and not of all that the sweep judges."""
+        """Whether it is for one robot, not for all that the sweep judges."""
         return self.scope not in (OVERALL, TRAINING, "")
 
 
@@ -117,7 +117,7 @@ def _rows(
         parts.append((UNTRAINED, Summary.from_dict(result["untrained"])))
     rows = [row(point.role, TRAINING, TRAINING_LOSS, training_loss(result))]
     for role, summary in parts:
-        judged = [name for name in point.scope or sweep.scope if name in summary.datasets]  # those with windows
+        judged = [name for name in point.scope or sweep.scope if name in summary.datasets]  # datasets with windows
         scopes = {OVERALL: summary.over(judged)}
         scopes |= {name: summary.datasets[name] for name in judged}
         for scope, metrics in scopes.items():
@@ -131,7 +131,7 @@ def training_loss(result: dict[str, Any]) -> Stat:
 
 
 def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
-    """results.csv and robots.parquet, each whole or not at all."""
+    """Writes results.csv and robots.parquet, each completely or not at all."""
     import pyarrow as pa
 
     rows = list(rows)
@@ -142,7 +142,8 @@ def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
 
 
 def read_rows(workspace: Workspace) -> list[Row]:
-    """What `write_rows` wrote; earlier versions wrote all into results.csv. Raises ConfigError for a damaged table."""
+    """Reads what `write_rows` wrote; earlier versions wrote everything into results.csv. Raises ConfigError for a
+    damaged table."""
     import pyarrow as pa
 
     rows = read_csv(workspace.results)
@@ -164,7 +165,7 @@ def place_rows(rows: Iterable[Row], sweeps: Sequence[Sweep]) -> tuple[list[Row],
     placed, gone = [], dict[str, None]()
     for r in rows:
         names = places.get(r.sweep)
-        if not names or not r.label:  # of numbers, or of a version that did not write the name
+        if not names or not r.label:  # an axis of numbers, or a version that did not write the name
             placed.append(r)
         elif r.label in names:
             placed.append(r if r.x == names[r.label] else dataclasses.replace(r, x=names[r.label]))
@@ -206,7 +207,7 @@ def read_csv(path: Path) -> list[Row]:
 
 
 def _number(text: str) -> float:
-    """An int where it was one."""
+    """An int if it was one, else a float."""
     return int(text) if text.isdigit() else float(text)
 
 
@@ -219,16 +220,16 @@ def of_sweep(rows: Iterable[Row], sweep: str) -> list[Row]:
 class CurvePoint:
     """The seeds of one x together.
 
-    `sem` joins the spread over seeds and over episodes (`curve`). `seed_sem` is the former alone, nan for a
-    single seed: the error of a comparison on the same windows.
+    `sem` combines the spread over seeds and over episodes (`curve`). `seed_sem` is the former alone, nan for a single
+    seed: the error of a comparison on the same windows.
     """
 
     x: float
     mean: float
     sem: float
     seed_sem: float
-    seeds: dict[int, float]  # the mean of each
-    parameters: tuple[int, ...]  # the numbers that its seeds have, in order: several where robots are drawn
+    seeds: dict[int, float]  # the mean of each seed
+    parameters: tuple[int, ...]  # the numbers that its seeds have, in order: several if robots are drawn
     label: str = ""
     clustered: bool = True  # by episode, as errors of each seed are; in tables of earlier versions windows stand alone
 
@@ -242,17 +243,17 @@ def curve(
     series: str = "",
     robots_vary: bool = False,
 ) -> list[CurvePoint]:
-    """The points of a curve by increasing x; none where no trial has the metric.
+    """The points of a curve by increasing x; none if no trial has the metric.
 
-    sem^2 = variance over seeds / seeds + mean of each seed's sem^2 over episodes: all seeds are judged
-    on the same windows, so that the second part does not shrink with their number. Where every seed judges robots of
-    its own (`Sweep.robots_vary`), it has windows of its own, too, and what they do is within the variance over seeds:
-    with several seeds the first part is all. So it is with the training loss, which every seed has of its own steps.
+    sem^2 = variance over seeds / seeds + mean of each seed's sem^2 over episodes: all seeds are judged on the same
+    windows, so the second part does not shrink with their number. If every seed judges its own robots
+    (`Sweep.robots_vary`), it also has its own windows, whose effect is part of the variance over seeds: with several
+    seeds only the first part is used. The same holds for the training loss, which every seed has from its own steps.
     """
     own_windows = robots_vary or scope == TRAINING
     groups: dict[float, list[Row]] = defaultdict(list)
     for r in rows:
-        # Of a hundred thousand rows a few are meant: what most of them fail is asked first.
+        # A few of a hundred thousand rows are meant, so the test that most of them fail comes first.
         if r.scope == scope and r.metric == metric and r.sweep == sweep and r.role == role and r.series == series:
             groups[r.x].append(r)
     points = []
@@ -274,14 +275,14 @@ def curve(
 
 
 def by_seed(a: CurvePoint, b: CurvePoint) -> list[float]:
-    """a minus b of every seed that both have."""
+    """a minus b for every seed that both have."""
     return [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
 
 
 def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
     """a minus b over the seeds that both have, and its standard error over seeds (nan for one).
 
-    Paired: a seed draws the same windows and, where parameters agree, the same initial values.
+    Paired: a seed draws the same windows and, for the parameters that both have, the same initial values.
     """
     pairs = by_seed(a, b)
     if not pairs:
@@ -304,6 +305,6 @@ def all_series(rows: Iterable[Row], sweep: str) -> dict[str, list[str]]:
 
 
 def tally(rows: Iterable[Row], sweep: str) -> tuple[int, int]:
-    """(finished, all) trials of a sweep, its control among them."""
+    """(finished, all) trials of a sweep, including its control."""
     status = {(r.trial, r.x): r.status for r in rows if r.sweep == sweep and r.role != UNTRAINED}
     return sum(s == FINISHED for s in status.values()), len(status)

@@ -1,8 +1,8 @@
 """The scaling curves of a study, from its sweeps and every window's numbers, and their fits.
 
-A sweep over one number is a curve, or one for each of its series. Where its trials differ in width, the axis is not
-the width but the parameters of the trunk: most of the others belong to single robots. Trials that differ in nothing
-but width and steps, wherever in the study they are, make one surface over parameters and windows seen, for the joint
+A sweep over one number is a curve, or one for each of its series. If its trials differ in width, the axis is not the
+width but the number of trunk parameters: most of the other parameters belong to single robots. Trials that differ only
+in width and steps, wherever in the study they are, make one surface over parameters and windows seen, for the joint
 fit, and over parameters and training FLOPs, for the best size of a budget.
 """
 
@@ -34,9 +34,9 @@ OTHER_ROBOTS = "every seed is judged on other robots, how hard these are is take
 
 @dataclass(frozen=True)
 class Curve:
-    """Trials on one axis, or two; `positions` are those that the study plans."""
+    """Trials on one or two axes; `positions` are those that the study plans."""
 
-    name: str  # such as "width", and "-<series>" after it
+    name: str  # such as "width", with "-<series>" if there are several
     axes: tuple[str, ...]
     positions: tuple[Position, ...]
 
@@ -46,15 +46,15 @@ class Curve:
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A curve with what was measured on it and its fit."""
+    """A curve, what was measured on it, and its fit."""
 
     curve: Curve
-    measured: Measurements | None  # None: nothing is finished, or nothing that can be compared
+    measured: Measurements | None  # None: nothing is finished, or nothing can be compared
     fit: PowerFit
 
 
 def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
-    """One for every sweep along which a loss may fall as a power, and each of its series."""
+    """One curve for each series of every sweep along which a loss may fall as a power."""
     found = []
     for sweep in sweeps:
         if not sweep.fittable or sweep.interior_minimum:
@@ -68,8 +68,8 @@ def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
 
 
 def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> Curve | None:
-    """The largest group of a study's trials that differ in width and steps alone, over TRUNK and WINDOWS; None where no
-    group has two of both."""
+    """The largest group of a study's trials that differ only in width and steps, over TRUNK and WINDOWS; None if no
+    group has two values of both."""
     groups: dict[str, dict[str, Trial]] = defaultdict(dict)
     for sweep in sweeps:
         for point in sweep.points:
@@ -111,7 +111,7 @@ def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRA
 def fit_study(
     sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable], draws: int = DRAWS
 ) -> list[CurveFit]:
-    """The fit of each curve, and the joint one where there is a surface."""
+    """The fit of each curve, and the joint fit if there is a surface."""
     curves = curves_of(sweeps, provenance)
     surface = surface_of(sweeps, provenance)
     if surface is not None:
@@ -126,7 +126,8 @@ def fit_budgets(
     flops: Mapping[str, float],
     draws: int = DRAWS,
 ) -> IsoFlop | None:
-    """The best size for a budget, from the surface's trials and the training `flops` of each; None without."""
+    """The best size for a budget, from the surface's trials and the training `flops` of each; None without a
+    surface."""
     surface = surface_of(sweeps, provenance)
     positions = [replace(p, x=(p.x[0], flops[p.trial])) for p in surface.finished(windows)] if surface else []
     if not positions:
@@ -135,7 +136,7 @@ def fit_budgets(
 
 
 def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Provenance) -> Curve:
-    """Over TRUNK where its trials differ in width."""
+    """The curve of a series, over TRUNK if its trials differ in width."""
     wider = len({p.trial.model.width for p in points}) > 1
 
     def position(p: Point, run: str) -> Position:
@@ -162,8 +163,8 @@ def _seen(trial: Trial) -> float:
 
 
 def _runs_of(points: Sequence[tuple[Hashable, Trial]]) -> list[str]:
-    """The run of each (position, trial). Trials of one position are seeds of one run, though every seed may have robots
-    of its own; positions are its branches where the trials of their lowest seed differ in steps alone."""
+    """The run of each (position, trial). Trials at one position are seeds of one run, although every seed may have its
+    own robots; positions are branches of a run if the trials of their lowest seed differ only in steps."""
     lowest: dict[Hashable, Trial] = {}
     for position, trial in sorted(points, key=lambda point: point[1].train.seed):
         lowest.setdefault(position, trial)
@@ -171,8 +172,8 @@ def _runs_of(points: Sequence[tuple[Hashable, Trial]]) -> list[str]:
 
 
 def _all_but_size(trial: Trial) -> str:
-    """Equal for trials that differ in width, steps and seed alone, and in how many other actions they are judged under
-    (`sweeps.sweep.limit_other_actions`)."""
+    """A value that is equal for trials that differ only in width, steps, seed, and the number of other actions under
+    which they are judged (`sweeps.sweep.limit_other_actions`)."""
     values = _without_steps(trial)
     values["model"].pop("width")
     values["eval"].pop("other_actions")
@@ -180,7 +181,7 @@ def _all_but_size(trial: Trial) -> str:
 
 
 def _without_steps(trial: Trial) -> dict[str, Any]:
-    # No field that is added may change in which order runs are drawn; these two were there when runs got names.
+    # Added fields must not change the order in which runs are drawn; these two existed when runs got names.
     values: dict[str, Any] = {"capped": [], "source": None} | identity_of(trial)
     for name in ("steps", "seed"):
         values["train"].pop(name)
@@ -189,12 +190,12 @@ def _without_steps(trial: Trial) -> dict[str, Any]:
 
 
 def noise_near(measured: Measurements, x: np.ndarray) -> tuple[float, float]:
-    """(standard deviation over seeds of the logarithm of a trial's loss, its degrees of freedom) at the position of
-    several seeds that is nearest to `x` [K]: it may grow along the axis. (nan, nan) where there is none."""
+    """(standard deviation over seeds of the logarithm of a trial's loss, its degrees of freedom) at the position with
+    several seeds that is nearest to `x` [K]: it may grow along the axis. (nan, nan) if there is none."""
     count = np.bincount(measured.points)[measured.points]
     if not (count > 1).any():
         return float("nan"), float("nan")
     away = np.linalg.norm(np.log(measured.x) - np.log(x), axis=1)
     nearest = int(np.argmin(np.where(count > 1, away, np.inf)))
-    # What is joined with a position's own variance are the same few seeds: they are no more than they are.
+    # The variance joined with a position's own comes from the same seeds: it has no more freedom than they have.
     return float(measured.noise()[nearest]), float(min(count[nearest] - 1 + PRIOR, measured.freedom))

@@ -24,7 +24,7 @@ from hma_jax.training.run_lock import CHECKPOINTS
 
 @dataclass(frozen=True)
 class FinishedTrial:
-    """A finished trial, what names it, and every window's numbers."""
+    """A finished trial, its identity, and every window's numbers."""
 
     id: str
     trial: Trial
@@ -40,7 +40,7 @@ def read_trial(directory: Path) -> FinishedTrial:
     """Raises ConfigError for a trial that is not finished, was changed, or kept no numbers of its windows."""
     if not (directory / RESULT).exists():
         raise ConfigError(f"{directory}: not a finished trial (it has no {RESULT})")
-    read_result(directory)  # that its files are those it was sealed with
+    read_result(directory)  # checks that its files are those with which it was sealed
     windows = WindowTable.load(directory / FILE)
     return FinishedTrial(directory.name, *trial_in(directory), windows)
 
@@ -53,9 +53,9 @@ def read_trials(trials: str | Path, ids: Iterable[str] | None = None) -> dict[st
 
 
 def read_side(path: str | Path) -> Side:
-    """What `hma compare` takes: a study (its reference trials, by seed), a finished trial, or an evaluated model.
+    """One side of `hma compare`: a study (its reference trials, by seed), a finished trial, or an evaluated model.
 
-    Raises ConfigError for what is none of them, or whose trials have no result.
+    Raises ConfigError if it is none of these, or if its trials have no result.
     """
     path = Path(path).resolve()  # a trial's directory bears its id; '.' and links do not
     workspace = Workspace(path)
@@ -85,8 +85,8 @@ def read_side(path: str | Path) -> Side:
 
 
 def _said_of(run: Path) -> tuple[str, dict[str, Any]]:
-    """The identity of the tokenizer on whose tokens a model was evaluated, and of its training the seed, the step and
-    all steps, by the stamp of `hma evaluate`, else the seed by the run's latest checkpoint; "" and nothing where
+    """The identity of the tokenizer on whose tokens a model was evaluated, and the seed, step and number of steps of
+    its training, from the stamp of `hma evaluate`, or else the seed from the run's latest checkpoint; "" and nothing if
     neither says it."""
     from hma_jax.training.reading import list_steps, read_description
 

@@ -11,8 +11,8 @@ Columns:
     <metric>, <metric>.sem     over all robots that it was judged on, each counting equally
     windows, episodes, robots  that these are means over
 
-It holds nothing of clocks or machines: a study that was killed and resumed writes the same bytes. Results of a
-trial without one are null.
+It holds no times and nothing about machines: a study that was killed and resumed writes the same bytes. Results of a
+trial without a result are null.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def trial_row(
 
 
 def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Writes the rows, which need not have the same columns; whole or not at all."""
+    """Writes the rows, which need not have the same columns, completely or not at all."""
     import pyarrow as pa
 
     rows = list(rows)

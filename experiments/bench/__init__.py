@@ -1,5 +1,5 @@
-"""`hma bench`: how fast things are, as records that say on what, how, and against what.
+"""`hma bench`: how fast things are, in records that say on what hardware, how, and compared with what.
 
-Every record holds the naive path beside the fast one, measured by turns in the same process: on
-shared machines a ratio within one run means something, a number alone rarely does.
+Every record holds the naive path beside the fast one, measured alternately in the same process: on shared machines a
+ratio within one run is meaningful, a single number rarely is.
 """

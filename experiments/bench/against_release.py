@@ -29,7 +29,7 @@ RELEASE_STAGES = {
 OUR_PREFIX, RELEASE_PREFIX = "ours: ", "release: "
 
 SHARED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-"""Environment of a process that leaves the GPU's memory to others too."""
+"""Environment of a process that leaves GPU memory for others."""
 
 
 class Worker:
@@ -44,12 +44,13 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(BrokenPipeError):  # it ended by itself
+        with suppress(BrokenPipeError):  # it ended on its own
             self.process.stdin.close()
         self.process.wait()
 
     def run(self, stage: str) -> float:
-        """Seconds. Raises ConfigError if the process ended instead of answering."""
+        """Runs a stage and returns the seconds it took. Raises ConfigError if the process ended instead of
+        answering."""
         with suppress(BrokenPipeError):
             print(stage, file=self.process.stdin, flush=True)
         answer = self.process.stdout.readline()
@@ -96,11 +97,12 @@ def _take_turns(
     progress: Callable[[str, int], None],
     arguments: Sequence[str],
 ) -> dict[str, list[float]]:
-    """Seconds of every turn, of one stage of the release and those of ours that give the same.
+    """Seconds of every turn, for one stage of the release and our stages that compute the same.
 
-    Every stage has a process of its own, as its users have: none meets memory that others left in pieces.
+    Every stage has its own process, as for its users, so that none finds memory that others have fragmented.
     """
-    # As text: started from its file, it would find our modules beside it before those of the standard library.
+    # Passed as text: started from its file, it would find our neighbouring modules before those of the standard
+    # library.
     script = Path(__file__).with_name("released.py").read_text()
     as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
     with ExitStack() as stack:

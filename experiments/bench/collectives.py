@@ -44,15 +44,15 @@ class Collective:
 
     kind: str
     over: str  # mesh axes, joined by "+"; "" where the program does not say
-    loops: int  # how many loops it is in, one in another: over micro-batches, if there are several, and over layers
+    loops: int  # number of nested loops around it: over micro-batches, if there are several, and over layers
     purpose: str
 
 
 @dataclass(frozen=True)
 class Sent:
-    count: int  # as they stand in the program's text
-    bytes: int  # that one device receives, once through the text
-    whole: int  # the same in a step: in a loop as often as it runs, where the compiler knows that
+    count: int  # number in the program's text
+    bytes: int  # bytes that one device receives in one pass through the text
+    whole: int  # the same in a step: loops count as often as they run, if the compiler knows that
 
 
 def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sent]:
@@ -76,7 +76,7 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
                 continue
             channels.add((kind, channel[1]))
         group = _first_group(line, devices)
-        # What starts a collective holds what is sent beside its result; of an all-reduce, the result alone.
+        # The start of a collective holds what is sent beside its result; that of an all-reduce, only the result.
         size = count_bytes(match["result"], started=bool(match["start"]) and kind != "all-reduce")
         over = "" if group is None else find_axes(group, mesh)
         collective = Collective(kind, over, name.count("while/body"), explain(kind, name, over, size))
@@ -88,7 +88,7 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
 
 def count_runs(text: str) -> dict[str, int]:
     """How often each computation of a program runs. A loop counts once if the compiler does not know how often it runs;
-    of a conditional every branch counts."""
+    every branch of a conditional counts."""
     callers: dict[str, list[tuple[str, int]]] = {}
     computation = ""
     for line in text.splitlines():
@@ -111,13 +111,13 @@ def count_runs(text: str) -> dict[str, int]:
 
 
 def count_kinds(collectives: Mapping[Collective, Sent]) -> dict[str, int]:
-    """How often each kind stands in the program."""
+    """How often each kind occurs in the program."""
     counts = {kind: sum(sent.count for c, sent in collectives.items() if c.kind == kind) for kind in KINDS}
     return {kind: count for kind, count in counts.items() if count}
 
 
 def explain(kind: str, name: str, over: str, size: int) -> str:
-    """What a collective is for, by the name of the operation that it comes from."""
+    """What a collective is for, from the name of the operation that it comes from."""
     backward = "transpose(" in name and "rematted_computation" not in name
     if kind == "collective-permute" and "dot_general" in name:
         # On TPUs a product next to a gather or a scatter of one side is computed part by part in a ring.

@@ -27,8 +27,8 @@ FACTORS = (1, 2, 4, 8)
 
 
 def choose_widths(model: ModelConfig, widths: Sequence[int]) -> tuple[int, ...]:
-    """`widths`, by default FACTORS times the base width, in ascending order. Raises ConfigError where there are fewer
-    than two, and for those that the model cannot have."""
+    """`widths`, by default FACTORS times the base width, in ascending order. Raises ConfigError if there are fewer than
+    two, and for widths that the model cannot have."""
     chosen = tuple(sorted(set(widths or [factor * model.mup.base_width for factor in FACTORS])))
     require(len(chosen) > 1, f"--widths must be at least two different widths, got {' '.join(map(str, widths))}")
     for width in chosen:

@@ -1,9 +1,9 @@
-"""Evaluation of a model: the protocol in one compiled call against the protocol taken literally.
+"""Evaluation of a model: the protocol in one compiled call, compared with the literal protocol.
 
-Literally means a pass over the whole window for every frame, unmasking step and action sequence. Where every
-frame follows recorded ones, as the official release evaluates, that is M (T - 1) passes for each of
-the 1 + draws sequences, the likelihood included; where frames follow generated ones, T - 1 for the
-likelihood and M (T - prompt) for each sequence. Both give the same numbers, which is checked.
+Literal means a pass over the whole window for every frame, unmasking step and action sequence. If every frame follows
+recorded ones, as in the official release's evaluation, that is M (T - 1) passes for each of the 1 + draws sequences,
+including the likelihood; if frames follow generated ones, T - 1 for the likelihood and M (T - prompt) for each
+sequence. Both give the same numbers, which is checked.
 """
 
 from __future__ import annotations

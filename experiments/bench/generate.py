@@ -1,4 +1,4 @@
-"""Generation, frame by frame: every way of making the next frame, on one model, by turns.
+"""Generation, frame by frame: every way of making the next frame, on one model, alternately.
 
 `recompute` is what our oracle and the official release do: M passes over the whole window.
 `fill` is a frame while the window fills (its commit fused with the next frame's first pass),
@@ -55,7 +55,7 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
 
 
 def ratios(stages: list[Stage], rows: int) -> dict[str, float]:
-    """What the caches buy, within this run."""
+    """What the caches gain, within this run."""
     median = {s.name: s.timing.median for s in stages if s.batch == rows}
     return {
         f"recompute / fill, batch {rows}": median["recompute"] / median["fill"],

@@ -1,4 +1,4 @@
-"""Loading: training windows out of a token store, frames out of RLDS shards, and memory meanwhile."""
+"""Loading: training windows from a token store, frames from RLDS shards, and the memory used meanwhile."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class MemoryPoint:
 
 @dataclass(frozen=True)
 class LoadTiming:
-    """What drawing batches took: the timing of one, and the memory as it went on."""
+    """What drawing batches took: the timing of one batch, and memory over time."""
 
     stage: Stage
     memory: tuple[MemoryPoint, ...]
@@ -109,7 +109,7 @@ def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: i
         next(loader)
         seconds.append(time.perf_counter() - began)
         memory.append(MemoryPoint(name, (number + 1) * batch, resident_bytes()))
-    # The mean counts: a batch that was ready costs nothing, the next one more.
+    # The mean is what counts: a batch that was ready costs nothing, and the next one more.
     timing = replace(summarise(seconds), median=float(np.mean(seconds)))
     return LoadTiming(Stage(name, batch, timing, frames=frames), tuple(memory))
 

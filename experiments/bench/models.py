@@ -1,4 +1,4 @@
-"""The models that are timed. Weights are drawn: speed does not depend on their values."""
+"""The models that are timed. Weights are random: speed does not depend on their values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Subject:
 
     @property
     def inference_params(self) -> Params:
-        """Matrices in the type they are used in."""
+        """Parameters, with matrices in the type in which they are used."""
         return inference_params(self.declared, self.params, self.execution.dtype)
 
     def batch(self, rows: int, frames: int | None = None) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def random_batch(
 
 
 def make_table(robots: int) -> EmbodimentTable:
-    """So many robots alike."""
+    """A table with this number of identical robots."""
     one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
     return EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
 
@@ -91,7 +91,7 @@ def make_subject(
     layers: int | None = None,
     width: int | None = None,
 ) -> Subject:
-    """As `make_shape`, with weights. Holes in the heap are filled after compiling, as in a training run."""
+    """Like `make_shape`, with weights. Holes in the heap are filled after compiling, as in a training run."""
     fill_holes_after_compiling(default_device().platform)
     config, table = make_shape(name, robots, layers, width)
     declared = declare_model(config, table, execution)

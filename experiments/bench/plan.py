@@ -34,20 +34,20 @@ from hma_jax.training.step import make_train_step
 LOCAL = "local"
 
 CORES_PER_CHIP = {"v2": 2, "v3": 2, "v4": 2, "v5p": 2, "v5e": 1, "v5litepod": 1, "v6e": 1}
-"""What a chip adds to the number in a cloud's name of TPUs: 2 where it counts cores (v4-32), else 1 (v5litepod-8)."""
+"""What one chip adds to the number in a cloud's TPU name: 2 if it counts cores (v4-32), else 1 (v5litepod-8)."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a model lies on a mesh, and what one device holds while it trains; bytes. Without memory figures it
-    does not fit."""
+    """How a model is laid out on a mesh, and what one device holds while it trains, in bytes. If there are no memory
+    figures, the model does not fit."""
 
     decisions: tuple[Decision, ...]
     devices: int
     mesh: Mapping[str, int]
     compile_seconds: float
-    flops_per_step: float  # of the model, by formula, all devices together
-    moments: int = 0  # both, of what is trained
+    flops_per_step: float  # FLOPs of the model, by formula, all devices together
+    moments: int = 0  # both, for what is trained
     arguments: int = 0  # parameters, moments and this device's rows
     temporary: int = 0
     peak: int = 0
@@ -122,7 +122,7 @@ def make_plan(
 
     Raises ConfigError if the mesh does not suit them or the model, or leaves large parameters whole.
     """
-    if execution.attention == "auto":  # of those devices, not of this machine's
+    if execution.attention == "auto":  # for those devices, not this machine's
         execution = replace(execution, attention=backend_of(devices[0].platform))
     declared = declare_model(model, table, execution)
     mesh_config = execution.mesh
@@ -158,7 +158,7 @@ def make_plan(
             return Plan(**facts, compile_seconds=time.perf_counter() - began, refusal=_refusal(str(error)))
     memory = compiled.memory_analysis()
     arguments, temporary = int(memory.argument_size_in_bytes), int(memory.temp_size_in_bytes)
-    # For CPU, XLA's peak leaves out what is temporary, which there and on GPU is one block beside the arguments.
+    # For CPU, XLA's peak leaves out temporary memory, which there and on GPU is one block beside the arguments.
     counted = devices[0].platform == "tpu"
     return Plan(
         **facts,

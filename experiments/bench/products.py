@@ -1,4 +1,4 @@
-"""The matrix products of a program, each alone: what it would take if nothing else took time."""
+"""The matrix products of a program, each alone: how long the program would take if nothing else took time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.diagnostics.products import Product, count_products, total_flops
 
 LEAST_SECONDS = 0.02
-"""Least duration of one timed call: a product is repeated in a loop until a call takes so long."""
+"""Least duration of one timed call: a product is repeated in a loop until a call takes this long."""
 
 ASSUMED_RATE = 1e11
 """FLOP/s by which the repetitions are chosen."""
@@ -22,7 +22,7 @@ ASSUMED_RATE = 1e11
 
 def time_products(subject: Subject, name: str, rows: int, repeats: int) -> list[Stage]:
     """A stage for the program called `name` on `rows` windows, then one for every product in it, named by its
-    shape, with the time and the operations of all its occurrences; the dearest first."""
+    shape, with the time and the operations of all its occurrences, the most expensive first."""
     found = count_products(*program(subject, name, rows=rows))
     whole = time_by_turns({name: repeatable(subject, name, rows=rows)}, repeats)[name]
     stages = []
@@ -38,7 +38,7 @@ def time_products(subject: Subject, name: str, rows: int, repeats: int) -> list[
 
 
 def shape_of(product: Product, occurrences: int) -> str:
-    """Occurrences, how many products of one call lie side by side, then rows, summed values and columns."""
+    """Occurrences, number of products batched in one call, then rows, summed values and columns."""
     count, *sizes = product.matrices
     return f"{occurrences} times {count} of " + " x ".join(map(str, sizes))
 
@@ -46,7 +46,8 @@ def shape_of(product: Product, occurrences: int) -> str:
 def _repeated(product: Product, loops: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
     def call(left: jax.Array, right: jax.Array) -> jax.Array:
         def body(_: int, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            # Without the barrier the factors would be the same every time, and the product be taken out of the loop.
+            # Without the barrier the factors would be the same every time, and the product would be moved out of the
+            # loop.
             left, right, _ = carry
             return jax.lax.optimization_barrier((left, right, product(left, right)))
 

@@ -78,7 +78,7 @@ def program(
 def repeatable(
     subject: Subject, name: str, sampler: tuple[str, int] = RELEASE_SAMPLER, rows: int = 1
 ) -> Callable[[], Any]:
-    """The program compiled, going on from where its last call ended."""
+    """The compiled program; each call continues from where the last one ended."""
     function, *args = program(subject, name, sampler, rows)
     carried = CARRIED.get(name)
     compiled = jax.jit(function, donate_argnums=() if carried is None else carried)
@@ -86,7 +86,7 @@ def repeatable(
 
 
 def carrying(call: Callable[..., Any], args: list[Any], carried: int | None) -> Callable[[], Any]:
-    """Calls with `args`, of which number `carried` is each time what the call before returned as its first result."""
+    """Calls with `args`, of which argument number `carried` is each time the first result of the call before."""
 
     def once() -> Any:
         result = call(*args)

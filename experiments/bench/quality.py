@@ -1,8 +1,8 @@
-"""What cheaper decoding costs in quality: PSNR, SSIM and delta PSNR of a trained model's rollouts
-beside the time per frame, decoding by decoding, on the same held-out windows.
+"""What cheaper decoding costs in quality: PSNR, SSIM and delta PSNR of a trained model's rollouts, and the time per
+frame, for each decoding on the same held-out windows.
 
-The first decoding is the reference. For latents the sampler's kind and steps vary, for ids the
-passes over each frame; where windows are longer than the model's, so does what happens past it.
+The first decoding is the reference. For latents the sampler's kind and steps vary, for ids the passes over each frame.
+If windows are longer than the model's, the way of continuing past the model's window varies too.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ PASSES = (8, 4, 2, 1)
 @dataclass(frozen=True)
 class DecodingQuality:
     """The quality and cost of one decoding: a row of quality.csv. Quality is a mean over datasets with its standard
-    error, which counts episodes."""
+    error over episodes."""
 
     decoding: str
-    frames: int  # of a rollout, prompt included
+    frames: int  # frames of a rollout, including the prompt
     windows: int
     episodes: int
     psnr: float  # dB, mean over predicted frames
@@ -47,10 +47,10 @@ class DecodingQuality:
     ssim_sem: float
     delta_psnr: float  # dB, last frame
     delta_psnr_sem: float
-    psnr_gap: float = 0.0  # to the reference's PSNR on the same windows, and the error of that difference
+    psnr_gap: float = 0.0  # difference from the reference's PSNR on the same windows, and its error
     psnr_gap_sem: float = 0.0
     milliseconds_per_frame: float = 0.0  # median, of one rollout at a time
-    cost: float = 1.0  # time per frame over the reference's
+    cost: float = 1.0  # time per frame relative to the reference's
 
 
 def decodings(model: ModelConfig, config: EvalConfig, frames: int) -> dict[str, EvalConfig]:
@@ -154,6 +154,6 @@ def plot_quality(rows: Sequence[DecodingQuality], path: Path) -> None:
 
 
 def subject_of(trained: Any) -> Subject:
-    """A trained run as what is timed."""
+    """A trained run as a `Subject`."""
     declared = declare_model(trained.model, trained.table, EXECUTION)
     return Subject(trained.model, EXECUTION, trained.table, declared, jax.device_put(trained.params), 0)

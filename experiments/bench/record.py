@@ -1,4 +1,4 @@
-"""One benchmark's record: JSON with everything needed to believe it or to repeat it."""
+"""One benchmark's record: JSON with everything needed to check or repeat it."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ class BenchRecord:
     machine: dict[str, Any]
     settings: dict[str, Any]
     stages: tuple[Stage, ...]
-    ratios: dict[str, float] = field(default_factory=dict)  # within this run, by what they say
+    ratios: dict[str, float] = field(default_factory=dict)  # ratios within this run, by what they say
     notes: tuple[str, ...] = ()
     matmul_flops_per_second: float = 0.0  # measured in the same run; 0: not measured
-    peak_flops_per_second: float = 0.0  # of the data sheet, all devices; 0: unknown
+    peak_flops_per_second: float = 0.0  # from the data sheet, all devices; 0: unknown
     peak_memory_bytes: int = 0
     format: int = FORMAT
 
@@ -104,7 +104,7 @@ def write_record(record: BenchRecord, directory: Path) -> Path:
 
 
 def read_record(path: Path) -> BenchRecord:
-    """Raises ConfigError for a file that is no record of this format."""
+    """Reads a record. Raises ConfigError for a file that is not a record of this format."""
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:

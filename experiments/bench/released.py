@@ -1,10 +1,10 @@
 """A process that runs stages of the official PyTorch release on request, as `stages` runs ours.
 
-It is started in an environment of its own, which has torch and what the release imports, with a checkout of
-the release (github.com/liruiw/HMA) on its path; nothing of it is part of this project. Its arguments are the examples
-at a time and what is computed in. On CPU the release's `.cuda()` must mean nothing, and its attention is the one it has
-without xformers. On a GPU it computes as its training program does: float32 products at "medium" precision, attention
-by a fused kernel, which is torch's own where xformers is not installed.
+It is started in an environment of its own, which has torch and what the release imports, with a checkout of the release
+(github.com/liruiw/HMA) on its path; nothing of the release is part of this project. Its arguments are the number of
+examples at a time and the number format. On CPU the release's `.cuda()` must do nothing, and its attention is the one
+that it uses without xformers. On a GPU it computes as its training program does: float32 products at "medium"
+precision, attention by a fused kernel, which is torch's own if xformers is not installed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def attend(q, k, v, attn_bias=None, scale=None):
 
 
 class ReleasedModels:
-    """The released base models with drawn weights, `rows` windows of one robot, computed in `dtype`."""
+    """The released base models with random weights, `rows` windows of one robot, computed in `dtype`."""
 
     def __init__(self, rows: int, dtype: str):
         self.device = prepare()
@@ -68,7 +68,7 @@ class ReleasedModels:
         self.models: dict[str, object] = {}
 
     def computing(self):
-        """Under which precision the release computes: float32, or automatic mixed precision."""
+        """A context in which the release computes: float32, or automatic mixed precision."""
         if self.dtype == "float32":
             return contextlib.nullcontext()
         return self.torch.autocast(self.device, getattr(self.torch, self.dtype))

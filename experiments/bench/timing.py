@@ -1,4 +1,4 @@
-"""Timing compiled calls: compilation apart, warmed up, by turns, with median and p90."""
+"""Timing of compiled calls: compilation timed separately, warmed up, alternately, with median and p90."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Compiled:
 
 
 def compile_call(function: Callable[..., Any], *args: Any, donate: tuple[int, ...] = ()) -> Compiled:
-    """`function` for arguments like `args`."""
+    """Compiles `function` for arguments like `args`."""
     call, seconds = time_once(lambda: jax.jit(function, donate_argnums=donate).lower(*args).compile())
     memory = call.memory_analysis()
     return Compiled(call, seconds, None if memory is None else int(memory.temp_size_in_bytes))
